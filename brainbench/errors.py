@@ -1,0 +1,79 @@
+"""Errors that tell the user what was received, what is allowed and what to do next."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class BrainbenchError(Exception):
+    """Base of every error this toolkit raises on purpose; its text is one sentence for the user."""
+
+    exit_code = 1
+    """Exit status of the command line when this error ends it."""
+
+
+class UsageError(BrainbenchError, ValueError):
+    """The request itself is wrong: an unknown name, a bad option, shapes that do not fit."""
+
+    exit_code = 2
+
+
+class DataError(BrainbenchError, ValueError):
+    """A file or an array was found but its content cannot be used."""
+
+
+class DataFileNotFoundError(DataError, FileNotFoundError):
+    """A path that was asked for does not exist or matches nothing."""
+
+    exit_code = 2
+
+
+class MissingDependencyError(BrainbenchError, ImportError):
+    """An optional package is needed for what was asked."""
+
+
+def nearest(name: str, options: Iterable[str]) -> str | None:
+    """Return the option closest in spelling to ``name``, or None when nothing is close.
+
+    >>> nearest("zhuan", ["zhuang", "resnet18"])
+    'zhuang'
+    """
+    choices = list(options)
+    lowered = {choice.lower(): choice for choice in reversed(choices)}
+    hits = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+    return lowered[hits[0]] if hits else None
+
+
+def listing(options: Iterable[str], *, limit: int = 12) -> str:
+    """Join options for a message and say how many were left out.
+
+    >>> listing(["a", "b", "c"], limit=2)
+    "'a', 'b' and 1 more"
+    """
+    choices = list(options)
+    shown = ", ".join(repr(choice) for choice in choices[:limit])
+    if len(choices) > limit:
+        shown += f" and {len(choices) - limit} more"
+    return shown or "none"
+
+
+def unknown_name(kind: str, name: str, options: Iterable[str], *, hint: str = "") -> UsageError:
+    """Build the error for a name that is not among ``options``, with the nearest valid one.
+
+    >>> str(unknown_name("backend", "mujocco", ["mujoco", "bullet"]))
+    "Unknown backend 'mujocco'; did you mean 'mujoco'? Allowed: 'mujoco', 'bullet'."
+    """
+    choices = list(options)
+    guess = nearest(name, choices)
+    suggestion = f"; did you mean {guess!r}?" if guess else "."
+    text = f"Unknown {kind} {name!r}{suggestion} Allowed: {listing(choices)}."
+    return UsageError(f"{text} {hint}".rstrip())
+
+
+def missing_dependency(package: str, *, extra: str, purpose: str) -> MissingDependencyError:
+    """Build the error for an optional package, naming the extra that installs it."""
+    return MissingDependencyError(
+        f"{purpose} needs the package {package!r}, which is not installed; "
+        f"install it with: pip install 'brainbench[{extra}]'."
+    )

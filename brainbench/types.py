@@ -1,0 +1,376 @@
+"""The data contracts that the packages exchange.
+
+Letters used everywhere: B batch, T time step, S sub-step, C channel, H×W whisker grid, N taxel,
+K stimulus, R trial, U unit, A animal, P = K(K−1)/2 RDM pair.
+
+A **stimulus set** is an :class:`xarray.Dataset` with ``wrench`` [stimulus, time, whisker, channel]
+(float32; N and N·m; the action of the whisker on its base, about the base point, world axes).
+A **recordings** data set is an :class:`xarray.Dataset` with ``counts`` [trial, time, unit], where
+NaN means "not recorded". :func:`check_stimulus_set` and :func:`check_recordings` state the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Literal
+
+from brainbench.errors import DataError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+CHANNELS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+"""Order of the six channels of a base wrench: forces in N, then moments in N·m."""
+
+GRID_SHAPE = (5, 7)
+"""Rows A–E and columns 0–6 of the whisker grid; whisker (row, col) sits at flat index row·7 + col."""
+
+Status = Literal["ok", "unreliable", "undefined"]
+"""``ok``: can be trusted; ``unreliable``: computed, but the data are too noisy or too few to trust
+it; ``undefined``: no number exists. The reason stands in words beside it."""
+
+RECORD_SCHEMA = 1
+"""Version of the result-record JSON layout."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A confidence interval with the method that made it."""
+
+    low: float
+    high: float
+    level: float = 0.95
+    method: str = ""
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Noise ceiling of the raw (uncorrected) comparison: what a perfect model could reach."""
+
+    lower: float
+    upper: float
+    method: str = "leave-one-animal-out (lower), mean of all (upper)"
+
+
+@dataclass(frozen=True)
+class SubjectScore:
+    """One animal's part of a score."""
+
+    subject: str
+    value: float
+    """Noise-corrected score; NaN when undefined."""
+    r: float
+    """Raw comparison of the model's RDM with this animal's."""
+    reliability: float
+    """Spearman-Brown-corrected split-half reliability of this animal's RDM."""
+    status: Status = "ok"
+    units: int = 0
+    trials: int = 0
+    layer: str | None = None
+    """Layer evaluated on this animal; it was chosen without this animal's data."""
+
+
+@dataclass(frozen=True)
+class LayerScore:
+    """One layer compared with every animal; shown for reading, never picked from."""
+
+    layer: str
+    value: float
+    """Mean noise-corrected score over the animals whose RDM is reliable."""
+    r: float
+    status: Status = "ok"
+
+
+@dataclass(frozen=True)
+class Score:
+    """What is known about one model's match to one set of recordings.
+
+    Everything printed or published comes from this object. ``value`` is NaN exactly when
+    ``status`` is ``undefined``. RDMs are upper triangles [P] in the order of ``stimuli``.
+    """
+
+    name: str
+    value: float
+    status: Status
+    reasons: tuple[str, ...] = ()
+    r: float = math.nan
+    """Mean raw comparison over animals."""
+    reliability: float = math.nan
+    """Mean Spearman-Brown-corrected split-half reliability over animals."""
+    reliability_interval: Interval | None = None
+    interval: Interval | None = None
+    p: float = math.nan
+    p_method: str = ""
+    p_smallest: float = math.nan
+    """Smallest p that this number of stimuli can give."""
+    ceiling: Ceiling | None = None
+    layer: str | None = None
+    """The layer chosen most often when each animal in turn is held out."""
+    layer_rule: str = ""
+    best_layer: str | None = None
+    best_layer_value: float = math.nan
+    """The optimistic maximum over layers, chosen and evaluated on the same data. Not a result."""
+    layers: tuple[LayerScore, ...] = ()
+    subjects: tuple[SubjectScore, ...] = ()
+    estimator: str = "default"
+    metric: str = ""
+    stimuli: tuple[str, ...] = ()
+    model_rdm: tuple[float, ...] = ()
+    brain_rdm: tuple[float, ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """Serialise deterministically; NaN becomes null."""
+        from brainbench.files import to_json
+
+        return to_json(self)
+
+    @classmethod
+    def from_json(cls, source: str | Mapping[str, Any]) -> Score:
+        """Rebuild a score from :meth:`to_json` or from the mapping inside it.
+
+        Raises:
+            DataError: a field is missing, unknown or of the wrong kind.
+        """
+        data = _mapping(source, "score")
+        return _build(
+            cls,
+            data,
+            reliability_interval=_optional(Interval, data.get("reliability_interval")),
+            interval=_optional(Interval, data.get("interval")),
+            ceiling=_optional(Ceiling, data.get("ceiling")),
+            layers=tuple(_build(LayerScore, item) for item in data.get("layers", ())),
+            subjects=tuple(_build(SubjectScore, item) for item in data.get("subjects", ())),
+        )
+
+    def summary(self) -> str:
+        """One line a person reads: value, interval, p and status."""
+        if self.status == "undefined":
+            return f"{self.name}: undefined ({'; '.join(self.reasons)})"
+        text = f"{self.name}: {self.value:.3f}"
+        if self.interval is not None:
+            text += f" [{self.interval.low:.3f}, {self.interval.high:.3f}]"
+        if math.isfinite(self.p):
+            text += f", p = {self.p:.2g}"
+        return text if self.status == "ok" else f"{text} ({self.status}: {'; '.join(self.reasons)})"
+
+    def _repr_html_(self) -> str:
+        """Show the score as a small table in a notebook."""
+        from html import escape
+
+        rows = [
+            ("score (noise-corrected)", _number(self.value) + (f" {_span(self.interval)}" if self.interval else "")),
+            ("status", f"{self.status} {'; '.join(self.reasons)}"),
+            ("raw r", _number(self.r)),
+            ("reliability", _number(self.reliability)),
+            ("permutation p", _number(self.p)),
+            ("noise ceiling (raw r)", _span(self.ceiling) if self.ceiling else "none"),
+            ("layer", f"{self.layer} ({self.layer_rule})"),
+            ("optimistic maximum", f"{_number(self.best_layer_value)} at {self.best_layer}"),
+            ("estimator", f"{self.estimator}; {self.metric}"),
+        ]
+        body = "".join(f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in rows)
+        return f"<table><caption>{escape(self.name)}</caption>{body}</table>"
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What a scored model is. Fields that do not apply are None."""
+
+    name: str
+    family: str = ""
+    objective: str | None = None
+    augmentation: str | None = None
+    parameters: int | None = None
+    multiply_adds: int | None = None
+    """Multiply-adds per time step of one stimulus."""
+    top1: float | None = None
+    top5: float | None = None
+    accuracy_interval: Interval | None = None
+    accuracy_data: str | None = None
+    """Content hash of the test data behind the accuracies."""
+    collapsed: bool | None = None
+    twin: str | None = None
+    """Registry name of the untrained twin."""
+    seed: int | None = None
+    weights: str | None = None
+    """Content hash of the weights that were scored."""
+    input: str = ""
+    """How the stimuli were turned into the model's input (units, normaliser)."""
+
+
+@dataclass(frozen=True)
+class ResultRecord:
+    """A score with what is needed to judge it: animals, baselines and the model card."""
+
+    score: Score
+    animal_to_animal: Score | None = None
+    baselines: Mapping[str, Score] = field(default_factory=dict)
+    card: ModelCard | None = None
+    synthetic: bool = False
+    """True when the recordings are synthetic: ranks then say nothing about brains."""
+    schema: int = RECORD_SCHEMA
+
+    def to_json(self) -> str:
+        """Serialise deterministically; NaN becomes null."""
+        from brainbench.files import to_json
+
+        return to_json(self)
+
+    @classmethod
+    def from_json(cls, source: str | Mapping[str, Any]) -> ResultRecord:
+        """Rebuild a record.
+
+        Raises:
+            DataError: it is not a record of a schema version this package reads.
+        """
+        data = _mapping(source, "result record")
+        if data.get("schema") != RECORD_SCHEMA:
+            raise DataError(
+                f"This result record has schema version {data.get('schema')!r}; this brainbench reads version "
+                f"{RECORD_SCHEMA}; score the model again or use the version that wrote it."
+            )
+        card = data.get("card")
+        return _build(
+            cls,
+            data,
+            score=Score.from_json(data["score"]) if "score" in data else None,
+            animal_to_animal=_optional_score(data.get("animal_to_animal")),
+            baselines={key: Score.from_json(item) for key, item in data.get("baselines", {}).items()},
+            card=card
+            and _build(ModelCard, card, accuracy_interval=_optional(Interval, card.get("accuracy_interval"))),
+        )
+
+    @property
+    def identity(self) -> str:
+        """Content hash of the result without time and machine: equal inputs give equal names."""
+        from brainbench.files import content_hash, to_plain
+
+        plain = to_plain(self)
+        for item in (plain["score"], plain["animal_to_animal"], *plain["baselines"].values()):
+            if item is not None:
+                for volatile in ("time", "machine", "python", "packages", "seconds"):
+                    item["provenance"].pop(volatile, None)
+        return content_hash(plain)
+
+    def _repr_html_(self) -> str:
+        """Show the score and its baselines in a notebook."""
+        parts = [self.score, *([self.animal_to_animal] if self.animal_to_animal else []), *self.baselines.values()]
+        return "".join(part._repr_html_() for part in parts)
+
+
+def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
+    """Return ``dataset`` if it is a valid stimulus set.
+
+    Required: ``wrench`` [stimulus, time, whisker, channel]; coordinates ``stimulus`` (unique labels),
+    ``time`` (s, increasing), ``whisker`` (names) with ``row`` and ``col`` (grid position from 0),
+    ``channel`` (:data:`CHANNELS`); attributes ``array``, ``scene``, ``fidelity``, ``seed``,
+    ``backend``, ``version``, ``content_hash``.
+
+    Raises:
+        DataError: something of this is missing.
+    """
+    _check_variable(dataset, "wrench", ("stimulus", "time", "whisker", "channel"), "stimulus set")
+    _check_present(dataset.coords, ("stimulus", "time", "whisker", "row", "col", "channel"), "stimulus set", "coordinate")
+    _check_present(
+        dataset.attrs,
+        ("array", "scene", "fidelity", "seed", "backend", "version", "content_hash"),
+        "stimulus set",
+        "attribute",
+    )
+    if tuple(str(name) for name in dataset["channel"].values) != CHANNELS:
+        raise DataError(f"The stimulus set has channels {list(dataset['channel'].values)}; expected {list(CHANNELS)}.")
+    return dataset
+
+
+def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
+    """Return ``dataset`` if it is a valid recordings data set.
+
+    Required: ``counts`` [trial, time, unit] (NaN = not recorded, never zero); ``duration`` [trial, time]
+    (s, length of each bin); per trial ``stimulus`` (label), ``subject``, ``session``, ``trial_id``;
+    per unit ``unit_subject``, ``unit_session``, ``unit_id``; attributes ``vocabulary`` (ordered
+    labels), ``window``, ``selection``, ``removed`` (rule → trials or units removed), ``source``,
+    ``synthetic``, ``content_hash``.
+
+    Raises:
+        DataError: something of this is missing.
+    """
+    _check_variable(dataset, "counts", ("trial", "time", "unit"), "recordings data set")
+    _check_present(dataset.variables, ("duration",), "recordings data set", "variable")
+    _check_present(
+        dataset.coords,
+        ("stimulus", "subject", "session", "trial_id", "unit_subject", "unit_session", "unit_id"),
+        "recordings data set",
+        "coordinate",
+    )
+    _check_present(
+        dataset.attrs,
+        ("vocabulary", "window", "selection", "removed", "source", "synthetic", "content_hash"),
+        "recordings data set",
+        "attribute",
+    )
+    return dataset
+
+
+def _check_variable(dataset: xr.Dataset, name: str, dims: tuple[str, ...], what: str) -> None:
+    if name not in dataset:
+        raise DataError(f"A {what} needs the variable {name!r}; this one has {sorted(map(str, dataset))}.")
+    if dataset[name].dims != dims:
+        raise DataError(f"{name!r} of a {what} has dimensions {dims}; this one has {dataset[name].dims}.")
+
+
+def _check_present(container: Any, names: tuple[str, ...], what: str, kind: str) -> None:
+    missing = [name for name in names if name not in container]
+    if missing:
+        raise DataError(f"This {what} lacks the {kind} {', '.join(map(repr, missing))}.")
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if math.isfinite(value) else "undefined"
+
+
+def _span(interval: Interval | Ceiling) -> str:
+    low, high = (interval.low, interval.high) if isinstance(interval, Interval) else (interval.lower, interval.upper)
+    return f"[{_number(low)}, {_number(high)}]"
+
+
+def _mapping(source: str | Mapping[str, Any], what: str) -> Mapping[str, Any]:
+    import json
+
+    if isinstance(source, str):
+        try:
+            source = json.loads(source)
+        except json.JSONDecodeError as error:
+            raise DataError(f"This {what} is not valid JSON ({error}).") from error
+    if not isinstance(source, Mapping):
+        raise DataError(f"A {what} is a JSON object; received {type(source).__name__}.")
+    return source
+
+
+def _optional(kind: type, data: Mapping[str, Any] | None) -> Any:
+    return None if data is None else _build(kind, data)
+
+
+def _optional_score(data: Mapping[str, Any] | None) -> Score | None:
+    return None if data is None else Score.from_json(data)
+
+
+def _build(kind: type, data: Mapping[str, Any], **ready: Any) -> Any:
+    """Make a dataclass from JSON: null becomes NaN for floats, lists become tuples."""
+    annotations = {item.name: str(item.type) for item in fields(kind)}
+    unknown = sorted(set(data) - set(annotations))
+    if unknown:
+        raise DataError(f"A {kind.__name__} has no field {unknown[0]!r}; it has {sorted(annotations)}.")
+    values: dict[str, Any] = {}
+    for name, value in data.items():
+        if value is None and annotations[name] == "float":
+            value = math.nan
+        elif isinstance(value, list):
+            value = tuple(math.nan if item is None else item for item in value)
+        values[name] = value
+    try:
+        return kind(**{**values, **ready})
+    except TypeError as error:
+        raise DataError(f"This {kind.__name__} is incomplete ({error}).") from error

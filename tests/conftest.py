@@ -1,0 +1,28 @@
+"""Shared fixtures. Tests marked ``shared`` skip without the reference data, except in our CI."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+REFERENCE = Path(os.environ.get("BRAINBENCH_REFERENCE", Path(__file__).parents[2] / "shared" / "reference"))
+
+
+@pytest.fixture(scope="session")
+def reference() -> Path:
+    """The folder of published reference data; a test that asks for it carries the marker ``shared``."""
+    if not REFERENCE.is_dir():
+        message = f"reference data not found at {REFERENCE}"
+        if os.environ.get("BRAINBENCH_REQUIRE_REFERENCE"):
+            pytest.fail(message)
+        pytest.skip(message)
+    return REFERENCE
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _private_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep the tests away from the user's cache (set BRAINBENCH_TEST_CACHE to reuse one between runs)."""
+    chosen = os.environ.get("BRAINBENCH_TEST_CACHE")
+    os.environ["BRAINBENCH_CACHE"] = chosen or str(tmp_path_factory.mktemp("cache"))
