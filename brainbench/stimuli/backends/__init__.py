@@ -1,1 +1,30 @@
-"""TODO."""
+"""Physics engines for whiskers, found by name with :func:`get_backend`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from brainbench.errors import unknown_name
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.backends.protocol import Backend
+
+_BACKENDS = {"mujoco": ("brainbench.stimuli.backends.mujoco", "MujocoBackend")}
+
+
+def list_backends() -> tuple[str, ...]:
+    """Names that :func:`get_backend` knows."""
+    return tuple(sorted(_BACKENDS))
+
+
+def get_backend(name: str) -> Backend:
+    """Return the backend called ``name``.
+
+    Raises:
+        UsageError: there is no such backend.
+    """
+    if name not in _BACKENDS:
+        raise unknown_name("backend", name, list_backends())
+    module, symbol = _BACKENDS[name]
+    return getattr(import_module(module), symbol)()
