@@ -67,8 +67,9 @@ def to_plain(value: Any) -> Any:
         return sorted(to_plain(item) for item in value)
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    if hasattr(value, "tolist"):  # numpy scalars and arrays, torch tensors
-        return to_plain(value.tolist())
+    as_list = getattr(value, "tolist", None)  # numpy scalars and arrays, torch tensors
+    if callable(as_list):
+        return to_plain(as_list())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -232,15 +232,16 @@ class ResultRecord:
                 f"This result record has schema version {data.get('schema')!r}; this brainbench reads version "
                 f"{RECORD_SCHEMA}; score the model again or use the version that wrote it."
             )
+        if "score" not in data:
+            raise DataError("This result record is incomplete (it has no 'score').")
         card = data.get("card")
         return _build(
             cls,
             data,
-            score=Score.from_json(data["score"]) if "score" in data else None,
+            score=Score.from_json(data["score"]),
             animal_to_animal=_optional_score(data.get("animal_to_animal")),
             baselines={key: Score.from_json(item) for key, item in data.get("baselines", {}).items()},
-            card=card
-            and _build(ModelCard, card, accuracy_interval=_optional(Interval, card.get("accuracy_interval"))),
+            card=card and _build(ModelCard, card, accuracy_interval=_optional(Interval, card.get("accuracy_interval"))),
         )
 
     @property
@@ -273,7 +274,9 @@ def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
         DataError: something of this is missing.
     """
     _check_variable(dataset, "wrench", ("stimulus", "time", "whisker", "channel"), "stimulus set")
-    _check_present(dataset.coords, ("stimulus", "time", "whisker", "row", "col", "channel"), "stimulus set", "coordinate")
+    _check_present(
+        dataset.coords, ("stimulus", "time", "whisker", "row", "col", "channel"), "stimulus set", "coordinate"
+    )
     _check_present(
         dataset.attrs,
         ("array", "scene", "fidelity", "seed", "backend", "version", "content_hash"),

@@ -1,0 +1,71 @@
+"""``brainbench doctor``: what is installed, what is missing, and what each missing part would enable."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib import metadata
+from typing import Any
+
+from brainbench.cli._shared import JsonOption, emit, table
+
+REQUIRED = ("torch", "mujoco-core", "numpy", "scipy", "xarray", "h5py", "h5netcdf", "trimesh", "typer", "rich")
+
+OPTIONAL = {
+    "pynwb": ("nwb", "checking NWB files against the schema"),
+    "nwbinspector": ("nwb", "best-practice checks of NWB files"),
+    "pybullet": ("bullet", "nothing yet: the WHISKiT-compatible backend of a later version (Python < 3.12)"),
+    "warp-lang": ("gpu", "nothing yet: the batched whisker solver of a later version"),
+    "mujoco-warp": ("gpu", "nothing yet: robot hands on CUDA in a later version"),
+    "matplotlib": ("report", "nothing yet: vector figures for papers in a later version"),
+}
+
+
+def doctor(as_json: JsonOption = False) -> None:
+    """Show versions, devices, folders and optional parts."""
+    data = diagnose()
+    rows = [[name, version or "missing: reinstall brainbench", ""] for name, version in data["required"].items()]
+    for name, part in data["optional"].items():
+        note = "" if part["version"] else f"enables {part['enables']}; {part['install']}"
+        rows.append([name, part["version"] or "not installed", note])
+    head = [
+        f"brainbench {data['version']}, Python {data['python']}, {data['machine']}",
+        f"processors {data['processors']}, CUDA {', '.join(data['cuda']) or 'none (not needed)'}",
+        f"cache {data['cache']} ({data['cache_bytes'] / 1e6:.1f} MB)",
+    ]
+    emit(data, "\n".join(head) + "\n\n" + table("", ["part", "version", ""], rows), as_json=as_json)
+
+
+def diagnose() -> dict[str, Any]:
+    """Collect what :func:`doctor` shows."""
+    from brainbench import __version__
+    from brainbench.files import cache_dir
+
+    cache = cache_dir()
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cuda": _cuda(),
+        "cache": str(cache),
+        "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),
+        "required": {name: _version(name) for name in REQUIRED},
+        "optional": {
+            name: {"version": _version(name), "enables": purpose, "install": f"pip install 'brainbench[{extra}]'"}
+            for name, (extra, purpose) in OPTIONAL.items()
+        },
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _cuda() -> list[str]:
+    import torch
+
+    return [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]

@@ -1,0 +1,36 @@
+"""``brainbench leaderboard``: from result records to a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit
+
+app = typer.Typer(no_args_is_help=True, help="Build leaderboards from result records.")
+
+
+@app.command("build")
+def build(
+    records: Annotated[
+        list[Path] | None, typer.Argument(help="Record files or folders of them; ./brainbench-results by default.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The page to write.")] = Path("leaderboard.html"),
+    title: Annotated[str, typer.Option(help="Title of the page.")] = "brainbench leaderboard",
+    as_json: JsonOption = False,
+) -> None:
+    """Write one self-contained HTML page from result records."""
+    from leaderboards.report import build_leaderboard
+
+    from leaderboards.store import read_records
+
+    stored = read_records(records or [Path("brainbench-results")])
+    page = build_leaderboard(stored, out, title=title)
+    good = [item for item in stored if not item.problem]
+    bad = [{"path": item.path, "problem": item.problem} for item in stored if item.problem]
+    text = f"{page}  ({len(good)} records, {len(bad)} with problems)"
+    for item in bad:
+        text += f"\n  {item['path']}: {item['problem']}"
+    emit({"page": page, "records": len(good), "problems": bad}, text, as_json=as_json)

@@ -1,0 +1,63 @@
+"""``brainbench recordings``: look into files and at what their responses can support."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, table
+
+app = typer.Typer(no_args_is_help=True, help="Inspect neural recordings and their reliability.")
+
+
+@app.command("inspect")
+def inspect(
+    path: Annotated[Path, typer.Argument(help="An NWB file or a file in our HDF5 layout.")], as_json: JsonOption = False
+) -> None:
+    """Show what a file holds and which --conditions could label its trials."""
+    from brainbench.datasets import inspect as inspect_file
+
+    inspection = inspect_file(path)
+    emit(inspection, str(inspection), as_json=as_json)
+
+
+@app.command("rdm")
+def rdm(
+    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, or a glob.")],
+    conditions: Annotated[
+        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] that labels the trials; see 'recordings inspect'.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Compute every animal's RDM (correlation distance) and its split-half reliability."""
+    from brainbench._sides import brain_side
+
+    brain = brain_side(source, conditions=conditions, progress=None)
+    labels = brain.vocabulary
+    animals = brain.animals(labels, time="mean", seed=seed)
+    data = {
+        "labels": labels,
+        "recordings": brain.origin,
+        "animals": [
+            {
+                "subject": item.subject,
+                "units": item.units,
+                "trials": item.trials,
+                "reliability": item.reliability,
+                "problem": item.problem,
+                "rdm": item.rdm,
+            }
+            for item in animals
+        ],
+    }
+    rows = [
+        [item.subject, str(item.units), str(item.trials), f"{item.reliability:.3f}", item.problem or ""]
+        for item in animals
+    ]
+    text = table(
+        f"{len(labels)} conditions: {', '.join(labels)}", ["animal", "units", "trials", "reliability", ""], rows
+    )
+    emit(data, text, as_json=as_json)

@@ -1,0 +1,132 @@
+"""``brainbench score``: the main job."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+
+if TYPE_CHECKING:
+    from brainbench.types import ResultRecord, Score
+
+
+def _complete_model(incomplete: str) -> list[str]:
+    from brainbench.models.registry import list_models
+
+    return [name for name in list_models() if name.startswith(incomplete)]
+
+
+def score(
+    model: Annotated[
+        str,
+        typer.Argument(
+            help="A registry name, FILE.py:FUNCTION that returns a torch module, or an HDF5 file of activations.",
+            autocompletion=_complete_model,
+        ),
+    ],
+    recordings: Annotated[
+        str, typer.Option("--recordings", "-r", help="'demo' (synthetic), an NWB or HDF5 file, a folder, or a glob.")
+    ] = "demo",
+    stimuli: Annotated[
+        str, typer.Option("--stimuli", "-s", help="A recipe, a scene file, a stimulus-set file, or an HDF5 array.")
+    ] = "rodgers",
+    conditions: Annotated[
+        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] of the recordings that labels the trials.")
+    ] = None,
+    match: Annotated[
+        Path | None, typer.Option(help="JSON, TOML or CSV file: recording label → stimulus label.")
+    ] = None,
+    whiskers: Annotated[str, typer.Option(help="Whiskers to simulate: all, C0-C3, C2,D1, …")] = "all",
+    fidelity: Annotated[str, typer.Option(help="Simulation preset: fast, balanced or accurate.")] = "balanced",
+    layers: Annotated[str | None, typer.Option(help="Comma-separated layers to compare; all by default.")] = None,
+    time: Annotated[
+        str, typer.Option(help="Time axis of both sides: 'mean' averages over it, 'concatenate' keeps every step.")
+    ] = "mean",
+    bin: Annotated[float | None, typer.Option(help="Bin width of the spike counts in seconds.")] = None,
+    estimator: Annotated[str, typer.Option(help="default, thesis or thesis-input (as published).")] = "default",
+    normalize: Annotated[
+        bool, typer.Option(help="Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI.")
+    ] = True,
+    seed: Annotated[int, typer.Option(help="Seed of untrained weights and of split halves.")] = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the record and the report.")] = Path(
+        "brainbench-results"
+    ),
+    as_json: JsonOption = False,
+) -> None:
+    """Score a model against neural recordings and write a result record and an HTML report."""
+    from leaderboards.report import write_report
+
+    from brainbench.scoring import score_record
+    from leaderboards.store import write_record
+
+    with progress_bar() as progress:
+        record = score_record(
+            model,
+            recordings=recordings,
+            stimuli=stimuli,
+            conditions=conditions,
+            match=match,
+            whiskers=whiskers,
+            fidelity=fidelity,
+            layers=tuple(name.strip() for name in layers.split(",")) if layers else None,
+            time=time,  # pyright: ignore[reportArgumentType]  # checked there, with the allowed values
+            bin=bin,
+            estimator=estimator,
+            normalize=normalize,
+            seed=seed,
+            progress=progress,
+        )
+    path = write_record(record, out)
+    report = write_report(record, path.with_suffix(".html"))
+    data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
+    emit(data, f"{_text(record)}\n\nrecord  {path}\nreport  {report}", as_json=as_json)
+
+
+def _text(record: ResultRecord) -> str:
+    score = record.score
+    source = score.provenance["recordings"]["source"]
+    lines = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(score.subjects)} animals  ·  {source}"]
+    if record.synthetic:
+        lines.append("Synthetic recordings: ranks on them say nothing about brains.")
+    facts = [
+        [
+            "score",
+            f"{_number(score.value)} {_interval(score)}",
+            "noise-corrected RSA, 1 = explains all that is reliable",
+        ],
+        ["status", score.status, "; ".join(score.reasons)],
+        ["raw r", _number(score.r), _ceiling(score)],
+        ["reliability", _number(score.reliability), "split halves, Spearman-Brown, mean over animals"],
+        ["permutation p", _number(score.p), f"{score.p_method}; smallest possible {_number(score.p_smallest)}"],
+        ["layer", str(score.layer), score.layer_rule],
+        ["best layer", f"{_number(score.best_layer_value)}", f"{score.best_layer}: optimistic maximum, not a result"],
+        ["estimator", score.estimator, score.metric],
+    ]
+    others = [("animal to animal", record.animal_to_animal), *record.baselines.items()]
+    rows = [
+        [name, f"{_number(item.value)} {_interval(item)}", item.status] for name, item in others if item is not None
+    ]
+    text = "\n".join(lines) + "\n\n" + table("", ["", "", ""], facts)
+    if rows:
+        text += "\n\n" + table("Baselines, same estimator", ["", "score", "status"], rows)
+    return text
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if math.isfinite(value) else "–"
+
+
+def _interval(score: Score) -> str:
+    if score.interval is None:
+        return ""
+    return f"[{_number(score.interval.low)}, {_number(score.interval.high)}]"
+
+
+def _ceiling(score: Score) -> str:
+    if score.ceiling is None:
+        return "no noise ceiling"
+    return f"noise ceiling {_number(score.ceiling.lower)} to {_number(score.ceiling.upper)}"

@@ -1,0 +1,118 @@
+"""Features computed elsewhere: an HDF5 file of activations that can be scored like a model.
+
+Layout, version 1: a dataset ``labels`` [K] of stimulus labels (strings) and a group ``activations``
+with one dataset per layer, [K, F] or [K, T, F], any numeric type. Layers are read in the order of
+their creation when the file tracks it, else by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.errors import DataError, DataFileNotFoundError, listing
+
+if TYPE_CHECKING:
+    import h5py
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Features:
+    """Activations with the labels of their stimuli."""
+
+    labels: tuple[str, ...]
+    activations: Mapping[str, NDArray[np.floating]]
+    """Layer name → float [K, T, F]; T = 1 for features without a time axis."""
+
+
+def write_features(path: str | Path, labels: Sequence[str], activations: Mapping[str, NDArray[np.floating]]) -> Path:
+    """Write activations ([K, F] or [K, T, F] per layer) in the layout above, atomically.
+
+    Raises:
+        DataError: a layer does not have one row per label.
+    """
+    import h5py
+
+    from brainbench.files import atomic_path
+
+    for layer, values in activations.items():
+        _check_shape(layer, np.shape(values), len(labels), str(path))
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["brainbench_features"] = 1
+        file.create_dataset("labels", data=[str(label) for label in labels], dtype=h5py.string_dtype())
+        group = file.create_group("activations", track_order=True)
+        for layer, values in activations.items():
+            # A slash would make a sub-group; layer names keep it as a look-alike on disk only.
+            group.create_dataset(layer.replace("/", "\N{DIVISION SLASH}"), data=np.asarray(values))
+    return Path(path)
+
+
+def read_features(path: str | Path) -> Features:
+    """Read a file in the layout above.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it is not HDF5, lacks ``labels`` or ``activations``, or a shape does not fit.
+    """
+    import h5py
+
+    path = Path(path)
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise DataError(
+            f"{str(path)!r} cannot be read as HDF5: it is truncated or of another kind ({error})."
+        ) from error
+    with file:
+        for name in ("labels", "activations"):
+            if name not in file:
+                raise DataError(
+                    f"{str(path)!r} holds {listing(file)}; a file of activations needs a dataset 'labels' [K] and a "
+                    "group 'activations' with one dataset [K, F] or [K, T, F] per layer."
+                )
+        labels = tuple(_text(label) for label in np.ravel(file["labels"][()]))
+        repeated = sorted({label for label in labels if labels.count(label) > 1})
+        if repeated:
+            raise DataError(f"{str(path)!r} has the label {repeated[0]!r} more than once; labels must be unique.")
+        layers = _layers(file["activations"], len(labels), str(path))
+    if not layers:
+        raise DataError(f"{str(path)!r} has no layer in its group 'activations'.")
+    return Features(labels, layers)
+
+
+def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.floating]]:
+    import h5py
+
+    if not isinstance(group, h5py.Group):
+        raise DataError(f"'activations' of {path!r} is a dataset; it must be a group with one dataset per layer.")
+    layers: dict[str, NDArray[np.floating]] = {}
+
+    def visit(name: str, item: object) -> None:
+        if not isinstance(item, h5py.Dataset):
+            return
+        _check_shape(name, item.shape, rows, path)
+        if not np.issubdtype(item.dtype, np.number):
+            raise DataError(f"Layer {name!r} of {path!r} has type {item.dtype}; activations must be numbers.")
+        values = item.astype(np.float64 if item.dtype == np.float64 else np.float32)[()]
+        layers[name.replace("\N{DIVISION SLASH}", "/")] = values[:, None, :] if values.ndim == 2 else values
+
+    group.visititems(visit)
+    return layers
+
+
+def _check_shape(layer: str, shape: tuple[int, ...], rows: int, path: str) -> None:
+    if len(shape) not in (2, 3) or shape[0] != rows:
+        raise DataError(
+            f"Layer {layer!r} of {path!r} has shape {list(shape)}; expected [K, F] or [K, T, F] with K = {rows} labels."
+        )
+
+
+def _text(label: object) -> str:
+    return label.decode() if isinstance(label, bytes) else str(label)

@@ -1,0 +1,152 @@
+"""The main job: score a temporal network against neural recordings.
+
+``score`` joins the four packages in the order of the data: stimuli → model → representational
+dissimilarity matrices (RDMs) of every layer; recordings → RDM and reliability of every animal;
+both → a noise-corrected comparison with honest statistics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time as clock
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+from brainbench.types import ResultRecord, Score
+
+if TYPE_CHECKING:
+    import os
+
+    import xarray as xr
+
+    from brainbench.datasets import Selection, Window
+    from brainbench.stimuli import Fidelity
+
+Progress = Callable[[int, int, str], None]
+TimeRule = Literal["mean", "concatenate"]
+
+RDM_METHOD = "correlation"
+COMPARISON = "pearson"
+
+
+def score(
+    model: Any,
+    *,
+    recordings: str | os.PathLike[str] | xr.Dataset = "demo",
+    stimuli: Any = None,
+    estimator: str = "default",
+    **options: Any,
+) -> Score:
+    """Score a model against recordings.
+
+    Args:
+        model: a registry name (``"zhuang-intersection-ln"``), a ``torch.nn.Module`` mapping
+            [B, T, C, H, W] → [B, …], ``"path/to/file.py:make_model"``, a file of activations
+            (:mod:`brainbench.models.features`), or a mapping {layer: [K, F] or [K, T, F]} whose rows
+            follow the stimuli.
+        recordings: ``"demo"``, an NWB or HDF5 file, a folder, a glob, or an opened data set.
+        stimuli: a recipe name (default ``"rodgers"``), a scene file, a stimulus-set file or an HDF5
+            array file; see :func:`brainbench.stimuli.load_stimuli`.
+        estimator: ``"default"``, or ``"thesis"`` / ``"thesis-input"`` for the published ones.
+        **options: see :func:`score_record`.
+
+    Returns:
+        The score with its statistics.
+
+    Raises:
+        UsageError: a name, an option or a shape is wrong; the labels of both sides do not match.
+        DataError: a file was found but cannot be used.
+    """
+    options = {"baselines": False, **options}
+    return score_record(model, recordings=recordings, stimuli=stimuli, estimator=estimator, **options).score
+
+
+def score_record(
+    model: Any,
+    *,
+    recordings: str | os.PathLike[str] | xr.Dataset = "demo",
+    stimuli: Any = None,
+    estimator: str = "default",
+    conditions: str | None = None,
+    match: str | os.PathLike[str] | Mapping[str, str | None] | None = None,
+    select: Selection | str | None = None,
+    window: Window | str | None = None,
+    bin: float | None = None,
+    whiskers: str = "all",
+    fidelity: Fidelity | str | None = None,
+    layers: tuple[str, ...] | None = None,
+    normalize: bool = True,
+    time: TimeRule = "mean",
+    seed: int = 0,
+    baselines: bool = True,
+    progress: Progress | None = None,
+) -> ResultRecord:
+    """Score a model and its baselines, with everything that a leaderboard needs.
+
+    Args:
+        model, recordings, stimuli, estimator: as in :func:`score`.
+        conditions: ``TABLE:COLUMN[,COLUMN]``, the interval table and columns that label the trials.
+        match: recording label → stimulus label (None drops the recording label), as a mapping or a
+            JSON, TOML or CSV file; without it both sides must have the same labels.
+        select, window, bin: see :func:`brainbench.datasets.open_recordings`.
+        whiskers: which whiskers a recipe simulates, e.g. ``"C0-C3"``.
+        fidelity: preset name or settings of the simulation.
+        layers: the layers to compare; all of them by default.
+        normalize: give plain modules forces in units of 1e-4 N and moments in units of 1e-6 N·m,
+            as our own models do inside; False passes SI values.
+        time: how the time axis enters an RDM on both sides: ``"mean"`` averages over it,
+            ``"concatenate"`` keeps every step as features.
+        seed: seed of untrained weights, of split halves and of random features.
+        baselines: also score the raw input, random features and animal against animal.
+        progress: called with (done, total, what).
+
+    Returns:
+        The result record; its scores share one brain side.
+    """
+    from brainbench import metrics
+    from brainbench._sides import brain_side, join_labels, model_side
+
+    started = clock.perf_counter()
+    network = model_side(
+        model,
+        stimuli,
+        whiskers=whiskers,
+        fidelity=fidelity,
+        layers=layers,
+        normalize=normalize,
+        time=time,
+        seed=seed,
+        progress=progress,
+    )
+    brain = brain_side(recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress)
+    pairs = join_labels(brain.vocabulary, network.labels, match)
+    kept = tuple(pairs)
+    rows = [network.labels.index(label) for label in pairs.values()]
+    animals = brain.animals(kept, time=time, seed=seed)
+
+    def against_brain(name: str, rdms: Mapping[str, Any]) -> Score:
+        return metrics.score_rdms(
+            rdms, animals, name=name, stimuli=kept, estimator=estimator, compare=COMPARISON, seed=seed
+        )
+
+    scores = [against_brain(network.card.name, network.rdms(rows, RDM_METHOD))]
+    between = None
+    if baselines:
+        scores += [against_brain(name, rdms) for name, rdms in network.baseline_rdms(rows, RDM_METHOD, seed).items()]
+        between = metrics.score_animals(animals, stimuli=kept, estimator=estimator)
+
+    origin = provenance(
+        **network.origin,
+        recordings=brain.origin,
+        pairs=pairs,
+        settings={"time": time, "normalize": normalize, "layers": layers, "estimator": estimator, "seed": seed},
+        seconds=round(clock.perf_counter() - started, 2),
+    )
+    first, *others = (dataclasses.replace(item, provenance=origin) for item in scores)
+    return ResultRecord(
+        score=first,
+        animal_to_animal=between and dataclasses.replace(between, provenance=origin),
+        baselines={item.name: item for item in others},
+        card=network.card,
+        synthetic=brain.synthetic,
+    )

@@ -1,0 +1,49 @@
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from brainbench.errors import DataError, DataFileNotFoundError
+from brainbench.models.features import read_features, write_features
+
+
+def test_features_come_back_with_a_time_axis_and_their_names(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    layers = {"block/conv": rng.normal(size=(3, 4)), "gru": rng.normal(size=(3, 2, 5)).astype(np.float32)}
+    features = read_features(write_features(tmp_path / "a.h5", ["x", "y", "z"], layers))
+    assert features.labels == ("x", "y", "z")
+    assert set(features.activations) == set(layers)
+    np.testing.assert_array_equal(features.activations["block/conv"][:, 0], layers["block/conv"])
+    np.testing.assert_array_equal(features.activations["gru"], layers["gru"])
+
+
+def test_nested_groups_of_other_writers_become_layer_names(tmp_path: Path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["labels"] = np.array([b"x", b"y"])
+        file["activations/layer1/conv"] = np.ones((2, 3))
+    assert list(read_features(tmp_path / "a.h5").activations) == ["layer1/conv"]
+
+
+def test_bad_files_are_refused_in_words(tmp_path: Path):
+    with pytest.raises(DataFileNotFoundError, match="There is no file"):
+        read_features(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("hello")
+    with pytest.raises(DataError, match="cannot be read as HDF5"):
+        read_features(tmp_path / "text.h5")
+    with h5py.File(tmp_path / "bare.h5", "w") as file:
+        file["stuff"] = 1
+    with pytest.raises(DataError, match=r"holds 'stuff'.*needs a dataset 'labels'"):
+        read_features(tmp_path / "bare.h5")
+    with pytest.raises(DataError, match=r"shape \[2, 4\]; expected .* K = 3"):
+        write_features(tmp_path / "c.h5", ["x", "y", "z"], {"fc": np.ones((2, 4))})
+    with h5py.File(tmp_path / "twice.h5", "w") as file:
+        file["labels"] = np.array([b"x", b"x"])
+        file["activations/fc"] = np.ones((2, 3))
+    with pytest.raises(DataError, match="'x' more than once"):
+        read_features(tmp_path / "twice.h5")
+    with h5py.File(tmp_path / "empty.h5", "w") as file:
+        file["labels"] = np.array([b"x", b"y"])
+        file.create_group("activations")
+    with pytest.raises(DataError, match="no layer"):
+        read_features(tmp_path / "empty.h5")
