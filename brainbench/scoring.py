@@ -12,6 +12,7 @@ import time as clock
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
+from brainbench.files import provenance
 from brainbench.types import ResultRecord, Score
 
 if TYPE_CHECKING:

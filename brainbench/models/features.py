@@ -71,17 +71,17 @@ def read_features(path: str | Path) -> Features:
             f"{str(path)!r} cannot be read as HDF5: it is truncated or of another kind ({error})."
         ) from error
     with file:
-        for name in ("labels", "activations"):
-            if name not in file:
-                raise DataError(
-                    f"{str(path)!r} holds {listing(file)}; a file of activations needs a dataset 'labels' [K] and a "
-                    "group 'activations' with one dataset [K, F] or [K, T, F] per layer."
-                )
-        labels = tuple(_text(label) for label in np.ravel(file["labels"][()]))
+        labels, group = file.get("labels"), file.get("activations")
+        if not isinstance(labels, h5py.Dataset) or not isinstance(group, h5py.Group):
+            raise DataError(
+                f"{str(path)!r} holds {listing(file)}; a file of activations needs a dataset 'labels' [K] and a "
+                "group 'activations' with one dataset [K, F] or [K, T, F] per layer."
+            )
+        labels = tuple(_text(label) for label in np.ravel(labels[()]))
         repeated = sorted({label for label in labels if labels.count(label) > 1})
         if repeated:
             raise DataError(f"{str(path)!r} has the label {repeated[0]!r} more than once; labels must be unique.")
-        layers = _layers(file["activations"], len(labels), str(path))
+        layers = _layers(group, len(labels), str(path))
     if not layers:
         raise DataError(f"{str(path)!r} has no layer in its group 'activations'.")
     return Features(labels, layers)
@@ -90,8 +90,6 @@ def read_features(path: str | Path) -> Features:
 def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.floating]]:
     import h5py
 
-    if not isinstance(group, h5py.Group):
-        raise DataError(f"'activations' of {path!r} is a dataset; it must be a group with one dataset per layer.")
     layers: dict[str, NDArray[np.floating]] = {}
 
     def visit(name: str, item: object) -> None:
