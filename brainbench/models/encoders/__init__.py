@@ -1,1 +1,1 @@
-"""TODO."""
+"""Encoders: a stimulus [B, T, C, H, W] to features [B, T, F]."""

@@ -1,0 +1,139 @@
+"""Convolution and linear layers that draw their own initial weights and pad as PyTorch's "same" does.
+
+Initial weights are uniform with variance gain²/fan_in, so that the scale of a signal survives depth:
+gain √2 before a rectifier (He et al. 2015), 1 before saturating gates. PyTorch's default (gain 1/√3)
+would shrink a sweep about tenfold by the sixth layer. Uniform numbers are also several times faster to
+draw than normal ones, which is felt at 38 M parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from brainbench.errors import UsageError, unknown_name
+
+RECTIFIER_GAIN = math.sqrt(2.0)
+
+ACTIVATIONS: Mapping[str, type[nn.Module]] = {
+    "elu": nn.ELU,
+    "gelu": nn.GELU,
+    "leakyrelu": nn.LeakyReLU,
+    "relu": nn.ReLU,
+    "sigmoid": nn.Sigmoid,
+    "tanh": nn.Tanh,
+}
+"""Activation functions by lower-case name."""
+
+INITIALISERS = ("kaiming_normal_", "kaiming_uniform_", "orthogonal_", "xavier_normal_", "xavier_uniform_")
+"""Initialisers of :mod:`torch.nn.init` that a configuration may name."""
+
+
+def pair(value: int | tuple[int, int] | list[int], what: str) -> tuple[int, int]:
+    """Return (rows, columns) from one number or two.
+
+    Raises:
+        UsageError: it is neither.
+    """
+    values = (value, value) if isinstance(value, int) else tuple(value)
+    if len(values) != 2 or not all(isinstance(item, int) and item > 0 for item in values):
+        raise UsageError(f"The {what} must be a positive integer or a pair of them; received {value!r}.")
+    return values
+
+
+def activation(name: str | None) -> nn.Module:
+    """Build an activation by name (:data:`ACTIVATIONS`, any case); None is the identity."""
+    if name is None:
+        return nn.Identity()
+    if name.lower() not in ACTIVATIONS:
+        raise unknown_name("activation", name, ACTIVATIONS)
+    return ACTIVATIONS[name.lower()]()
+
+
+def same_padding(kernel_size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return (left, right, top, bottom) zeros that keep the grid's size; odd ones go right and below."""
+    rows, columns = kernel_size
+    return (columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2
+
+
+@torch.no_grad()
+def initialise(layer: nn.Conv2d | nn.Linear, *, gain: float, bias: float | None, method: Mapping[str, Any] | None) -> None:
+    """Draw a layer's weight and set its bias (None: uniform within 1/√fan_in, as PyTorch does)."""
+    fan_in = layer.weight[0].numel()
+    if method is None:
+        bound = gain * math.sqrt(3.0 / fan_in)
+        layer.weight.uniform_(-bound, bound)
+    else:
+        options = dict(method)
+        getattr(nn.init, options.pop("method"))(layer.weight, **options)
+    if layer.bias is not None:
+        if bias is None:
+            bound = 1.0 / math.sqrt(fan_in)
+            layer.bias.uniform_(-bound, bound)
+        else:
+            layer.bias.fill_(bias)
+
+
+class Conv2d(nn.Conv2d):
+    """2-D convolution [B, C, H, W] → [B, out, H', W'] with zero padding "same", "valid" or a number.
+
+    For an even kernel "same" adds the odd row and column below and to the right, as PyTorch does,
+    but without its warning.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        *,
+        kernel_size: tuple[int, int],
+        stride: tuple[int, int] = (1, 1),
+        padding: str | tuple[int, int] = "same",
+        use_bias: bool = True,
+        bias: float | None = 0.0,
+        gain: float = RECTIFIER_GAIN,
+        method: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._initial = {"gain": gain, "bias": bias, "method": method}
+        self._extra: tuple[int, int, int, int] | None = None
+        symmetric = (0, 0) if isinstance(padding, str) else padding
+        if padding == "same":
+            left, right, top, bottom = same_padding(kernel_size)
+            symmetric = (top, left)
+            if (left, top) != (right, bottom):
+                symmetric, self._extra = (0, 0), (left, right, top, bottom)
+        super().__init__(in_channels, out_channels, kernel_size, stride, symmetric, bias=use_bias)
+
+    def reset_parameters(self) -> None:
+        """Draw new weights from the global random state."""
+        initialise(self, **self._initial)
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:  # noqa: A002 - the name in nn.Conv2d
+        """Convolve [B, C, H, W]."""
+        return super().forward(input if self._extra is None else functional.pad(input, self._extra))
+
+
+class Linear(nn.Linear):
+    """Linear layer [..., in] → [..., out] with this module's initial weights."""
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        use_bias: bool = True,
+        bias: float | None = 0.0,
+        gain: float = 1.0,
+        method: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._initial = {"gain": gain, "bias": bias, "method": method}
+        super().__init__(in_features, out_features, bias=use_bias)
+
+    def reset_parameters(self) -> None:
+        """Draw new weights from the global random state."""
+        initialise(self, **self._initial)

@@ -1,0 +1,275 @@
+r"""Convolutional recurrent cells.
+
+Every cell maps an input x [B, C, H, W] and a state s to an output y [B, out, H, W] and the next state.
+Gates come from one fused "same" convolution of cat(x, s). ``layer_norm`` normalises each gate's
+pre-activation over channels at every place (Ba et al. 2016). A gate that keeps the old state carries a
+fixed +1 inside its sigmoid, so that a fresh cell remembers. Biases start at zero.
+
+Equations: UGRNN and IntersectionRNN, Collins et al. 2017; GRU, Cho et al. 2014; LSTM, Hochreiter and
+Schmidhuber 1997, Gers et al. 2000. Order and names of the gates follow PyTorchTNN, whose weights
+:meth:`load_tnn_state` reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import nn
+
+from brainbench.errors import UsageError
+from brainbench.models._layers import Conv2d, pair
+from brainbench.models._tnn_state import load_named
+
+FORGET_BIAS = 1.0
+
+
+class ChannelNorm(nn.LayerNorm):
+    """LayerNorm over the channels of [B, C, H, W], separately at every place."""
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:  # noqa: A002 - the name in nn.LayerNorm
+        """Normalise [B, C, H, W] over C."""
+        return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class Cell(nn.Module):
+    """What all cells share: the state's shape, zero initial states and PyTorchTNN's names.
+
+    Args:
+        in_channels: Channels of x.
+        out_channels: Channels of y.
+        kernel_size: One number or (rows, columns) of the gates' convolution.
+        layer_norm: Normalise each gate over channels.
+    """
+
+    state_factor: ClassVar[int] = 1
+    """Channels of the state per output channel."""
+    tnn_names: ClassVar[Mapping[str, str]] = {}
+    """Our submodule names → PyTorchTNN's."""
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        if in_channels < 1 or out_channels < 1:
+            raise UsageError(f"{type(self).__name__} needs channels ≥ 1; received {in_channels} and {out_channels}.")
+        self.in_channels = in_channels
+        self.out_channels = out_channels
+
+    def initial_state(
+        self,
+        batch: int,
+        *spatial: int,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> torch.Tensor:
+        """Return the zero state [batch, state channels, *spatial], like the parameters unless told otherwise."""
+        like = next(self.parameters())
+        shape = (batch, self.state_factor * self.out_channels, *spatial)
+        return torch.zeros(shape, device=device or like.device, dtype=dtype or like.dtype)
+
+    def load_tnn_state(self, state: Mapping[str, Any]) -> None:
+        """Load arrays or tensors under PyTorchTNN's parameter names, such as ``conv.weight``.
+
+        Raises:
+            DataError: a name is missing or unexpected, or a shape differs.
+        """
+        load_named(self.tnn_parameters(), state, what=f"{type(self).__name__}")
+
+    def tnn_parameters(self) -> dict[str, torch.Tensor]:
+        """Return the parameters under PyTorchTNN's names."""
+        renamed = {}
+        for name, value in self.named_parameters():
+            owner, _, leaf = name.rpartition(".")
+            renamed[f"{self.tnn_names[owner]}.{leaf}" if owner else leaf] = value
+        return renamed
+
+    def _check(self, x: torch.Tensor, state: torch.Tensor | None) -> torch.Tensor:
+        if x.ndim < 2 or x.shape[1] != self.in_channels:
+            raise UsageError(
+                f"{type(self).__name__} expects [batch, {self.in_channels}, rows, columns]; received {list(x.shape)}."
+            )
+        if state is None:
+            return self.initial_state(x.shape[0], *x.shape[2:], device=x.device, dtype=x.dtype)
+        expected = (x.shape[0], self.state_factor * self.out_channels, *x.shape[2:])
+        if tuple(state.shape) != expected:
+            raise UsageError(
+                f"{type(self).__name__} expects a state of shape {list(expected)}; received {list(state.shape)}."
+            )
+        return state
+
+
+class TimeDecay(Cell):
+    """Leaky trace: s ← x + τ s, y = s, with one trainable scalar τ that starts at zero.
+
+    Works on any [B, C, ...]. ``kernel_size`` is accepted for a uniform signature and unused.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        *,
+        kernel_size: int | tuple[int, int] | None = None,
+        layer_norm: bool = False,
+        tau: float = 0.0,
+    ) -> None:
+        super().__init__(in_channels, out_channels)
+        if layer_norm:
+            raise UsageError("TimeDecay has no gates to normalise; leave layer_norm off or take a gated cell.")
+        if in_channels != out_channels:
+            raise UsageError(f"TimeDecay keeps its channels; received {in_channels} in and {out_channels} out.")
+        self.tau = nn.Parameter(torch.tensor(float(tau)))
+
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, C, ...]."""
+        state = x + self.tau * self._check(x, state)
+        return state, state
+
+
+class _GatedCell(Cell):
+    """A cell with one fused convolution for all its gates."""
+
+    gates: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
+    ) -> None:
+        super().__init__(in_channels, out_channels)
+        self.conv = self._convolution(len(self.gates), kernel_size)
+        self.norms = nn.ModuleDict({name: ChannelNorm(out_channels) for name in self.gates} if layer_norm else {})
+
+    def _convolution(self, gates: int, kernel_size: int | tuple[int, int]) -> Conv2d:
+        size = pair(kernel_size, "kernel size of a cell")
+        return Conv2d(self.in_channels + self.out_channels, gates * self.out_channels, kernel_size=size, gain=1.0)
+
+    def _gates(self, x: torch.Tensor, memory: torch.Tensor) -> list[torch.Tensor]:
+        """Return each gate's pre-activation [B, out, H, W] in the order of :attr:`gates`."""
+        return self._normalised(self.conv(torch.cat((x, memory), 1)), self.gates)
+
+    def _normalised(self, fused: torch.Tensor, names: tuple[str, ...]) -> list[torch.Tensor]:
+        parts = fused.chunk(len(names), 1)
+        if not self.norms:
+            return list(parts)
+        return [self.norms[name](part) for name, part in zip(names, parts, strict=True)]
+
+
+class UGRNN(_GatedCell):
+    """Update-gate cell: g = σ(g' + 1), c = tanh(c'), s ← g s + (1 − g) c, y = s (Collins et al. 2017)."""
+
+    gates = ("g", "c")
+    tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv", "norms.g": "ln_g_act", "norms.c": "ln_c_act"}
+
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W]."""
+        state = self._check(x, state)
+        keep, candidate = self._gates(x, state)
+        keep = torch.sigmoid(keep + FORGET_BIAS)
+        state = keep * state + (1 - keep) * torch.tanh(candidate)
+        return state, state
+
+
+class IntersectionRNN(_GatedCell):
+    """Cell gated through time and through depth (Collins et al. 2017).
+
+    State: p = σ(p' + 1), s ← p s + (1 − p) tanh(m'). Output: q = σ(q' + 1), y = q x + (1 − q) relu(n').
+    """
+
+    gates = ("gh", "h", "gy", "y")
+    tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv"} | {f"norms.{name}": f"ln_{name}_act" for name in gates}
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
+    ) -> None:
+        if in_channels != out_channels:
+            raise UsageError(
+                "IntersectionRNN mixes its input into its output, so both need the same channels; "
+                f"received {in_channels} in and {out_channels} out."
+            )
+        super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
+
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W]."""
+        state = self._check(x, state)
+        keep, candidate, through, output = self._gates(x, state)
+        keep = torch.sigmoid(keep + FORGET_BIAS)
+        through = torch.sigmoid(through + FORGET_BIAS)
+        y = through * x + (1 - through) * torch.relu(output)
+        return y, keep * state + (1 - keep) * torch.tanh(candidate)
+
+
+class GRU(_GatedCell):
+    """Gated recurrent unit with two convolutions (Cho et al. 2014).
+
+    r = σ(r' + 1), u = σ(u') from cat(x, s); c = tanh of a second convolution of cat(x, r s);
+    s ← u s + (1 − u) c, y = s. The fixed +1 sits on the reset gate alone.
+    """
+
+    gates = ("r", "u")
+    tnn_names: ClassVar[Mapping[str, str]] = {
+        "conv": "conv_ru",
+        "candidate": "conv_c",
+        "norms.r": "ln_r_pre",
+        "norms.u": "ln_u_pre",
+        "norms.c": "ln_c_pre",
+    }
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
+    ) -> None:
+        super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
+        self.candidate = self._convolution(1, kernel_size)
+        if layer_norm:
+            self.norms["c"] = ChannelNorm(out_channels)
+
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W]."""
+        state = self._check(x, state)
+        reset, keep = self._gates(x, state)
+        reset, keep = torch.sigmoid(reset + FORGET_BIAS), torch.sigmoid(keep)
+        (candidate,) = self._normalised(self.candidate(torch.cat((x, reset * state), 1)), ("c",))
+        state = keep * state + (1 - keep) * torch.tanh(candidate)
+        return state, state
+
+
+class LSTM(_GatedCell):
+    """Long short-term memory; the state is cat(c, h) [B, 2 out, H, W].
+
+    c ← c σ(f' + 1) + σ(i') tanh(j'), normalised too with ``layer_norm``; h = tanh(c) σ(o'); y = h.
+    """
+
+    state_factor = 2
+    gates = ("i", "j", "f", "o")
+    tnn_names: ClassVar[Mapping[str, str]] = {
+        "conv": "conv",
+        "norms.i": "ln_input",
+        "norms.j": "ln_transform",
+        "norms.f": "ln_forget",
+        "norms.o": "ln_output",
+        "norms.c": "ln_state",
+    }
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
+    ) -> None:
+        super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
+        if layer_norm:
+            self.norms["c"] = ChannelNorm(out_channels)
+
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y [B, out, H, W], state [B, 2 out, H, W])."""
+        memory, hidden = self._check(x, state).chunk(2, 1)
+        write, candidate, keep, read = self._gates(x, hidden)
+        memory = memory * torch.sigmoid(keep + FORGET_BIAS) + torch.sigmoid(write) * torch.tanh(candidate)
+        (memory,) = self._normalised(memory, ("c",))
+        hidden = torch.tanh(memory) * torch.sigmoid(read)
+        return hidden, torch.cat((memory, hidden), 1)
+
+
+CELLS: Mapping[str, type[Cell]] = {
+    "time-decay": TimeDecay,
+    "ugrnn": UGRNN,
+    "intersection": IntersectionRNN,
+    "gru": GRU,
+    "lstm": LSTM,
+}
+"""Cells by the name that graphs and the registry use."""

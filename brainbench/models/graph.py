@@ -1,0 +1,394 @@
+"""Temporal graphs: networks with feedback, unrolled over time.
+
+Two unrollings of the same weights. ``biological``: every connection takes one step, so a stimulus
+climbs one area per step (Nayebi et al. 2018). ``full``: feedforward connections act within the step and
+only feedback is delayed. Nodes whose inputs have not arrived yet receive zeros; their biases still act.
+
+Letters: B batch, T step, (C, H, W) one step of the stimulus or of a node.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from brainbench.errors import UsageError, unknown_name
+from brainbench.models._layers import RECTIFIER_GAIN, Conv2d, Linear, activation
+from brainbench.models._tnn_config import read_graph
+from brainbench.models._tnn_state import check_named, copy_named
+from brainbench.models.cells import CELLS, Cell, TimeDecay
+from brainbench.models.graph_spec import Convolution, GraphSpec, Node, Pool, Shape, Unroll, check_unroll
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class GraphState:
+    """What a graph carries from one step to the next."""
+
+    outputs: Mapping[str, torch.Tensor]
+    """Last output of every node [B, ...]."""
+    memories: Mapping[str, torch.Tensor]
+    """State of every cell [B, ...]."""
+
+
+class _NodeModule(nn.Module):
+    """Operation, memory, activation and pool of one node."""
+
+    def __init__(self, node: Node, shape: Shape) -> None:
+        super().__init__()
+        self.node = node
+        self.grid = shape[1:]
+        self.operation, channels = _operation(node, shape)
+        self.memory: Cell | None = None
+        if node.memory is not None:
+            cell, size = CELLS[node.memory.kind], node.memory.kernel_size
+            options = {"tau": node.memory.tau} if cell is TimeDecay else {"layer_norm": node.memory.layer_norm}
+            self.memory = cell(channels, channels, kernel_size=size, **options)
+        self.dropout = nn.Dropout(node.operation.dropout if node.operation is not None else 0.0)
+        self.before = activation(node.operation.activation if node.operation is not None else None)
+        self.after = nn.Sequential(activation(node.activation), *_pool(node.pool))
+
+    def gather(self, inputs: list[torch.Tensor]) -> torch.Tensor:
+        """Resize inputs [B, C, H, W] to the node's grid and concatenate them on channels."""
+        fitted = [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
+        return fitted[0] if len(fitted) == 1 else torch.cat(fitted, 1)
+
+    def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
+        """Return what the memory sees [B, ...]."""
+        x = self.dropout(self.gather(inputs))
+        if isinstance(self.operation, Linear):
+            x = x.flatten(1)
+        return self.before(self.operation(x))
+
+
+class TemporalGraph(nn.Module):
+    """A network of areas with feedforward and feedback connections.
+
+    Args:
+        spec: The graph. ``spec.input_shape`` (C, H, W) is what every step of the stimulus must have.
+
+    ``layers`` lists the nodes in feedforward order; :meth:`step` streams, :meth:`forward` takes a sweep.
+    """
+
+    def __init__(self, spec: GraphSpec) -> None:
+        super().__init__()
+        self._fixed_shape = True
+        self._open_grid = False
+        self.spec = spec
+        self.layers = spec.order
+        inputs, self._shapes = spec.shapes()
+        self.nodes = nn.ModuleDict({name: _NodeModule(spec.by_name[name], inputs[name]) for name in spec.order})
+        self._groups = spec.groups()
+        self._predecessors = {name: spec.predecessors(name) for name in spec.order}
+
+    @classmethod
+    def from_config(
+        cls,
+        source: Mapping[str, Any] | str | os.PathLike[str],
+        *,
+        input_shape: tuple[int, int, int] | None = None,
+    ) -> TemporalGraph:
+        """Build a graph from PyTorchTNN's configuration: a mapping or the path of a JSON file.
+
+        Args:
+            source: The configuration.
+            input_shape: (C, H, W) that overrides the configuration's. PyTorchTNN's published files
+                declare shapes that its callers override, so without this argument the declared shape is
+                a default: :meth:`load_tnn_state` gives it up if the weights were made for another.
+
+        Raises:
+            DataError: the file is missing or not JSON, or a key is missing or unsupported.
+            UsageError: the graph is not valid.
+        """
+        spec = read_graph(source)
+        graph = cls(spec if input_shape is None else replace(spec, input_shape=tuple(input_shape)))
+        graph._fixed_shape = input_shape is not None
+        return graph
+
+    @property
+    def input_shape(self) -> tuple[int, int, int]:
+        """(C, H, W) of one step of the stimulus."""
+        return self.spec.input_shape
+
+    def load_tnn_state(self, state: Mapping[str, Any]) -> None:
+        """Load arrays or tensors under PyTorchTNN's names, ``<node>._pre_memory.conv.weight`` and so on.
+
+        Raises:
+            DataError: names are missing or unexpected, or shapes differ; the graph is then unchanged.
+        """
+        resized = {} if self._fixed_shape else self._resized_by(state)
+        shapes = {name: tuple(value.shape) for name, value in self.tnn_parameters().items()} | resized
+        check_named(shapes, state, what="this graph")
+        if resized:
+            _log.warning(
+                "These weights were not made for the stimulus shape %s of the configuration; the shape is taken "
+                "from the first stimulus instead.",
+                list(self.input_shape),
+            )
+            self._resize_operations(resized)
+        copy_named(self.tnn_parameters(), state)
+
+    def tnn_parameters(self) -> dict[str, torch.Tensor]:
+        """Return the parameters under PyTorchTNN's names."""
+        renamed: dict[str, torch.Tensor] = {}
+        for name, node in self._items():
+            renamed.update({f"{_tnn_owner(name, node)}.{key}": p for key, p in node.operation.named_parameters()})
+            if node.memory is not None:
+                cell = node.memory.tnn_parameters()
+                renamed.update({f"{name}._recurrent_cell.{key}": value for key, value in cell.items()})
+        return renamed
+
+    def _resized_by(self, state: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+        """Return the weights in ``state`` that differ from ours only as another stimulus shape would make them."""
+        resized = {}
+        for name, node in self._items():
+            key = f"{_tnn_owner(name, node)}.weight"
+            follows = isinstance(node.operation, Linear) or name in self.spec.inputs
+            if key in state and follows and isinstance(node.operation, (Conv2d, Linear)):
+                new, old = tuple(state[key].shape), tuple(node.operation.weight.shape)
+                if new != old and len(new) == len(old) and new[:1] + new[2:] == old[:1] + old[2:]:
+                    resized[key] = new
+        return resized
+
+    def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
+        for name, node in self._items():
+            shape = resized.get(f"{_tnn_owner(name, node)}.weight")
+            if shape is not None:
+                node.operation.weight = nn.Parameter(node.operation.weight.new_empty(shape))
+                setattr(node.operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
+        # The grid shows in the weights only as a product, so it stays open until a stimulus arrives.
+        self._open_grid = True
+
+    def _accept(self, shape: Shape) -> None:
+        """Check one step's shape (C, H, W) against the graph; an open grid takes it on."""
+        if not self._open_grid:
+            if shape != self.input_shape:
+                raise UsageError(
+                    f"This graph expects steps of shape [channels, rows, columns] = {list(self.input_shape)}; "
+                    f"received {list(shape)}."
+                )
+            return
+        spec = replace(self.spec, input_shape=shape)
+        inputs, outputs = spec.shapes()
+        for name, node in self._items():
+            if isinstance(node.operation, (Conv2d, Linear)):
+                dense = isinstance(node.operation, Linear)
+                needed = math.prod(inputs[name]) if dense else inputs[name][0]
+                if needed != node.operation.weight.shape[1]:
+                    raise UsageError(
+                        f"The loaded weights do not fit steps of shape {list(shape)}: node {name!r} would receive "
+                        f"{needed} values and has weights for {node.operation.weight.shape[1]}."
+                    )
+            node.grid = inputs[name][1:]
+        self.spec, self._shapes, self._open_grid = spec, outputs, False
+
+    def init_state(
+        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> GraphState:
+        """Return the state before the first step: silent nodes and empty memories, all zeros."""
+        if self._open_grid:
+            raise UsageError("The stimulus shape is still open; pass input_shape to TemporalGraph.from_config.")
+        like = next(self.parameters())
+        options = {"device": device or like.device, "dtype": dtype or like.dtype}
+        outputs = {name: torch.zeros(batch, *self._shapes[name], **options) for name in self.layers}
+        memories = {
+            name: node.memory.initial_state(batch, *self._memory_grid(name), **options)
+            for name, node in self._items()
+            if node.memory is not None
+        }
+        return GraphState(outputs, memories)
+
+    def _memory_grid(self, name: str) -> Shape:
+        node = self.spec.by_name[name]
+        shape = (1, *self.node(name).grid)
+        return (node.operation.output_shape(shape) if node.operation is not None else shape)[1:]
+
+    def node(self, name: str) -> _NodeModule:
+        """Return the module of a node."""
+        module = self.nodes[name]
+        return module  # type: ignore[return-value]  # ModuleDict is not generic
+
+    def step(
+        self, x: torch.Tensor, state: GraphState, *, unroll: Unroll = "biological"
+    ) -> tuple[torch.Tensor, GraphState]:
+        """Advance by one step of the stimulus [B, C, H, W]; return the output [B, ...] and the next state.
+
+        Equals :meth:`forward` step by step.
+        """
+        check_unroll(unroll)
+        if x.ndim != 4:
+            raise UsageError(f"A step expects [batch, channels, rows, columns]; received {list(x.shape)}.")
+        self._accept(tuple(x.shape[1:]))
+        outputs: dict[str, torch.Tensor] = {}
+        memories: dict[str, torch.Tensor] = {}
+        for name in self.layers:
+            inputs = [x] if name in self.spec.inputs else []
+            for edge in self._predecessors[name]:
+                delayed = unroll == "biological" or edge.feedback
+                inputs.append((state.outputs if delayed else outputs)[edge.source])
+            outputs[name] = self._advance(name, self.node(name).operate(inputs), state.memories, memories)
+        return outputs[self.spec.output], GraphState(outputs, memories)
+
+    def _advance(
+        self,
+        name: str,
+        x: torch.Tensor,
+        before: Mapping[str, torch.Tensor],
+        after: dict[str, torch.Tensor],
+    ) -> torch.Tensor:
+        node = self.node(name)
+        if node.memory is not None:
+            x, after[name] = node.memory(x, before.get(name))
+        return node.after(x)
+
+    def forward(
+        self,
+        x: torch.Tensor,
+        unroll: Unroll = "biological",
+        return_activations: bool | Collection[str] = False,
+    ) -> Any:
+        """Process a sweep [B, T, C, H, W].
+
+        Args:
+            x: The sweep.
+            unroll: ``biological`` or ``full``.
+            return_activations: True for every node, or the names of the nodes wanted.
+
+        Returns:
+            The outputs [B, T, ...], and with ``return_activations`` also ``{node: [B, T, ...]}``.
+
+        Raises:
+            UsageError: the shape does not fit, or a node or unrolling does not exist.
+        """
+        check_unroll(unroll)
+        wanted = self._wanted(return_activations)
+        if x.ndim != 5 or x.shape[1] < 1:
+            raise UsageError(
+                f"A temporal graph expects [batch, time, channels, rows, columns]; received {list(x.shape)}."
+            )
+        self._accept(tuple(x.shape[2:]))
+        kept: dict[str, torch.Tensor] = {}
+        for position, group in enumerate(self._groups):
+            later = {name for other in self._groups[position + 1 :] for name in other}
+            needed = {e.source for name in later for e in self._predecessors[name]} | wanted | {self.spec.output}
+            cyclic = len(group) > 1 or any(edge.source == group[0] for edge in self._predecessors[group[0]])
+            compute = self._compute_loop if cyclic else self._compute_sweep
+            kept.update(compute(group, x, kept, unroll, needed))
+            for name in [name for name in kept if name not in needed]:
+                del kept[name]
+        output = kept[self.spec.output]
+        return (output, {name: kept[name] for name in self.layers if name in wanted}) if return_activations else output
+
+    def _wanted(self, return_activations: bool | Collection[str]) -> set[str]:
+        if isinstance(return_activations, bool):
+            return set(self.layers) if return_activations else set()
+        for name in return_activations:
+            if name not in self.layers:
+                raise unknown_name("node", name, self.layers)
+        return set(return_activations)
+
+    def _compute_sweep(
+        self,
+        group: tuple[str, ...],
+        x: torch.Tensor,
+        kept: Mapping[str, torch.Tensor],
+        unroll: Unroll,
+        needed: Collection[str],
+    ) -> dict[str, torch.Tensor]:
+        """Compute a node outside every loop for all steps at once, which reads its weights once."""
+        del needed
+        (name,) = group
+        node, (batch, steps) = self.node(name), x.shape[:2]
+        inputs = [x.flatten(0, 1)] if name in self.spec.inputs else []
+        for edge in self._predecessors[name]:
+            source = kept[edge.source]
+            if unroll == "biological" or edge.feedback:
+                source = torch.cat((torch.zeros_like(source[:, :1]), source[:, :-1]), 1)
+            inputs.append(source.flatten(0, 1))
+        y = node.operate(inputs)
+        if node.memory is not None:
+            sequence, state, outputs = y.unflatten(0, (batch, steps)), None, []
+            for t in range(steps):
+                output, state = node.memory(sequence[:, t], state)
+                outputs.append(output)
+            y = torch.stack(outputs, 1).flatten(0, 1)
+        return {name: node.after(y).unflatten(0, (batch, steps))}
+
+    def _compute_loop(
+        self,
+        group: tuple[str, ...],
+        x: torch.Tensor,
+        kept: Mapping[str, torch.Tensor],
+        unroll: Unroll,
+        needed: Collection[str],
+    ) -> dict[str, torch.Tensor]:
+        """Compute nodes that feed back on one another step by step; keep the outputs that are needed."""
+        batch, steps = x.shape[:2]
+        previous = {name: x.new_zeros(batch, *self._shapes[name]) for name in group}
+        memories: dict[str, torch.Tensor] = {}
+        history: dict[str, list[torch.Tensor]] = {name: [] for name in group if name in needed}
+        for t in range(steps):
+            current: dict[str, torch.Tensor] = {}
+            for name in group:
+                inputs = [x[:, t]] if name in self.spec.inputs else []
+                for edge in self._predecessors[name]:
+                    delayed = unroll == "biological" or edge.feedback
+                    if edge.source in previous:
+                        inputs.append((previous if delayed else current)[edge.source])
+                        continue
+                    source, at = kept[edge.source], t - delayed
+                    inputs.append(source[:, at] if at >= 0 else torch.zeros_like(source[:, 0]))
+                current[name] = self._advance(name, self.node(name).operate(inputs), memories, memories)
+            previous = current
+            for name, outputs in history.items():
+                outputs.append(current[name])
+        return {name: torch.stack(outputs, 1) for name, outputs in history.items()}
+
+    def _items(self) -> list[tuple[str, _NodeModule]]:
+        return [(name, self.node(name)) for name in self.layers]
+
+
+def _tnn_owner(name: str, node: _NodeModule) -> str:
+    return f"{name}._pre_memory.{'lin' if isinstance(node.operation, Linear) else 'conv'}"
+
+
+def _operation(node: Node, shape: Shape) -> tuple[nn.Module, int]:
+    """Build a node's operation for its concatenated input shape; return it with its output channels."""
+    what = node.operation
+    if what is None:
+        return nn.Identity(), shape[0]
+    options = {"use_bias": what.use_bias, "bias": what.bias, "method": what.initialiser}
+    if isinstance(what, Convolution):
+        layer = Conv2d(
+            shape[0],
+            what.channels,
+            kernel_size=what.kernel_size,
+            stride=what.stride,
+            padding=what.padding,
+            **options,
+        )
+        return layer, what.channels
+    return Linear(math.prod(shape), what.features, gain=RECTIFIER_GAIN, **options), what.features
+
+
+def _pool(pool: Pool | None) -> list[nn.Module]:
+    if pool is None:
+        return []
+    if pool.kind == "max":
+        layer: nn.Module = nn.MaxPool2d(pool.size, pool.stride, pool.padding, ceil_mode=pool.ceil_mode)
+    else:
+        layer = nn.AdaptiveAvgPool2d(pool.size)
+    return [layer, nn.Flatten()] if pool.flatten else [layer]
+
+
+def _resize(x: torch.Tensor, grid: Shape) -> torch.Tensor:
+    return functional.interpolate(x, size=grid, mode="bilinear", align_corners=False, antialias=True)
