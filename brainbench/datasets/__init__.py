@@ -1,1 +1,33 @@
-"""TODO."""
+"""Recordings of brains: open them, look into them, write them, and make the demo ones.
+
+>>> from brainbench.datasets import open_recordings
+>>> open_recordings("sessions/*.nwb", conditions="trials:stimulus")  # doctest: +SKIP
+"""
+
+from brainbench.datasets.blocks import SessionBlock, blocks
+from brainbench.datasets.conditions import Conditions
+from brainbench.datasets.hdf5 import write_recordings
+from brainbench.datasets.inspection import Inspection, inspect
+from brainbench.datasets.recipes import Recipe, get_recipe, list_recipes
+from brainbench.datasets.recordings import open_recordings
+from brainbench.datasets.selection import Rule, Selection
+from brainbench.datasets.sessions import Session, make_session
+from brainbench.datasets.window import Window
+
+__all__ = [
+    "Conditions",
+    "Inspection",
+    "Recipe",
+    "Rule",
+    "Selection",
+    "Session",
+    "SessionBlock",
+    "Window",
+    "blocks",
+    "get_recipe",
+    "inspect",
+    "list_recipes",
+    "make_session",
+    "open_recordings",
+    "write_recordings",
+]

@@ -1,0 +1,79 @@
+"""Hand trials to the metrics: one block per session, because units differ between sessions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.types import check_recordings
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class SessionBlock:
+    """Trials and units that were recorded together. Letters: R trials, T time bins, U units."""
+
+    subject: str
+    session: str
+    responses: NDArray[np.float64]
+    """[R, T, U] firing rate, Hz; NaN where a unit was not recorded in a trial."""
+    labels: NDArray[np.int64]
+    """[R] index into the data set's vocabulary."""
+    keys: tuple[str, ...]
+    """[R] a name for each trial, unique in the data set and independent of its order."""
+    units: tuple[str, ...]
+    """[U] unit identifiers."""
+
+
+def blocks(dataset: xr.Dataset) -> dict[str, tuple[SessionBlock, ...]]:
+    """Split recordings into blocks, by subject and session in the order of the data set.
+
+    Trials and units without any recorded value are left out. A session without a trial left gives no
+    block; a subject without a block does not appear.
+
+    Raises:
+        DataError: ``dataset`` is not a recordings data set.
+    """
+    check_recordings(dataset)
+    counts, duration = dataset["counts"].values, dataset["duration"].values
+    subjects, sessions = dataset["subject"].values.astype(str), dataset["session"].values.astype(str)
+    unit_subjects, unit_sessions = (dataset[name].values.astype(str) for name in ("unit_subject", "unit_session"))
+    position = {label: index for index, label in enumerate(dataset.attrs["vocabulary"])}
+    labels = np.array([position[label] for label in dataset["stimulus"].values.astype(str).tolist()], dtype=np.int64)
+    ids, unit_ids = dataset["trial_id"].values.astype(str), dataset["unit_id"].values.astype(str)
+    found: dict[str, list[SessionBlock]] = {}
+    for subject, session in dict.fromkeys(zip(subjects.tolist(), sessions.tolist(), strict=True)):
+        rows = np.flatnonzero((subjects == subject) & (sessions == session))
+        columns = np.flatnonzero((unit_subjects == subject) & (unit_sessions == session))
+        own = counts[np.ix_(rows, np.arange(counts.shape[1]), columns)]
+        recorded = np.isfinite(own)
+        keep, units = recorded.any(axis=(1, 2)), recorded.any(axis=(0, 1))
+        if not keep.any():
+            continue
+        seconds = np.where(duration[rows] > 0, duration[rows], np.nan)[keep]
+        found.setdefault(subject, []).append(
+            SessionBlock(
+                subject=subject,
+                session=session,
+                responses=own[keep][:, :, units] / seconds[:, :, None],
+                labels=labels[rows][keep],
+                keys=_unique([f"{subject}/{session}/{ids[row]}" for row in rows[keep]]),
+                units=tuple(unit_ids[columns][units].tolist()),
+            )
+        )
+    return {subject: tuple(items) for subject, items in found.items()}
+
+
+def _unique(keys: list[str]) -> tuple[str, ...]:
+    """Number repeated keys, in the canonical (time) order of the trials."""
+    seen: dict[str, int] = {}
+    result = []
+    for key in keys:
+        seen[key] = seen.get(key, 0) + 1
+        result.append(key if seen[key] == 1 else f"{key}#{seen[key]}")
+    return tuple(result)

@@ -1,0 +1,207 @@
+"""Our own HDF5 layout for recordings, version 1: spike times, or responses that are already counted.
+
+The root carries the attributes ``format`` = "brainbench-recordings", ``version`` = 1 and ``kind``.
+
+``kind`` = "spikes": one file, any number of sessions; names in <> are free::
+
+    /sessions/<name>            attributes subject, session, start (ISO 8601 or ""), synthetic (bool)
+        units/                  one row per unit
+            spike_times         float64 [spikes], s, ascending within a unit; units one after another
+            spike_times_index   int64 [units], end of each unit in spike_times
+            id                  optional, [units]
+            obs_intervals       optional, float64 [spans, 2], s, with obs_intervals_index
+            <column>            optional, [units]: depth (µm), layer, inhibitory, …
+        tables/<table>/         one row per trial
+            start_time          float64 [rows], s; stop_time likewise, optional
+            id                  optional, [rows]
+            <column>            [rows]: numbers, booleans or UTF-8 text
+
+``kind`` = "counts": one recordings data set (:func:`brainbench.types.check_recordings`)::
+
+    /counts, /duration, /time   [trial, time, unit], [trial, time] and [time]
+    /trial/<coordinate>         [trial]: stimulus, subject, session, trial_id, …
+    /unit/<coordinate>          [unit]: unit_subject, unit_session, unit_id, …
+    /attributes                 JSON text with the data set's attributes
+
+Any HDF5 library can write it. Readers refuse versions they do not know.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.datasets.sessions import SPIKES, Session, Table, decode, text
+from brainbench.errors import DataError, UsageError
+from brainbench.files import atomic_path, to_json
+from brainbench.types import check_recordings
+
+if TYPE_CHECKING:
+    import h5py
+    import xarray as xr
+
+FORMAT = "brainbench-recordings"
+VERSION = 1
+
+
+def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Session | Iterable[Session]) -> Path:
+    """Write recordings in this layout: the old file or the new one stands, never a part.
+
+    Args:
+        path: file to write, usually ``*.h5``.
+        recordings: a recordings data set (kind "counts") or sessions (kind "spikes"; build them with
+            :func:`~brainbench.datasets.make_session`).
+
+    Raises:
+        DataError: the data set does not fulfil the contract, or a session has no units.
+        UsageError: two sessions share subject and name, or there is none.
+    """
+    import h5py
+    import xarray as xr
+
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update({"format": FORMAT, "version": VERSION})
+        if isinstance(recordings, xr.Dataset):
+            _write_counts(file, check_recordings(recordings))
+        else:
+            _write_sessions(file, [recordings] if isinstance(recordings, Session) else list(recordings))
+    return Path(path)
+
+
+def is_ours(file: h5py.File) -> bool:
+    """Tell whether an open HDF5 file has this layout, of any version."""
+    return text(file.attrs.get("format", "")) == FORMAT
+
+
+def read_kind(file: h5py.File, path: Path) -> str:
+    """Return the kind of an open file of this layout, "spikes" or "counts".
+
+    Raises:
+        DataError: its version or kind is not one this package reads.
+    """
+    version, kind = file.attrs.get("version"), text(file.attrs.get("kind", ""))
+    if version != VERSION or kind not in ("spikes", "counts"):
+        raise DataError(
+            f"{path} is {FORMAT} version {version}, kind {kind!r}; this brainbench reads version {VERSION}, kinds "
+            f"'spikes' and 'counts'."
+        )
+    return kind
+
+
+def read_sessions(file: h5py.File, path: Path) -> list[Session]:
+    """Describe the sessions of an open file of kind "spikes"; columns are read later.
+
+    Raises:
+        DataError: a group of the layout is missing.
+    """
+    sessions = []
+    for name, group in _need(file, "sessions", path).items():
+        tables = {
+            key: Table(key, dict(table.items()), f"{path}:{name}")
+            for key, table in _need(group, "tables", path).items()
+        }
+        units = Table("units", dict(_need(group, "units", path).items()), f"{path}:{name}")
+        sessions.append(
+            Session(
+                subject=text(group.attrs.get("subject", "")) or name,
+                session=text(group.attrs.get("session", "")) or name,
+                units=units if SPIKES in units else None,
+                tables=tables,
+                source=f"{path}:{name}",
+                start=text(group.attrs.get("start", "")),
+                format=f"{FORMAT} {VERSION}",
+                synthetic=bool(group.attrs.get("synthetic", False)),
+            )
+        )
+    return sessions
+
+
+def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
+    """Load the data set in an open file of kind "counts".
+
+    Raises:
+        DataError: a part of the layout is missing or does not fit the others.
+    """
+    import xarray as xr
+
+    coordinates: dict[str, Any] = {"time": ("time", _need(file, "time", path)[...])}
+    for dimension in ("trial", "unit"):
+        for name, values in _need(file, dimension, path).items():
+            coordinates[name] = (dimension, decode(values[...]))
+    try:
+        attributes = json.loads(text(_need(file, "attributes", path)[()]))
+        dataset = xr.Dataset(
+            {
+                "counts": (("trial", "time", "unit"), _need(file, "counts", path)[...]),
+                "duration": (("trial", "time"), _need(file, "duration", path)[...]),
+            },
+            coordinates,
+            attributes,
+        )
+    except ValueError as error:
+        raise DataError(f"{path} does not hold a consistent recordings data set ({error}).") from error
+    return check_recordings(dataset)
+
+
+def _write_counts(file: h5py.File, dataset: xr.Dataset) -> None:
+    file.attrs["kind"] = "counts"
+    for name in ("counts", "duration", "time"):
+        file.create_dataset(name, data=dataset[name].values, **_compression(dataset[name].values))
+    for name, coordinate in dataset.coords.items():
+        if coordinate.dims in (("trial",), ("unit",)):
+            _write_column(file.require_group(str(coordinate.dims[0])), str(name), coordinate.values)
+    file.create_dataset("attributes", data=to_json(dataset.attrs))
+
+
+def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
+    if not sessions:
+        raise UsageError("There is no session to write; pass at least one.")
+    file.attrs["kind"] = "spikes"
+    root = file.create_group("sessions")
+    for session in sessions:
+        name = f"{session.subject}-{session.session}".replace("/", "_")
+        if name in root:
+            raise UsageError(f"Two sessions are called {name!r}; give each its own session name.")
+        if session.units is None:
+            raise DataError(f"Session {name!r} has no units table; there are no spikes to write.")
+        group = root.create_group(name)
+        group.attrs.update(
+            {"subject": session.subject, "session": session.session, "start": session.start}
+            | {"synthetic": session.synthetic}
+        )
+        _write_table(group.create_group("units"), session.units)
+        for key, table in session.tables.items():
+            _write_table(group.create_group(f"tables/{key.replace('/', '_')}"), table)
+
+
+def _write_table(group: h5py.Group, table: Table) -> None:
+    for name, values in table.data.items():
+        array = decode(values[...])
+        # References and compound types point into the source file and mean nothing outside it.
+        if array.dtype.kind in "biufU":
+            _write_column(group, name, array)
+
+
+def _write_column(group: h5py.Group, name: str, values: Any) -> None:
+    import h5py
+
+    array = np.asarray(values)
+    if array.dtype.kind in "UO":
+        group.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype())
+    else:
+        group.create_dataset(name, data=array, **_compression(array))
+
+
+def _compression(array: Any) -> dict[str, Any]:
+    return {"compression": "gzip", "shuffle": True} if array.size > 1000 else {}
+
+
+def _need(group: h5py.Group, name: str, path: Path) -> Any:
+    if name not in group:
+        raise DataError(f"{path} lacks {(group.name or '').rstrip('/')}/{name}, which the {FORMAT} layout needs.")
+    return group[name]

@@ -1,0 +1,324 @@
+"""Say what a recordings file holds, what is missing for scoring, and which conditions to try."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from brainbench.datasets import hdf5
+from brainbench.datasets._extract import no_units, read_spikes
+from brainbench.datasets.recipes import detect_recipe
+from brainbench.datasets.sessions import SPIKES, Session, Table, as_labels, natural_order
+from brainbench.datasets.sources import find_files, open_file, read_file
+from brainbench.errors import DataError
+from brainbench.files import to_json
+
+_EXAMPLES = 6
+_MOST_VALUES = 60
+_STIMULUS = re.compile(r"stim|cond|object|image|texture|shape|categ|orient|freq|odou?r|position", re.IGNORECASE)
+_BEHAVIOUR = re.compile(r"resp|choice|accuracy|correct|outcome|confid|reward|react|lick|key|tags", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class ColumnSummary:
+    """One column of an interval table."""
+
+    name: str
+    kind: str
+    """``text``, ``integer``, ``number``, ``boolean``, ``list`` (ragged) or ``other``."""
+    distinct: int
+    """Number of distinct values; 0 where they are not single values."""
+    examples: tuple[str, ...] = ()
+    fewest: int = 0
+    """Trials of the rarest value."""
+
+
+@dataclass(frozen=True)
+class TableSummary:
+    """One interval table."""
+
+    name: str
+    rows: int
+    columns: tuple[ColumnSummary, ...]
+    problem: str = ""
+    """Why part of the table cannot be used, if so."""
+
+
+@dataclass(frozen=True)
+class UnitsSummary:
+    """The units table."""
+
+    units: int
+    spikes: int
+    first: float
+    """First spike, s."""
+    last: float
+    """Last spike, s."""
+    silent: int
+    """Units without a spike."""
+    columns: tuple[str, ...]
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class SessionSummary:
+    """One session."""
+
+    subject: str
+    session: str
+    start: str
+    synthetic: bool
+    units: UnitsSummary | None
+    tables: tuple[TableSummary, ...]
+    modules: tuple[tuple[str, tuple[str, ...]], ...]
+    """Processing modules with what they hold."""
+    missing: tuple[str, ...]
+    """What scoring needs and this session lacks."""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A ``--conditions`` value worth trying."""
+
+    conditions: str
+    labels: tuple[str, ...]
+    fewest: int
+    """Trials of the rarest label."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What is in the files of one source."""
+
+    path: str
+    format: str
+    recipe: str | None
+    """Recipe that will be used, because the layout is known."""
+    sessions: tuple[SessionSummary, ...]
+    proposals: tuple[Proposal, ...]
+    """Best first."""
+
+    def to_json(self) -> str:
+        """Serialise deterministically."""
+        return to_json(self)
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"{self.path} ({self.format})"
+        if self.recipe:
+            yield f"recipe: {self.recipe} (detected from the layout)"
+        for session in self.sessions:
+            yield from _session_lines(session)
+        if self.proposals:
+            yield "conditions to try:"
+            for item in self.proposals:
+                shown = ", ".join(item.labels[:_EXAMPLES]) + (" …" if len(item.labels) > _EXAMPLES else "")
+                yield f"  --conditions {item.conditions}   {len(item.labels)} labels, ≥ {item.fewest} trials: {shown}"
+
+
+def inspect(path: str | os.PathLike[str]) -> Inspection:
+    """Describe the recordings of a file, a folder or a glob. Reads tables and spike times, no raw data.
+
+    Problems inside a table or in the units are reported, not raised, so that a damaged or unsuitable
+    file can still be looked into.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: a file is not HDF5, is truncated, or has none of the known layouts.
+    """
+    summaries: list[SessionSummary] = []
+    proposals: list[Proposal] = []
+    formats: dict[str, None] = {}
+    recipes: dict[str | None, None] = {}
+    for file_path in find_files(path):
+        with open_file(file_path) as file:
+            if hdf5.is_ours(file) and hdf5.read_kind(file, file_path) == "counts":
+                return _counted(hdf5.read_counts(file, file_path), file_path)
+            sessions = read_file(file, file_path)
+            for session in sessions:
+                found = detect_recipe(session)
+                recipes[found.name if found else None] = None
+                formats[session.format] = None
+                summaries.append(_summary(session))
+            proposals += propose(sessions)
+    return Inspection(
+        path=os.fspath(path),
+        format=", ".join(formats),
+        recipe=next(iter(recipes)) if len(recipes) == 1 else None,
+        sessions=tuple(summaries),
+        proposals=_merged(proposals),
+    )
+
+
+def propose(sessions: Iterable[Session]) -> list[Proposal]:
+    """Rank the columns that could label trials: 2–60 values with at least two trials each.
+
+    Stimulus-like names come before others and before behavioural ones; then text before integers
+    before the rest, the table ``trials`` before others, and balanced columns before unbalanced.
+    """
+    ranked: list[tuple[tuple[float, ...], Proposal]] = []
+    for session in sessions:
+        recipe = detect_recipe(session)
+        for name, table in session.tables.items():
+            for column in _columns(table):
+                if not (2 <= column.distinct <= _MOST_VALUES and column.fewest >= 2) or _is_time(column):
+                    continue
+                ranked.append((_rank(name, column, len(table)), _proposal(session, name, column.name)))
+        if recipe is not None:
+            labels = recipe.conditions.values(session.table(recipe.conditions.table)).tolist()
+            declared = recipe.vocabulary(recipe.conditions) or ()
+            counts = Counter("-".join(row) for row in labels)
+            fewest = min(counts[label] for label in declared)
+            ranked.append(((-1.0,), Proposal(str(recipe.conditions), declared, fewest)))
+    return [proposal for _, proposal in sorted(ranked, key=lambda item: item[0])]
+
+
+def _rank(table: str, column: ColumnSummary, rows: int) -> tuple[float, ...]:
+    topic = 0 if _STIMULUS.search(column.name) else 2 if _BEHAVIOUR.search(column.name) else 1
+    kind = {"text": 0, "integer": 1}.get(column.kind, 2)
+    imbalance = 1 - column.fewest * column.distinct / max(rows, 1)
+    return (topic, kind, table != "trials", imbalance)
+
+
+def _proposal(session: Session, table: str, column: str) -> Proposal:
+    counts = Counter(item for item in as_labels(session.table(table).column(column)).tolist() if item)
+    labels = list(counts)
+    return Proposal(f"{table}:{column}", tuple(labels[index] for index in natural_order(labels)), min(counts.values()))
+
+
+def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
+    """Join equal proposals of several files: all labels, the fewest trials."""
+    merged: dict[str, Proposal] = {}
+    for item in proposals:
+        known = merged.get(item.conditions)
+        if known is None:
+            merged[item.conditions] = item
+        else:
+            labels = list(dict.fromkeys((*known.labels, *item.labels)))
+            if len(labels) > len(known.labels):
+                labels = [labels[index] for index in natural_order(labels)]
+            merged[item.conditions] = Proposal(item.conditions, tuple(labels), min(known.fewest, item.fewest))
+    return tuple(merged.values())
+
+
+def _is_time(column: ColumnSummary) -> bool:
+    return column.name in ("start_time", "stop_time") or column.name.endswith(("_time", "_times"))
+
+
+def _summary(session: Session) -> SessionSummary:
+    units = _units(session)
+    tables = tuple(_table(table) for table in session.tables.values())
+    missing = [no_units(session)] if units is None else []
+    missing += [units.problem] if units is not None and units.problem else []
+    missing += [f"table {table.name}: {table.problem}" for table in tables if table.problem]
+    if not session.tables:
+        missing.append("no interval tables: nothing says when which stimulus was presented")
+    elif not propose([session]):
+        missing.append("no column of the interval tables has 2 to 60 values with at least two trials each")
+    return SessionSummary(
+        subject=session.subject,
+        session=session.session,
+        start=session.start,
+        synthetic=session.synthetic,
+        units=units,
+        tables=tables,
+        modules=tuple(session.modules.items()),
+        missing=tuple(missing),
+        notes=session.notes,
+    )
+
+
+def _units(session: Session) -> UnitsSummary | None:
+    table = session.units
+    if table is None or SPIKES not in table:
+        return None
+    try:
+        spikes = read_spikes(table, [])
+    except DataError as error:
+        return UnitsSummary(len(table), len(table.data[SPIKES]), np.nan, np.nan, 0, table.columns, str(error))
+    heard = [times for times in spikes if len(times)]
+    return UnitsSummary(
+        units=len(spikes),
+        spikes=sum(map(len, spikes)),
+        first=float(min((times[0] for times in heard), default=np.nan)),
+        last=float(max((times[-1] for times in heard), default=np.nan)),
+        silent=len(spikes) - len(heard),
+        columns=table.columns,
+        problem="" if heard else "none of the units has a spike",
+    )
+
+
+def _table(table: Table) -> TableSummary:
+    problem = "" if "start_time" in table else "it has no start_time"
+    try:
+        return TableSummary(table.name, len(table), tuple(_columns(table)), problem)
+    except DataError as error:
+        return TableSummary(table.name, len(table), (), str(error))
+
+
+def _columns(table: Table) -> Iterator[ColumnSummary]:
+    for name in table.columns:
+        if f"{name}_index" in table:
+            yield ColumnSummary(name, "list", 0)
+            continue
+        try:
+            values = table.column(name)
+        except DataError:
+            yield ColumnSummary(name, "other", 0)
+            continue
+        counts = Counter(item for item in as_labels(values).tolist() if item)
+        labels = list(counts)
+        kind = _kind(values)
+        shown = [labels[index] for index in natural_order(labels)[:_EXAMPLES]]
+        examples = tuple(f"{float(item):.6g}" for item in shown) if kind == "number" else tuple(shown)
+        yield ColumnSummary(name, kind, len(counts), examples, min(counts.values(), default=0))
+
+
+def _kind(values: np.ndarray) -> str:
+    if values.dtype.kind == "f" and len(values) and np.all(np.isfinite(values) & (values == np.round(values))):
+        return "integer"
+    return {"U": "text", "b": "boolean", "i": "integer", "u": "integer"}.get(values.dtype.kind, "number")
+
+
+def _counted(dataset: object, path: Path) -> Inspection:
+    import xarray as xr
+
+    if not isinstance(dataset, xr.Dataset):
+        raise DataError(f"{path} does not hold a recordings data set.")
+    labels = Counter(dataset["stimulus"].values.astype(str).tolist())
+    pairs = dict.fromkeys(zip(dataset["subject"].values.tolist(), dataset["session"].values.tolist(), strict=True))
+    sessions = tuple(
+        SessionSummary(str(subject), str(session), "", bool(dataset.attrs["synthetic"]), None, (), (), ())
+        for subject, session in pairs
+    )
+    vocabulary = tuple(dataset.attrs["vocabulary"])
+    proposal = Proposal("(already counted)", vocabulary, min(labels[label] for label in vocabulary))
+    return Inspection(str(path), f"{hdf5.FORMAT} {hdf5.VERSION}, counted responses", None, sessions, (proposal,))
+
+
+def _session_lines(session: SessionSummary) -> Iterator[str]:
+    made = "  SYNTHETIC" if session.synthetic else ""
+    yield f"subject {session.subject}, session {session.session}, started {session.start or 'unknown'}{made}"
+    if session.units is not None:
+        units = session.units
+        span = f"{units.first:.3f}–{units.last:.3f} s" if np.isfinite(units.first) else "no span"
+        silent = f", {units.silent} silent" if units.silent else ""
+        yield f"  units: {units.units} ({units.spikes:,} spikes, {span}{silent}); columns {', '.join(units.columns)}"
+    for table in session.tables:
+        yield f"  table {table.name}: {table.rows} rows"
+        for column in table.columns:
+            values = f"{column.distinct} values: {', '.join(column.examples)}" if column.distinct else column.kind
+            yield f"    {column.name} ({column.kind}) {values}{' …' if column.distinct > _EXAMPLES else ''}"
+    for name, contents in session.modules:
+        yield f"  processing/{name}: {', '.join(contents)}"
+    for item in (*session.missing, *session.notes):
+        yield f"  ! {item}"

@@ -1,0 +1,112 @@
+"""Read Neurodata Without Borders 2.x files through h5py: units, interval tables, subject, nothing else.
+
+Needs no NWB schema and touches no raw data. Interval tables are every ``TimeIntervals`` under
+``/intervals`` and in the processing modules.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.datasets.sessions import Session, Table, decode, text
+from brainbench.errors import DataError
+
+if TYPE_CHECKING:
+    import h5py
+
+_INTRACELLULAR = ("CurrentClampSeries", "VoltageClampSeries", "IZeroClampSeries", "PatchClampSeries")
+
+
+def is_nwb(file: h5py.File) -> bool:
+    """Tell whether an open HDF5 file is NWB, of any version."""
+    return _type(file) == "NWBFile" or "nwb_version" in file.attrs or "nwb_version" in file
+
+
+def read_nwb(file: h5py.File, path: Path) -> Session:
+    """Describe the session in an open NWB file; columns are read later, while it stays open.
+
+    The subject is ``/general/subject/subject_id``, else the ``sub-`` part of the file name, else the
+    file's stem; the session likewise (``/general/session_id``, ``ses-``, stem). What was guessed is
+    said in ``notes``.
+
+    Raises:
+        DataError: the file is NWB 1.x, whose layout differs.
+    """
+    import h5py
+
+    version = text(file.attrs.get("nwb_version", "")) or _string(file, "nwb_version")
+    if version.removeprefix("NWB-").startswith("1"):
+        raise DataError(f"{path} is NWB {version}; brainbench reads NWB 2.x: convert it first (e.g. with MatNWB).")
+    notes: list[str] = []
+    subject = _string(file, "general/subject/subject_id")
+    if not subject:
+        subject = _entity(path, "sub")
+        notes.append(f"{path.name}: no subject_id; the subject {subject!r} was taken from the file name")
+    session = _string(file, "general/session_id") or _entity(path, "ses")
+    description = _string(file, "session_description")
+    keywords, units = file.get("general/keywords"), file.get("units")
+    return Session(
+        subject=subject,
+        session=session,
+        units=_table(units, "units", path) if isinstance(units, h5py.Group) else None,
+        tables=_interval_tables(file, path),
+        source=str(path),
+        identifier=_string(file, "identifier"),
+        start=_string(file, "session_start_time"),
+        format=f"NWB {version}",
+        synthetic=description.lower().startswith("synthetic") or "synthetic" in _words(keywords),
+        intracellular=_intracellular(file),
+        modules={name: tuple(module) for name, module in _groups(file.get("processing"))},
+        notes=tuple(notes),
+    )
+
+
+def _interval_tables(file: h5py.File, path: Path) -> dict[str, Table]:
+    tables = {name: _table(group, name, path) for name, group in _groups(file.get("intervals"))}
+    for module_name, module in _groups(file.get("processing")):
+        for name, group in _groups(module):
+            if _type(group) == "TimeIntervals":
+                key = f"{module_name}/{name}" if name in tables else name
+                tables[key] = _table(group, key, path)
+    return tables
+
+
+def _table(group: h5py.Group, name: str, path: Path) -> Table:
+    import h5py
+
+    columns = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
+    declared = [text(key) for key in group.attrs.get("colnames", ())]
+    order = [key for key in declared if key in columns] + [key for key in columns if key not in declared]
+    return Table(name, {key: columns[key] for key in order}, str(path))
+
+
+def _intracellular(file: h5py.File) -> dict[str, int]:
+    kinds = [_type(group) for _, group in _groups(file.get("acquisition"))]
+    return {kind: kinds.count(kind) for kind in _INTRACELLULAR if kind in kinds}
+
+
+def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
+    import h5py
+
+    return [] if parent is None else [(name, item) for name, item in parent.items() if isinstance(item, h5py.Group)]
+
+
+def _type(group: h5py.Group) -> str:
+    return text(group.attrs.get("neurodata_type", ""))
+
+
+def _string(file: h5py.File, name: str) -> str:
+    values = _words(file.get(name), lower=False)
+    return values[0].strip() if values else ""
+
+
+def _words(dataset: Any, *, lower: bool = True) -> list[str]:
+    values = [] if dataset is None else decode(dataset[()]).ravel().tolist()
+    return [str(item).lower() if lower else str(item) for item in values]
+
+
+def _entity(path: Path, entity: str) -> str:
+    match = re.search(rf"(?:^|_){entity}-([^_.]+)", path.name)
+    return match.group(1) if match else path.stem

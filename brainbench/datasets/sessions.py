@@ -1,0 +1,257 @@
+"""One recording session as every file format presents it: a units table and interval tables.
+
+Columns are anything that can be sliced (an HDF5 dataset, an array) and are read when asked for, so
+a file with gigabytes of raw voltage costs only what is used. Times are seconds on one session clock.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.errors import DataError, unknown_name
+
+SPIKES = "spike_times"
+OBSERVED = "obs_intervals"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of equal length, in the manner of NWB's DynamicTable.
+
+    A ragged column ``x`` has its values in ``x`` and the end of each row in ``x_index``.
+    """
+
+    name: str
+    data: Mapping[str, Any]
+    """Column name → array-like; index columns included."""
+    where: str = ""
+    """File and path, for messages."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns, without ``id`` and the index columns of ragged ones."""
+        return tuple(name for name in self.data if name != "id" and not self._is_index(name))
+
+    def __len__(self) -> int:
+        if "id" in self.data:
+            return len(self.data["id"])
+        flat = [name for name in self.columns if f"{name}_index" not in self.data]
+        first = flat[0] if flat else next((name for name in self.data if self._is_index(name)), None)
+        return len(self.data[first]) if first else 0
+
+    def __contains__(self, column: object) -> bool:
+        return column in self.data
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Read one column [rows]; text comes as ``str``.
+
+        Raises:
+            UsageError: there is no such column (the nearest is named).
+            DataError: it is ragged, not one value per row, or of another length than the table.
+        """
+        self.require(name)
+        if f"{name}_index" in self.data:
+            raise DataError(f"Column {name!r} of {self.label} holds a list per row; choose one with a single value.")
+        values = decode(self.data[name][...])
+        if values.ndim != 1 or values.dtype.kind not in "biufU":
+            raise DataError(
+                f"Column {name!r} of {self.label} has shape {values.shape} and type {values.dtype}; expected one "
+                f"number or text per row."
+            )
+        if len(values) != len(self):
+            raise DataError(f"Column {name!r} of {self.label} has {len(values)} values for {len(self)} rows.")
+        return values
+
+    def times(self, name: str) -> NDArray[np.float64]:
+        """Read one numeric column [rows] in seconds.
+
+        Raises:
+            DataError: the column holds text.
+        """
+        values = self.column(name)
+        if values.dtype.kind == "U":
+            raise DataError(f"Column {name!r} of {self.label} holds text ({values[0]!r}); expected times in seconds.")
+        return values.astype(np.float64)
+
+    def ids(self) -> NDArray[Any]:
+        """Row identifiers, or the row numbers when the table has none."""
+        return decode(self.data["id"][...]) if "id" in self.data else np.arange(len(self))
+
+    def ends(self, name: str) -> NDArray[np.int64]:
+        """Return the checked row ends [rows] of a ragged column.
+
+        Raises:
+            DataError: they decrease, are negative or do not end where the values end.
+        """
+        total = len(self.data[name])
+        ends = np.asarray(self.data[f"{name}_index"][...]).astype(np.int64)
+        steps = np.diff(ends, prepend=0)
+        if len(ends) != len(self) or np.any(steps < 0) or (len(ends) > 0 and ends[-1] != total):
+            last = int(ends[-1]) if len(ends) else 0
+            order = ", decreasing" if np.any(steps < 0) else ""
+            raise DataError(
+                f"The ragged index {name}_index of {self.label} is inconsistent: {len(ends)} ends for {len(self)} "
+                f"rows, the last at {last} of {total} values{order}; the file is damaged or was written wrongly."
+            )
+        return ends
+
+    def require(self, column: str) -> None:
+        """Raise the error for an unknown column, naming the nearest one."""
+        if column not in self.data:
+            raise unknown_name("column", column, self.columns, hint=f"(in {self.label})")
+
+    @property
+    def label(self) -> str:
+        """Name and place of the table, for messages."""
+        return f"table {self.name!r}{f' of {self.where}' if self.where else ''}"
+
+    def _is_index(self, name: str) -> bool:
+        return name.endswith("_index") and name.removesuffix("_index") in self.data
+
+
+@dataclass(frozen=True)
+class Session:
+    """One session of one subject. Valid while its file is open."""
+
+    subject: str
+    session: str
+    units: Table | None
+    """``id``, ``spike_times`` (+ ``spike_times_index``), optionally ``obs_intervals``, ``depth`` …"""
+    tables: Mapping[str, Table]
+    """Interval tables by name; each has ``start_time`` and usually ``stop_time``."""
+    source: str = ""
+    identifier: str = ""
+    """The file's own unique name for this session; equal names mean the same data."""
+    start: str = ""
+    """Session start, ISO 8601."""
+    format: str = ""
+    synthetic: bool = False
+    intracellular: Mapping[str, int] = field(default_factory=dict)
+    """Number of intracellular series by type, for the message when there are no units."""
+    modules: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Contents of the processing modules, by name."""
+    notes: tuple[str, ...] = ()
+
+    def table(self, name: str) -> Table:
+        """Return one interval table.
+
+        Raises:
+            UsageError: there is no such table (the nearest is named).
+        """
+        if name not in self.tables:
+            raise unknown_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
+        return self.tables[name]
+
+
+def make_session(
+    subject: str,
+    session: str,
+    spikes: Sequence[NDArray[Any]],
+    tables: Mapping[str, Mapping[str, Sequence[Any] | NDArray[Any]]],
+    *,
+    unit_columns: Mapping[str, Sequence[Any] | NDArray[Any]] | None = None,
+    observed: Sequence[NDArray[Any]] | None = None,
+    start: str = "",
+    synthetic: bool = False,
+) -> Session:
+    """Build a session from arrays, to be written with :func:`~brainbench.datasets.write_recordings`.
+
+    Args:
+        subject: name of the animal.
+        session: name of the session, unique within the animal.
+        spikes: spike times (s) of each unit.
+        tables: interval tables, each a mapping of columns with at least ``start_time``.
+        unit_columns: columns of the units table, such as ``id``, ``depth`` (µm), ``layer``.
+        observed: per unit the recorded spans [n, 2] (s), if known.
+        start: session start, ISO 8601.
+        synthetic: whether the spikes were made by a computer.
+
+    Raises:
+        DataError: columns differ in length or a table has no ``start_time``.
+    """
+    data: dict[str, Any] = {"id": np.arange(len(spikes))}
+    data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}
+    data |= _ragged(SPIKES, spikes)
+    if observed is not None:
+        data |= _ragged(OBSERVED, [np.reshape(item, (-1, 2)) for item in observed])
+    made = {
+        name: Table(name, {key: np.asarray(item) for key, item in table.items()}, session)
+        for name, table in tables.items()
+    }
+    units = Table("units", data, session)
+    for table in (units, *made.values()):
+        for name in table.columns:
+            if f"{name}_index" not in table and len(table.data[name]) != len(table):
+                raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
+    for table in made.values():
+        table.require("start_time")
+    return Session(subject, session, units, made, source=session, start=start, synthetic=synthetic, format="arrays")
+
+
+def _ragged(name: str, rows: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    values = np.concatenate([np.asarray(row, dtype=np.float64) for row in rows]) if rows else np.zeros(0)
+    return {name: values, f"{name}_index": np.cumsum([len(row) for row in rows], dtype=np.int64)}
+
+
+def decode(values: Any) -> NDArray[Any]:
+    """Turn HDF5 text (bytes or objects) into ``str`` arrays; leave the rest."""
+    array = np.asarray(values)
+    if array.dtype.kind == "S":
+        return np.char.decode(array, "utf-8", "replace")
+    if array.dtype.kind == "O":
+        flat = [text(item) if isinstance(item, (bytes, str)) else None for item in array.ravel()]
+        if all(item is not None for item in flat):
+            return np.array(flat, dtype=str).reshape(array.shape)
+    return array
+
+
+def text(value: Any) -> str:
+    """Return bytes or text as ``str``."""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def as_labels(values: NDArray[Any]) -> NDArray[np.str_]:
+    """Write each value [n] as the text a person would use; missing ones become "".
+
+    >>> as_labels(np.array([1.0, 2.5, np.nan])).tolist()
+    ['1', '2.5', '']
+    """
+    unique, inverse = np.unique(values, return_inverse=True)
+    return (
+        np.array([_label(item) for item in unique.tolist()], dtype=str)[inverse] if len(values) else np.zeros(0, "U1")
+    )
+
+
+def _label(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        if not np.isfinite(value):
+            return ""
+        return str(int(value)) if value.is_integer() else repr(value)
+    return str(value).strip()
+
+
+def natural_key(label: str) -> tuple[Any, ...]:
+    """Sort key that puts numbers in numeric order, alone or inside text.
+
+    >>> sorted(["10", "9", "b10", "b2"], key=natural_key)
+    ['9', '10', 'b2', 'b10']
+    """
+    try:
+        return (0, float(label), ())
+    except ValueError:
+        parts = re.split(r"(\d+)", label)
+        return (1, 0.0, tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts))
+
+
+def natural_order(labels: Iterable[Any]) -> NDArray[np.int64]:
+    """Return the order [n] that sorts labels naturally."""
+    keys = [natural_key(str(label)) for label in labels]
+    return np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.int64)
