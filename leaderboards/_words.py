@@ -1,0 +1,166 @@
+"""What the pages say in words: numbers, verdicts and the methods sentence, all from the record."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from brainbench.types import Interval, ModelCard, ResultRecord, Score
+
+STATUS = {
+    "ok": "The recordings are reliable enough to trust this number.",
+    "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
+    "undefined": "No number exists.",
+}
+
+SYNTHETIC = "Synthetic demo recordings: ranks say nothing about brains."
+
+_CARD_LABELS = {
+    "family": "family",
+    "objective": "training objective",
+    "augmentation": "augmentation",
+    "parameters": "parameters",
+    "multiply_adds": "multiply-adds per time step",
+    "top1": "top-1 accuracy",
+    "top5": "top-5 accuracy",
+    "accuracy_interval": "accuracy interval",
+    "accuracy_data": "accuracy measured on",
+    "collapsed": "collapsed to one class",
+    "twin": "untrained twin",
+    "seed": "seed",
+    "weights": "weights (hash)",
+    "input": "input",
+}
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Format with a fixed number of digits and a true minus sign; NaN is ``undefined``."""
+    if value is None or not math.isfinite(value):
+        return "undefined"
+    text = f"{value:.{digits}f}"
+    return text.replace("-", "−") if float(text) else text.lstrip("-")
+
+
+def probability(value: float) -> str:
+    """Format a p-value with two significant digits."""
+    return f"{value:.2g}" if math.isfinite(value) else "undefined"
+
+
+def count(value: int | None) -> str:
+    """Format an integer with thousands separated."""
+    return "" if value is None else f"{value:,}"
+
+
+def plural(amount: int, one: str, many: str = "") -> str:
+    """Write an amount with its noun: ``1 result``, ``3 results``."""
+    return f"{amount} {one if amount == 1 else many or one + 's'}"
+
+
+def span(interval: Interval | None) -> str:
+    """Format an interval as ``[low, high]``; empty without one."""
+    return f"[{number(interval.low)}, {number(interval.high)}]" if interval else ""
+
+
+def level(interval: Interval) -> str:
+    """Say what kind of interval it is."""
+    return f"{100 * interval.level:g} % interval" + (f", {interval.method}" if interval.method else "")
+
+
+def p_sentence(score: Score) -> str:
+    """Say how the p-value was found and how small it could have been."""
+    parts = [score.p_method] if score.p_method else []
+    if math.isfinite(score.p_smallest):
+        least = probability(score.p_smallest)
+        reached = math.isfinite(score.p) and score.p <= score.p_smallest * (1 + 1e-9)
+        parts.append(
+            f"this is the smallest that {len(score.stimuli)} stimuli can give"
+            if reached
+            else f"the smallest possible is {least}"
+        )
+    return "; ".join(parts)
+
+
+def comparisons(record: ResultRecord) -> list[str]:
+    """Say how the score stands to each baseline, by whether their intervals overlap."""
+    score = record.score
+    others = list(record.baselines.items())
+    if record.animal_to_animal is not None:
+        others.append(("animal-to-animal", record.animal_to_animal))
+    if score.status != "ok" or score.interval is None:
+        return []
+    sentences = []
+    for name, other in others:
+        if other.status != "ok" or other.interval is None:
+            sentences.append(f"Cannot be compared with {name}, which is {other.status}.")
+        elif score.interval.low > other.interval.high:
+            sentences.append(f"Above {name} ({number(other.value)}): the intervals do not overlap.")
+        elif score.interval.high < other.interval.low:
+            sentences.append(f"Below {name} ({number(other.value)}): the intervals do not overlap.")
+        else:
+            sentences.append(f"Not told apart from {name} ({number(other.value)}): the intervals overlap.")
+    return sentences
+
+
+def methods(record: ResultRecord) -> str:
+    """Return a paragraph for a paper's methods section, made only of what the record states."""
+    score = record.score
+    provenance = score.provenance
+    recordings = str(provenance.get("recordings") or "the recordings")
+    text = (
+        f"The model {score.name} was compared with {recordings} ({plural(len(score.subjects), 'animal')}, "
+        f"{plural(len(score.stimuli), 'stimulus', 'stimuli')}) by representational similarity analysis"
+    )
+    text += f" ({score.metric})" if score.metric else ""
+    text += f", with noise correction by the estimator '{score.estimator}'."
+    if score.layer_rule:
+        text += f" Layer: {score.layer_rule}."
+    if score.interval:
+        text += f" Interval: {level(score.interval)}."
+    if score.p_method:
+        text += f" Significance: {score.p_method}."
+    if score.ceiling and score.ceiling.method:
+        text += f" Noise ceiling: {score.ceiling.method}."
+    version = provenance.get("version")
+    text += f" Computed with brainbench {version}." if version else ""
+    if record.synthetic:
+        text += " The recordings are synthetic: the result says nothing about brains."
+    return text
+
+
+def card_rows(card: ModelCard) -> list[tuple[str, str]]:
+    """Return what the model card states, as label and text; fields that do not apply are left out."""
+    rows = []
+    for item in fields(card):
+        value = getattr(card, item.name)
+        if item.name == "name" or value is None or value == "":
+            continue
+        if isinstance(value, Interval):
+            value = f"{span(value)} ({level(value)})"
+        elif isinstance(value, bool):
+            value = "yes" if value else "no"
+        elif isinstance(value, int) and item.name != "seed":
+            value = count(value)
+        elif isinstance(value, float):
+            value = number(value)
+        rows.append((_CARD_LABELS[item.name], str(value)))
+    return rows
+
+
+def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the provenance as label and text, without the command, which the page shows by itself."""
+    return [
+        (key.replace("_", " "), _inline(value))
+        for key, value in sorted(provenance.items())
+        if key != "command" and value is not None
+    ]
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_inline(item)}" for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_inline(item) for item in value)
+    return value if isinstance(value, str) else json.dumps(value)

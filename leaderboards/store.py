@@ -1,0 +1,163 @@
+"""Result records on disk: one JSON file per score, named by what it says.
+
+A file is called ``<readable name>--<content hash>.json``. The hash (:attr:`ResultRecord.identity`)
+covers everything but time, machine and package versions, so equal results have equal names, folders
+of records merge by copying files, and a record edited by hand no longer fits its name. The hash
+detects slips and careless edits; it is no signature against someone who renames the file as well.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+from brainbench.errors import DataError, DataFileNotFoundError
+from brainbench.files import write_text
+from brainbench.types import RECORD_SCHEMA, Interval, ResultRecord, Score
+from leaderboards.schema import first_fault
+
+
+@dataclass(frozen=True)
+class StoredRecord:
+    """A record file: either a usable record, or what is wrong with the file."""
+
+    path: Path
+    record: ResultRecord | None
+    problem: str | None = None
+    """One sentence; None exactly when ``record`` can be used."""
+
+
+def record_name(record: ResultRecord) -> str:
+    """Return the file name of a record: slug of the score's name, two hyphens, content hash.
+
+    >>> record_name(ResultRecord(Score("Zhuang Intersection/LN", 0.5, "ok")))[:24]
+    'zhuang-intersection-ln--'
+    """
+    ascii_name = unicodedata.normalize("NFKD", record.score.name).encode("ascii", "ignore").decode().lower()
+    slug = re.sub(r"[^a-z0-9.+]+", "-", ascii_name).strip("-.")[:80].rstrip("-.")
+    return f"{slug or 'model'}--{record.identity}.json"
+
+
+def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
+    """Write a record into ``folder`` and return its path.
+
+    Atomic, so that concurrent writers lose nothing. Idempotent: an equal result that is already
+    there is left as it is (with its first time and machine); a damaged file of that name is replaced.
+
+    Raises:
+        DataError: the record contradicts itself (:func:`read_record` would refuse it).
+    """
+    path = Path(folder) / record_name(record)
+    text = record.to_json() + "\n"
+    _parse(text, path)
+    try:
+        read_record(path)
+    except DataError:  # absent, damaged or edited
+        write_text(path, text)
+    return path
+
+
+def read_record(path: str | os.PathLike[str]) -> ResultRecord:
+    """Read one record.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: the file is not JSON, not a record of this schema version, contradicts itself, or
+            its content does not fit the hash in its name (edited by hand, or renamed).
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise DataFileNotFoundError(f"There is no result record {os.fspath(path)!r}.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{os.fspath(path)!r} cannot be read as UTF-8 text ({error}).") from error
+    record = _parse(text, path)
+    named = path.stem.rpartition("--")[2]
+    if named != record.identity:
+        raise DataError(
+            f"{path.name!r} was edited or renamed: its content has the hash {record.identity}, its name says "
+            f"{named!r}; restore the original file or score the model again."
+        )
+    return record
+
+
+def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[StoredRecord]:
+    """Read every record of a folder (with its sub-folders), a file, or a list of either.
+
+    A file that cannot be used comes back with its problem in words instead of ending the whole
+    reading. Files in two places with the same content count once. Sorted by path.
+
+    Raises:
+        DataFileNotFoundError: a path does not exist, or nothing was found at all.
+    """
+    sources = [Path(source)] if isinstance(source, (str, os.PathLike)) else [Path(item) for item in source]
+    paths: list[Path] = []
+    for item in sources:
+        if not item.exists():
+            raise DataFileNotFoundError(f"There is no file or folder {os.fspath(item)!r} to read result records from.")
+        # A hidden name is another process's unfinished write.
+        found = (path for path in item.rglob("*.json") if not path.name.startswith(".")) if item.is_dir() else [item]
+        paths += found
+    if not paths:
+        places = ", ".join(repr(os.fspath(item)) for item in sources) or "the empty list of files"
+        raise DataFileNotFoundError(
+            f"No result records (*.json) in {places}; make one with: brainbench score MODEL --out FOLDER"
+        )
+    stored: dict[str, StoredRecord] = {}
+    for path in sorted(set(paths)):
+        try:
+            record = read_record(path)
+        except DataError as error:
+            stored[os.fspath(path)] = StoredRecord(path, None, str(error))
+        else:
+            stored.setdefault(record.identity, StoredRecord(path, record))
+    return list(stored.values())
+
+
+def _parse(text: str, path: Path) -> ResultRecord:
+    try:
+        data = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path.name!r} is not valid JSON ({error}).") from error
+    version = data.get("schema") if isinstance(data, dict) else None
+    # The version comes first: an older layout should be called old, not faulty.
+    fault = first_fault(data) if version == RECORD_SCHEMA or not isinstance(version, int) else None
+    if fault:
+        raise DataError(f"{path.name!r} is not a result record: {fault}.")
+    try:
+        record = ResultRecord.from_json(data)
+    except DataError as error:
+        raise DataError(f"{path.name!r}: {error}") from error
+    for score in (record.score, record.animal_to_animal, *record.baselines.values()):
+        contradiction = _contradiction(score) if score else None
+        if score and contradiction:
+            raise DataError(f"{path.name!r} contradicts itself: in the score {score.name!r}, {contradiction}.")
+    return record
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON; a number without value is null")
+
+
+def _contradiction(score: Score) -> str | None:
+    """Return what cannot be true at once, or None. These rules are beyond what JSON Schema can say."""
+    if math.isnan(score.value) != (score.status == "undefined"):
+        return f"the status is {score.status!r} but the value is {score.value}"
+    pairs = len(score.stimuli) * (len(score.stimuli) - 1) // 2
+    for name in ("model_rdm", "brain_rdm"):
+        length = len(getattr(score, name))
+        if length not in (0, pairs):
+            return f"{name} has {length} pairs but {len(score.stimuli)} stimuli make {pairs}"
+    for name in ("interval", "reliability_interval"):
+        interval: Interval | None = getattr(score, name)
+        if interval and interval.low > interval.high:
+            return f"{name} runs from {interval.low} down to {interval.high}"
+    return None
