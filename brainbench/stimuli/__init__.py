@@ -1,1 +1,90 @@
-"""TODO."""
+"""Whisker stimuli: arrays, objects, motion, scenes and their simulation into forces and moments.
+
+The public names are imported on first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+_LAZY = {
+    "Fidelity": "fidelity",
+    "Frames": "scene",
+    "Head": "scene",
+    "PlacedObject": "objects",
+    "Recipe": "scene_files",
+    "Scene": "scene",
+    "Solid": "objects",
+    "Still": "motion",
+    "Stimuli": "sets",
+    "Translation": "motion",
+    "Whisker": "whisker",
+    "WhiskerArray": "morphology",
+    "Whisking": "motion",
+    "describe_recipe": "recipes",
+    "get_backend": "backends",
+    "get_recipe": "recipes",
+    "list_recipes": "recipes",
+    "load_scene": "scene_files",
+    "load_stimuli": "sets",
+    "read_stimulus_set": "storage",
+    "simulate": "simulation",
+    "to_frame": "readout",
+    "to_grid": "readout",
+    "write_stimulus_set": "storage",
+}
+
+__all__ = [
+    "Fidelity",
+    "Frames",
+    "Head",
+    "PlacedObject",
+    "Recipe",
+    "Scene",
+    "Solid",
+    "Still",
+    "Stimuli",
+    "Translation",
+    "Whisker",
+    "WhiskerArray",
+    "Whisking",
+    "describe_recipe",
+    "get_backend",
+    "get_recipe",
+    "list_recipes",
+    "load_scene",
+    "load_stimuli",
+    "read_stimulus_set",
+    "simulate",
+    "to_frame",
+    "to_grid",
+    "write_stimulus_set",
+]
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.backends import get_backend
+    from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.stimuli.morphology import WhiskerArray
+    from brainbench.stimuli.motion import Still, Translation, Whisking
+    from brainbench.stimuli.objects import PlacedObject, Solid
+    from brainbench.stimuli.readout import to_frame, to_grid
+    from brainbench.stimuli.recipes import describe_recipe, get_recipe, list_recipes
+    from brainbench.stimuli.scene import Frames, Head, Scene
+    from brainbench.stimuli.scene_files import Recipe, load_scene
+    from brainbench.stimuli.sets import Stimuli, load_stimuli
+    from brainbench.stimuli.simulation import simulate
+    from brainbench.stimuli.storage import read_stimulus_set, write_stimulus_set
+    from brainbench.stimuli.whisker import Whisker
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'brainbench.stimuli' has no attribute {name!r}")
+    value = getattr(import_module(f"brainbench.stimuli.{_LAZY[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,169 @@
+"""Triangle meshes: loading with units, diagnosis, scaling, convex hull and content hash. Metres inside."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+
+if TYPE_CHECKING:
+    import trimesh
+    from numpy.typing import ArrayLike, NDArray
+
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
+"""Length units of mesh files in metres."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is wrong with a mesh as a solid."""
+
+    open_edges: int
+    """Edges that do not join exactly two triangles; 0 for a watertight surface."""
+    degenerate_faces: int
+    """Triangles without area."""
+    bodies: int
+    """Connected pieces."""
+    inconsistent: bool
+    """Whether neighbouring triangles disagree on which side is out."""
+
+    @property
+    def watertight(self) -> bool:
+        """Whether the surface encloses a volume."""
+        return self.open_edges == 0
+
+    def __str__(self) -> str:
+        faults = [
+            f"{self.open_edges} open edges (not watertight)" if self.open_edges else "",
+            f"{self.degenerate_faces} triangles without area" if self.degenerate_faces else "",
+            f"{self.bodies} separate pieces" if self.bodies > 1 else "",
+            "triangles that disagree on inside and outside" if self.inconsistent else "",
+        ]
+        return ", ".join(fault for fault in faults if fault) or "watertight"
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh.
+
+    Raises:
+        DataError: a vertex is not finite, a face names a missing vertex, or there is no face.
+    """
+
+    vertices: NDArray[np.float64]
+    """[V, 3] m."""
+    faces: NDArray[np.int64]
+    """[F, 3] vertex indices, counter-clockwise seen from outside."""
+    name: str = field(default="mesh", compare=False)
+
+    def __post_init__(self) -> None:
+        vertices = np.array(self.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.array(self.faces, dtype=np.int64).reshape(-1, 3)
+        if not len(faces):
+            raise DataError(f"The mesh {self.name!r} has no faces.")
+        if not np.isfinite(vertices).all():
+            raise DataError(f"The mesh {self.name!r} has vertices that are not finite numbers.")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise DataError(f"The mesh {self.name!r} has faces that name missing vertices.")
+        for name, array in (("vertices", vertices), ("faces", faces)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [2, 3] (m) of the used vertices."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding-box diagonal [m]."""
+        low, high = self.bounds
+        return float(np.linalg.norm(high - low))
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis:
+        """Faults of this mesh as a solid."""
+        solid = self.to_trimesh()
+        counts = np.unique(solid.edges_sorted, axis=0, return_counts=True)[1]
+        return Diagnosis(
+            open_edges=int((counts != 2).sum()),
+            degenerate_faces=int((solid.area_faces <= 1e-12 * self.diagonal**2).sum()),
+            bodies=int(solid.body_count),
+            inconsistent=not solid.is_winding_consistent,
+        )
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Hash of vertices and faces; the name does not count."""
+        from brainbench.files import content_hash
+
+        return content_hash(self.vertices, self.faces)
+
+    def scaled(self, factor: float) -> Mesh:
+        """Return the mesh scaled about its origin."""
+        if not (np.isfinite(factor) and factor > 0):
+            raise UsageError(f"A mesh is scaled by a positive factor; received {factor!r}.")
+        return Mesh(self.vertices * factor, self.faces, self.name)
+
+    def to_diagonal(self, diagonal: float) -> Mesh:
+        """Return the mesh scaled about its origin to a bounding-box diagonal [m]."""
+        return self.scaled(diagonal / self.diagonal)
+
+    def transformed(self, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
+        """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m)."""
+        return Mesh(self.vertices @ np.asarray(rotation).T + np.asarray(translation), self.faces, self.name)
+
+    def hull(self) -> Mesh:
+        """Return the convex hull.
+
+        Raises:
+            DataError: the mesh is flat and has no volume.
+        """
+        from scipy.spatial import QhullError
+
+        try:
+            hull = self.to_trimesh().convex_hull
+        except QhullError as error:
+            raise DataError(f"The mesh {self.name!r} has no volume: its points lie in a plane.") from error
+        return Mesh(np.asarray(hull.vertices), np.asarray(hull.faces), self.name)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """Return a :class:`trimesh.Trimesh` with the same vertices and faces."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
+    """Read a mesh file (OBJ, STL, PLY, GLB, OFF, …); equal vertices are merged, nothing else is repaired.
+
+    Args:
+        path: the file; a scene with several meshes is joined into one.
+        unit: length unit of the file's numbers, one of :data:`UNITS` (most formats carry none).
+
+    Raises:
+        UsageError: the unit is unknown.
+        DataError: the file is missing or holds no readable triangle mesh.
+    """
+    import trimesh
+
+    if unit not in UNITS:
+        raise unknown_name("length unit", unit, UNITS)
+    path = Path(path)
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no mesh file {os.fspath(path)!r}.")
+    try:
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:
+        raise DataError(f"{os.fspath(path)!r} cannot be read as a mesh ({error}).") from error
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise DataError(f"{os.fspath(path)!r} holds no triangles.")
+    loaded.merge_vertices(merge_tex=True, merge_norm=True)
+    return Mesh(np.asarray(loaded.vertices) * UNITS[unit], np.asarray(loaded.faces), path.stem)

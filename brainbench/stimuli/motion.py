@@ -1,0 +1,178 @@
+"""How whiskers and objects move: whisking after Knutsen, translation, rest. Angles in rad, times in s."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.morphology import MountedWhisker
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """How elevation φ and torsion ζ follow azimuth θ in each row: dφ/dθ and dζ/dθ for rows A to E."""
+
+    name: str
+    elevation: tuple[float, float, float, float, float]
+    torsion: tuple[float, float, float, float, float]
+
+
+ROTATIONS = {
+    "knutsen": Rotations("knutsen", (0.398, 0.591, 0.578, 0.393, 0.217), (-0.900, -0.284, 0.243, 0.449, 0.744)),
+    "knutsen-b": Rotations("knutsen-b", (0.12, 0.30, 0.30, 0.14, 0.02), (-0.76, -0.25, 0.22, 0.43, 0.73)),
+}
+"""Published coefficients for the couplings that Knutsen, Biess & Ahissar (2008, Neuron 59, 35–42)
+measured in rats: ``knutsen`` as WHISKiT uses them (Zweifel et al. 2021), ``knutsen-b`` a second
+published fit."""
+
+
+@dataclass(frozen=True)
+class Still:
+    """Nothing moves."""
+
+    def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return zeros [n]."""
+        return np.zeros(len(times))
+
+    def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rest angles (θ, φ, ζ) [n, 3] of one whisker."""
+        return np.tile(np.array(mount.angles), (len(times), 1))
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return zeros [n, 3]."""
+        return np.zeros((len(times), 3))
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        return {"kind": "still"}
+
+
+@dataclass(frozen=True)
+class Whisking:
+    """Sinusoidal whisking of the whole array about its rest pose.
+
+    With the azimuth a(t) = (protraction + retraction)/2 · cos(2πft + π) + (protraction − retraction)/2
+    each whisker has θ = θ₀ + a, φ = φ₀ + a·dφ, ζ = ζ₀ + a·dζ with its row's coefficients (the form of
+    Knutsen et al. 2008); the left side mirrors the right. The sinusoid starts retracted, at a = −retraction.
+    During ``onset`` the part that leaves this pose grows from nothing as 6u⁵ − 15u⁴ + 10u³, so position,
+    velocity and acceleration start without a jump.
+
+    Raises:
+        UsageError: a value is not finite or negative, or protraction and retraction cancel.
+    """
+
+    frequency: float = 20.0
+    """Whisks per second [Hz]."""
+    protraction: float = math.radians(30)
+    """Largest azimuth forward of rest [rad]."""
+    retraction: float = math.radians(10)
+    """Largest azimuth backward of rest [rad]."""
+    onset: float = 0.05
+    """Duration of the smooth start [s]."""
+    rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
+
+    def __post_init__(self) -> None:
+        _require("whisking frequency (Hz)", self.frequency, positive=True)
+        _require("whisking onset (s)", self.onset)
+        for name in ("protraction", "retraction"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or abs(value) > math.pi / 2:
+                raise UsageError(f"The {name} of whisking must lie within ±90° (given in rad); received {value!r}.")
+        if self.protraction + self.retraction <= 0:
+            raise UsageError(
+                "Whisking needs a protraction in front of its retraction (their sum is the peak-to-peak amplitude); "
+                f"received {self.protraction!r} and {self.retraction!r} rad."
+            )
+
+    def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a(t) [n] (rad), the azimuth relative to rest, positive forward on both sides."""
+        times = np.asarray(times, dtype=float)
+        stroke = (self.protraction + self.retraction) / 2 * (1 - np.cos(2 * np.pi * self.frequency * times))
+        return smooth_step(times, self.onset) * stroke - self.retraction
+
+    def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (θ, φ, ζ) [n, 3] (rad) of one whisker."""
+        azimuth = self.azimuth(times)[:, None]
+        mirror = 1.0 if mount.side == "right" else -1.0
+        rate = [mirror, self.rotations.elevation[mount.row], mirror * self.rotations.torsion[mount.row]]
+        return np.array(mount.angles) + azimuth * np.array(rate)
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        from brainbench.files import to_plain
+
+        return {"kind": "whisking", **to_plain(self)}
+
+
+@dataclass(frozen=True)
+class Translation:
+    """Straight motion that reaches its velocity smoothly.
+
+    The speed grows as 6u⁵ − 15u⁴ + 10u³ during ``onset`` and then stays.
+    """
+
+    velocity: Vector
+    """Final velocity [m/s, world]."""
+    onset: float = 0.01
+    """Duration of the smooth start [s]; 0 moves at full speed from the first instant."""
+
+    def __post_init__(self) -> None:
+        if len(self.velocity) != 3 or not all(math.isfinite(value) for value in self.velocity):
+            raise UsageError(f"A velocity is three finite numbers in m/s; received {self.velocity!r}.")
+        _require("translation onset (s)", self.onset)
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far it has moved since t = 0, [n, 3] (m, world)."""
+        times = np.asarray(times, dtype=float)
+        if self.onset == 0:
+            path = np.maximum(times, 0.0)
+        else:
+            u = np.clip(times / self.onset, 0.0, 1.0)
+            path = self.onset * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(times - self.onset, 0.0)
+        return path[:, None] * np.array(self.velocity)
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        return {"kind": "translation", "velocity": list(self.velocity), "onset": self.onset}
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayFollicle:
+    """Trajectory of one whisker base in the frame in which its array stood at t = 0."""
+
+    mount: MountedWhisker
+    whisking: Still | Whisking = field(default_factory=Still)
+    travel: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    """Displacement of the head [n, 3] (m) at times [n]; None when it stands still."""
+
+    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions [n, 3] (m) and Euler angles (θ, φ, ζ) [n, 3] (rad)."""
+        times = np.asarray(times, dtype=float)
+        position = np.tile(np.array(self.mount.position), (len(times), 1))
+        if self.travel is not None:
+            position = position + self.travel(times)
+        return position, self.whisking.angles(self.mount, times)
+
+
+def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float64]:
+    """Return 6u⁵ − 15u⁴ + 10u³ with u = t/duration within 0 … 1; ones when ``duration`` is 0."""
+    if duration == 0:
+        return np.ones_like(np.asarray(times, dtype=float))
+    u = np.clip(np.asarray(times, dtype=float) / duration, 0.0, 1.0)
+    return u**3 * (u * (6 * u - 15) + 10)
+
+
+def _require(what: str, value: float, *, positive: bool = False) -> None:
+    if not math.isfinite(value) or value < 0 or (positive and value == 0):
+        raise UsageError(f"The {what} must be {'positive' if positive else 'zero or more'}; received {value!r}.")

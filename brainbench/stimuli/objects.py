@@ -1,0 +1,244 @@
+"""Objects that whiskers meet: primitives, the Rodgers solid and meshes from files. Metres.
+
+A :class:`Solid` stands in its own frame; :class:`PlacedObject` puts it into a scene.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from brainbench.geometry import Mesh, load_mesh
+from brainbench.stimuli.motion import Still, Translation
+from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere, rotation_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+Vector = tuple[float, float, float]
+
+RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))
+"""Control points (x, y) of the cubic Bézier curve that is the convex face of the Rodgers solid, in the
+units of the published mesh (1 unit = 34.324 mm at a diagonal of 55 mm). Fitted by us; the curve passes
+through all 101 published vertices of that face within 6e-7."""
+RODGERS_OFFSET = (-0.020447, -0.046006)
+"""Displacement (x, y) from the convex to the concave face: the profile is the curve swept along it."""
+RODGERS_SPAN = (-0.256589, 0.251290)
+"""Lowest and highest z of the extruded profile."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A rigid shape in its own frame."""
+
+    name: str
+    parts: tuple[Part, ...]
+    """Convex parts whose union is what whiskers touch [m]."""
+    mesh: Mesh | None = None
+    """Surface for pictures and measurements; None for primitives."""
+    notes: tuple[str, ...] = ()
+    """What a user should know, such as a concavity lost to the convex hull."""
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [2, 3] (m)."""
+        if self.mesh is not None:
+            return self.mesh.bounds
+        corners = np.stack([part.bounds() for part in self.parts])
+        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding-box diagonal [m]."""
+        return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+
+    def scaled(self, factor: float) -> Solid:
+        """Return the solid scaled about its origin."""
+        if not (math.isfinite(factor) and factor > 0):
+            raise UsageError(f"A solid is scaled by a positive factor; received {factor!r}.")
+        parts = tuple(scale_part(part, factor) for part in self.parts)
+        return replace(self, parts=parts, mesh=self.mesh and self.mesh.scaled(factor))
+
+    def to_diagonal(self, diagonal: float) -> Solid:
+        """Return the solid scaled about its origin to a bounding-box diagonal [m]."""
+        return self.scaled(diagonal / self.diagonal)
+
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine the physics; the parts count by a hash of their numbers."""
+        from brainbench.files import content_hash, to_plain
+
+        parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
+        return {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "hash": content_hash(parts)}
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """A solid in a scene (world frame)."""
+
+    solid: Solid
+    position: Vector = (0.0, 0.0, 0.0)
+    """Where the solid's origin lies [m]."""
+    rotation: Vector = (0.0, 0.0, 0.0)
+    """Angles [rad] about the world's x, then y, then z axis."""
+    motion: Still | Translation = field(default_factory=Still)
+    friction: float | None = None
+    """Coulomb coefficient of its contacts; None takes each whisker's own."""
+
+    def obstacle(self, frame: tuple[ArrayLike, ArrayLike] | None = None) -> Obstacle:
+        """Return what the physics sees.
+
+        Args:
+            frame: rotation [3, 3] and origin [3] (m) of the frame, in the world, in which the
+                obstacle is expressed; the world itself when None.
+        """
+        axes, origin = (np.eye(3), np.zeros(3)) if frame is None else (np.asarray(frame[0]), np.asarray(frame[1]))
+        rotation = axes.T @ euler_matrix(self.rotation)
+        translation = axes.T @ (np.asarray(self.position) - origin)
+        parts = tuple(move_part(part, rotation, translation) for part in self.solid.parts)
+        if isinstance(self.motion, Still):
+            return Obstacle(parts=parts, friction=self.friction)
+        motion = self.motion
+
+        def path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            identity = np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+            return motion.displacement(times) @ axes, identity
+
+        return Obstacle(parts=parts, motion=path, friction=self.friction)
+
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine the physics."""
+        return {
+            "solid": self.solid.config(),
+            "position": list(self.position),
+            "rotation": list(self.rotation),
+            "motion": self.motion.config(),
+            "friction": self.friction,
+        }
+
+
+def sphere(radius: float) -> Solid:
+    """Return a ball about the origin; ``radius`` in metres."""
+    return Solid("sphere", (Sphere((0.0, 0.0, 0.0), radius),))
+
+
+def box(size: Vector) -> Solid:
+    """Return a box about the origin with edge lengths ``size`` [m]."""
+    half = (size[0] / 2, size[1] / 2, size[2] / 2)
+    return Solid("box", (Box((0.0, 0.0, 0.0), half),))
+
+
+def cylinder(radius: float, height: float) -> Solid:
+    """Return an upright (z) cylinder about the origin, such as a pole; metres."""
+    return Solid("cylinder", (Cylinder((0.0, 0.0, -height / 2), (0.0, 0.0, height / 2), radius),))
+
+
+def capsule(radius: float, length: float) -> Solid:
+    """Return an upright (z) capsule about the origin; ``length`` [m] between the centres of its caps."""
+    return Solid("capsule", (Capsule((0.0, 0.0, -length / 2), (0.0, 0.0, length / 2), radius),))
+
+
+def rodgers_solid(diagonal: float = 0.055, *, segments: int = 24) -> Solid:
+    """Return the crescent of the shape-discrimination task (Rodgers 2022), in the published mesh's frame.
+
+    A cubic Bézier profile of constant offset, extruded along z. Each segment between two points of
+    the curve is a parallelogram prism, so the parts are exactly convex, their union is exactly the
+    polygonal solid and the concave face stays concave. The concave face looks towards −y.
+
+    Args:
+        diagonal: bounding-box diagonal [m]; 55 mm in the published simulation.
+        segments: prisms along the curve; 24 leave a sagitta below 0.02 mm at 55 mm.
+    """
+    if segments < 2:
+        raise UsageError(f"The Rodgers solid needs at least 2 segments along its curve; received {segments}.")
+    t = np.linspace(0.0, 1.0, segments + 1)[:, None]
+    weights = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
+    convex = weights @ np.array(RODGERS_CONTROL)
+    concave = convex + np.array(RODGERS_OFFSET)
+    # Rings of four corners along the curve: convex low, convex high, concave high, concave low.
+    low, high = (np.full(segments + 1, height) for height in RODGERS_SPAN)
+    profile = ((convex, low), (convex, high), (concave, high), (concave, low))
+    rings = np.stack([np.column_stack([side, height]) for side, height in profile], axis=1)
+    corner, following = np.arange(4), np.roll(np.arange(4), -1)
+    near = 4 * np.arange(segments)[:, None]
+    quads = np.stack([near + corner, near + corner + 4, near + following + 4, near + following], axis=-1).reshape(-1, 4)
+    last = 4 * segments
+    quads = np.vstack([quads, [[0, 1, 2, 3]], [[last + 3, last + 2, last + 1, last]]])
+    faces = np.vstack([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]])
+    mesh = Mesh(rings.reshape(-1, 3), faces, "rodgers")
+    parts = tuple(ConvexPart(np.vstack([rings[i], rings[i + 1]])) for i in range(segments))
+    return Solid("rodgers", parts, mesh).to_diagonal(diagonal)
+
+
+def mesh_solid(path: str | os.PathLike[str], *, unit: str, diagonal: float | None = None) -> Solid:
+    """Return a mesh file as a solid; whiskers touch its convex hull.
+
+    Args:
+        path: any format :func:`brainbench.geometry.load_mesh` reads.
+        unit: length unit of the file (``m``, ``mm``, …).
+        diagonal: scale to this bounding-box diagonal [m]; None keeps the size.
+
+    Raises:
+        DataError: the file is missing, unreadable or flat.
+    """
+    mesh = load_mesh(path, unit=unit)
+    if diagonal is not None:
+        mesh = mesh.to_diagonal(diagonal)
+    hull = mesh.hull()
+    notes = ["Whiskers touch the convex hull: concavities of the mesh are filled."] if _is_concave(mesh, hull) else []
+    if not mesh.diagnosis.watertight:
+        notes.append(f"The mesh is not a closed solid: {mesh.diagnosis}.")
+    return Solid(mesh.name, (ConvexPart(hull.vertices),), mesh, tuple(notes))
+
+
+def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrix [3, 3] of ``angles`` [rad] about the fixed x, then y, then z axis."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
+def move_part(part: Part, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Part:
+    """Return ``part`` rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+
+    def place(point: ArrayLike) -> Any:
+        return tuple(map(float, rotation @ np.asarray(point) + translation))
+
+    if isinstance(part, ConvexPart):
+        return ConvexPart(part.vertices @ rotation.T + translation)
+    if isinstance(part, Sphere):
+        return replace(part, centre=place(part.centre))
+    if isinstance(part, Box):
+        from scipy.spatial.transform import Rotation
+
+        turned = Rotation.from_matrix(rotation @ rotation_matrix(part.quaternion)).as_quat(scalar_first=True)
+        return replace(part, centre=place(part.centre), quaternion=tuple(map(float, turned)))
+    return replace(part, start=place(part.start), end=place(part.end))
+
+
+def scale_part(part: Part, factor: float) -> Part:
+    """Return ``part`` scaled about the origin."""
+
+    def times(vector: ArrayLike) -> Any:
+        return tuple(float(value) * factor for value in np.asarray(vector))
+
+    if isinstance(part, ConvexPart):
+        return ConvexPart(part.vertices * factor)
+    if isinstance(part, Sphere):
+        return Sphere(times(part.centre), part.radius * factor)
+    if isinstance(part, Box):
+        return replace(part, centre=times(part.centre), half_sizes=times(part.half_sizes))
+    return replace(part, start=times(part.start), end=times(part.end), radius=part.radius * factor)
+
+
+def _is_concave(mesh: Mesh, hull: Mesh) -> bool:
+    if not mesh.diagnosis.watertight:
+        return True
+    return bool(mesh.to_trimesh().volume < 0.999 * hull.to_trimesh().volume)

@@ -1,0 +1,75 @@
+"""Two views of a stimulus set: the network's input grid and a tidy table."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from brainbench.errors import DataError, UsageError, listing
+from brainbench.types import CHANNELS, GRID_SHAPE, check_stimulus_set
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+    from numpy.typing import NDArray
+
+
+def to_grid(
+    dataset: xr.Dataset, *, substeps: int = 5, unstable: Literal["error", "zero"] = "error"
+) -> NDArray[np.float32]:
+    """Return the network's input [K, T, S·C, H, W] in SI units (N, N·m).
+
+    Frame t·S + s, channel c of the whisker at (row, col) goes to [k, t, s·6 + c, row, col] (sub-step
+    major). Cells without a whisker and whiskers that were not simulated are zero. 110 frames in
+    sub-steps of 5 give [K, 22, 30, 5, 7].
+
+    Args:
+        dataset: stimulus set with whiskers of one side.
+        substeps: frames S that make one time step.
+        unstable: what to do with whiskers whose simulation became unstable (their numbers are NaN):
+            refuse, or read them as zero.
+
+    Raises:
+        UsageError: the frames do not divide into sub-steps, or two whiskers share a cell.
+        DataError: a number is not finite.
+    """
+    check_stimulus_set(dataset)
+    stimuli, frames, whiskers, channels = dataset["wrench"].shape
+    if substeps < 1 or frames % substeps:
+        raise UsageError(f"{frames} frames do not divide into time steps of {substeps} sub-steps.")
+    rows, cols = dataset["row"].values.astype(int), dataset["col"].values.astype(int)
+    cells = rows * GRID_SHAPE[1] + cols
+    if len(set(cells)) < whiskers:
+        raise UsageError("The stimulus set has two whiskers in one cell (both sides); select one side first.")
+    wrench = dataset["wrench"].values
+    if not np.isfinite(wrench).all():
+        if unstable != "zero":
+            raise DataError(_describe_gaps(dataset))
+        wrench = np.nan_to_num(wrench, nan=0.0, posinf=0.0, neginf=0.0)
+    grid = np.zeros((stimuli, frames, channels, GRID_SHAPE[0] * GRID_SHAPE[1]), dtype=np.float32)
+    grid[..., cells] = np.swapaxes(wrench, 2, 3)
+    return grid.reshape(stimuli, frames // substeps, substeps * channels, *GRID_SHAPE)
+
+
+def to_frame(dataset: xr.Dataset) -> pd.DataFrame:
+    """Return a tidy table: one row per stimulus, frame and whisker.
+
+    Columns: ``stimulus``, ``time`` (s), ``whisker``, ``row``, ``col``, the six channels (N, N·m), and
+    ``contact``, ``contact_arc`` (m) and ``status`` where the set has them.
+    """
+    check_stimulus_set(dataset)
+    channels = dataset["wrench"].assign_coords(channel=list(CHANNELS)).to_dataset(dim="channel")
+    extra = [name for name in ("contact", "contact_arc", "status") if name in dataset]
+    joined = channels.merge(dataset[extra]) if extra else channels
+    table = joined.to_dataframe(dim_order=["stimulus", "time", "whisker"]).reset_index()
+    return table.loc[:, ["stimulus", "time", "whisker", "row", "col", *CHANNELS, *extra]]
+
+
+def _describe_gaps(dataset: xr.Dataset) -> str:
+    bad = ~np.isfinite(dataset["wrench"].values).all(axis=(1, 3))
+    names = [f"{dataset['whisker'].values[j]} in {dataset['stimulus'].values[i]}" for i, j in np.argwhere(bad)]
+    return (
+        f"The simulation of {len(names)} whiskers became unstable ({listing(names, limit=4)}): simulate with a finer "
+        "fidelity, or read them as zero with to_grid(…, unstable='zero')."
+    )
