@@ -1,0 +1,171 @@
+"""A causal transformer that reads the encoder's features and answers at an action token after every step.
+
+Tokens: x0, a, x1, a, … with one learned action token a; 22 steps make 44 tokens of a context of 65.
+Pre-norm blocks as in GPT-2 (Radford et al. 2019), learned positions, a head w → w without bias ("LM head").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from brainbench.errors import UsageError
+from brainbench.models._layers import Linear
+
+# GPT-2 draws weights with standard deviation 0.02 at any width; gain/√fan_in is its width-aware form
+# (0.02 ≈ gain 0.45 at 512), and residual branches shrink with depth so that the sum keeps its scale.
+_TOKEN_STD = 0.02
+
+
+@dataclass(frozen=True)
+class GPTState:
+    """Keys and values of the tokens so far, one pair [B, heads, tokens, width/heads] per block."""
+
+    keys: tuple[torch.Tensor, ...]
+    values: tuple[torch.Tensor, ...]
+
+    @property
+    def tokens(self) -> int:
+        """Number of tokens seen."""
+        return self.keys[0].shape[2]
+
+
+class GPTBlock(nn.Module):
+    """Pre-norm attention and a four times wider MLP, each added to the stream [B, tokens, width]."""
+
+    def __init__(self, width: int, heads: int, dropout: float, depth: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.dropout = dropout
+        residual = 1.0 / math.sqrt(2.0 * depth)
+        self.norm_attention = nn.LayerNorm(width)
+        self.query_key_value = Linear(width, 3 * width)
+        self.project = Linear(width, width, gain=residual)
+        self.norm_mlp = nn.LayerNorm(width)
+        self.mlp = nn.Sequential(
+            Linear(width, 4 * width), nn.GELU(), Linear(4 * width, width, gain=residual), nn.Dropout(dropout)
+        )
+        self.residual_dropout = nn.Dropout(dropout)
+
+    def forward(
+        self, x: torch.Tensor, past: tuple[torch.Tensor, torch.Tensor] | None = None
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+        """Return the stream and the keys and values of all tokens so far."""
+        batch, tokens, width = x.shape
+        fused = self.query_key_value(self.norm_attention(x)).view(batch, tokens, 3, self.heads, width // self.heads)
+        query, key, value = fused.permute(2, 0, 3, 1, 4)
+        mask = None
+        if past is not None:
+            seen = past[0].shape[2]
+            key, value = torch.cat((past[0], key), 2), torch.cat((past[1], value), 2)
+            mask = torch.ones(tokens, seen + tokens, dtype=torch.bool, device=x.device).tril(seen)
+        attended = functional.scaled_dot_product_attention(
+            query,
+            key,
+            value,
+            attn_mask=mask,
+            is_causal=mask is None,
+            dropout_p=self.dropout if self.training else 0.0,
+        )
+        x = x + self.residual_dropout(self.project(attended.transpose(1, 2).reshape(batch, tokens, width)))
+        return x + self.mlp(self.norm_mlp(x)), (key, value)
+
+
+class GPTAttender(nn.Module):
+    """Map features [B, T, F] to [B, T, width], causally, for at most ``context // 2`` steps.
+
+    Args:
+        features: F, features of one step.
+        width: Width of the stream; a multiple of ``heads``.
+
+    25,778,688 parameters for 512 → 512; 6,532,608 for 512 → 256.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        width: int,
+        *,
+        blocks: int = 8,
+        heads: int = 4,
+        context: int = 65,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if width % heads:
+            raise UsageError(f"The width of a GPT attender must be a multiple of its {heads} heads; received {width}.")
+        self.features = width
+        self.context = context
+        self.action = nn.Parameter(torch.empty(features))
+        self.embed = Linear(features, width)
+        self.positions = nn.Parameter(torch.empty(context, width))
+        self.dropout = nn.Dropout(dropout)
+        self.blocks = nn.ModuleList(GPTBlock(width, heads, dropout, blocks) for _ in range(blocks))
+        self.norm = nn.LayerNorm(width)
+        self.lm_head = Linear(width, width, use_bias=False)
+        nn.init.normal_(self.action, std=_TOKEN_STD)
+        nn.init.normal_(self.positions, std=_TOKEN_STD)
+        self.layers = (*(f"block{index}" for index in range(1, blocks + 1)), "lm_head")
+
+    @property
+    def max_steps(self) -> int:
+        """Longest sweep that fits the context."""
+        return self.context // 2
+
+    def init_state(
+        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> GPTState:
+        """Return the state before the first step: no tokens."""
+        block = self._block(0)
+        shape = (batch, block.heads, 0, self.features // block.heads)
+        empty = torch.zeros(shape, device=device or self.positions.device, dtype=dtype or self.positions.dtype)
+        return GPTState((empty,) * len(self.blocks), (empty,) * len(self.blocks))
+
+    def step(self, x: torch.Tensor, state: GPTState) -> tuple[torch.Tensor, GPTState]:
+        """Advance by one step of features [B, F]; return the answer [B, width] and the next state.
+
+        Raises:
+            UsageError: the context is full.
+        """
+        stream = self._tokens(x[:, None], state.tokens)
+        keys, values = [], []
+        for index, past in enumerate(zip(state.keys, state.values, strict=True)):
+            stream, (key, value) = self._block(index)(stream, past)
+            keys.append(key)
+            values.append(value)
+        return self.lm_head(self.norm(stream[:, 1])), GPTState(tuple(keys), tuple(values))
+
+    def forward(
+        self, x: torch.Tensor, return_activations: bool | Collection[str] = False
+    ) -> torch.Tensor | tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Return the answers [B, T, width], with activations also those at the action tokens of named layers."""
+        stream = self._tokens(x, 0)
+        wanted = self.layers if return_activations is True else return_activations or ()
+        activations = {}
+        for index, name in enumerate(self.layers[:-1]):
+            stream, _ = self._block(index)(stream)
+            if name in wanted:
+                activations[name] = stream[:, 1::2]
+        y = self.lm_head(self.norm(stream[:, 1::2]))
+        if "lm_head" in wanted:
+            activations["lm_head"] = y
+        return (y, activations) if return_activations is not False else y
+
+    def _tokens(self, x: torch.Tensor, start: int) -> torch.Tensor:
+        batch, steps, features = x.shape
+        if start + 2 * steps > self.context:
+            raise UsageError(
+                f"The GPT attender remembers at most {self.max_steps} steps (context {self.context} tokens, two per "
+                f"step); received step {start // 2 + steps}. Shorten the sweep or start again from init_state."
+            )
+        pairs = torch.stack((x, self.action.to(x.dtype).expand(batch, steps, features)), 2)
+        return self.dropout(self.embed(pairs.flatten(1, 2)) + self.positions[start : start + 2 * steps])
+
+    def _block(self, index: int) -> GPTBlock:
+        block = self.blocks[index]
+        return block  # type: ignore[return-value]  # ModuleList is not generic

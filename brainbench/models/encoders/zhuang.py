@@ -1,0 +1,59 @@
+"""The recurrent convolutional encoder of Zhuang et al. (2017), with any cell.
+
+Six 2×2 convolutions (the first "valid", 5 × 7 → 4 × 6, the others "same"), two dense layers, feedback
+3→2, 4→2, 4→3, 5→3, 5→4, 6→4, 6→5 and skips conv2, conv4 → fc7. With the time-decay cell every node has a
+memory, as published; with a gated cell the convolutions carry it and the dense layers have none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from brainbench.models.graph_spec import Convolution, Dense, Edge, GraphSpec, Memory, Node
+
+INPUT_SHAPE = (30, 5, 7)
+"""Five sub-steps of six channels (sub-step-major) on the whisker grid."""
+
+_FEEDBACK = ((3, 2), (4, 2), (4, 3), (5, 3), (5, 4), (6, 4), (6, 5))
+_FULL = (96, 128, 256, 384, 384, 256)
+
+
+@dataclass(frozen=True)
+class ZhuangEncoder:
+    """Choices of the encoder; :meth:`spec` is its graph.
+
+    Features: 512, or 96 when ``small`` (every width × 3/16, about 1.3 M parameters with the largest cell).
+    """
+
+    cell: str = "time-decay"
+    """``time-decay``, ``ugrnn``, ``intersection``, ``gru`` or ``lstm``."""
+    layer_norm: bool = False
+    small: bool = False
+    input_shape: tuple[int, int, int] = INPUT_SHAPE
+
+    def _width(self, full: int) -> int:
+        return full * 3 // 16 if self.small else full
+
+    @property
+    def features(self) -> int:
+        """Number of output features."""
+        return self._width(512)
+
+    def spec(self) -> GraphSpec:
+        """Return the graph's description.
+
+        Raises:
+            UsageError: there is no such cell.
+        """
+        memory = Memory(self.cell, layer_norm=self.layer_norm)
+        names = [f"conv{index}" for index in range(1, 7)]
+        nodes = [
+            Node(name, Convolution(self._width(width), padding="valid" if name == "conv1" else "same"), memory)
+            for name, width in zip(names, _FULL, strict=True)
+        ]
+        dense = memory if self.cell == "time-decay" else None
+        nodes += [Node("fc7", Dense(self._width(1024)), dense), Node("fc8", Dense(self.features), dense)]
+        forward = [*zip(names, names[1:], strict=False), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
+        edges = [Edge(*ends) for ends in (*forward, ("fc7", "fc8"))]
+        edges += [Edge(f"conv{source}", f"conv{target}", feedback=True) for source, target in _FEEDBACK]
+        return GraphSpec(tuple(nodes), tuple(edges), ("conv1",), "fc8", self.input_shape)

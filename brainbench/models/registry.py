@@ -1,0 +1,239 @@
+"""Models by name.
+
+A name is ``<encoder>[-<cell>][-ln][-small][+<attender>][.<tag>]``. Without a tag the model is untrained;
+its weights follow from the seed alone. Other packages add models through the entry point group
+``brainbench.models``: an entry point names a module (or an object in it) whose import runs
+:func:`register_model`. Importing this module imports no framework.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
+
+_log = logging.getLogger(__name__)
+
+ENTRY_POINTS = "brainbench.models"
+OBJECTIVES = ("supervised", "simclr", "simsiam", "ae")
+"""Tags of trained weights: the objective they were trained with."""
+
+_NAME = re.compile(r"[a-z0-9]+([-+][a-z0-9]+)*")
+
+
+@dataclass(frozen=True)
+class ModelRecord:
+    """One architecture of the registry."""
+
+    name: str
+    build: Callable[[], nn.Module]
+    """Builds the model with new random weights."""
+    family: str
+    description: str
+    citation: str
+    licence: str
+
+
+@dataclass(frozen=True)
+class ModelDescription:
+    """What is known about an architecture without building its weights."""
+
+    name: str
+    family: str
+    description: str
+    citation: str
+    licence: str
+    parameters: int
+    multiply_adds: int | None
+    """Multiply-adds of a time step, counted on the first one (attention to earlier steps adds to it: 0.2 % in
+    the 22nd step of ``+gpt``); None for a model that does not state its input shape."""
+    layers: tuple[str, ...]
+    """Layers that can be extracted by name."""
+
+
+_records: dict[str, ModelRecord] = {}
+_sources: set[str] = set()
+
+Factory = TypeVar("Factory", bound="Callable[[], nn.Module]")
+
+
+def register_model(
+    name: str, *, family: str, description: str = "", citation: str = "", licence: str = "unstated"
+) -> Callable[[Factory], Factory]:
+    """Decorate a function without arguments that builds a model, so that it can be had by name.
+
+    Args:
+        name: Lower-case letters, digits, ``-`` and ``+``.
+        family: Architecture family, for grouping on leaderboards.
+        description: One line for people.
+        citation: Paper the architecture comes from.
+        licence: Licence of the code (weights carry their own).
+
+    Raises:
+        UsageError: the name is taken or breaks the grammar.
+
+    Example:
+        >>> @register_model("tiny-linear", family="linear")
+        ... def tiny_linear():
+        ...     from torch import nn
+        ...     return nn.Sequential(nn.Flatten(), nn.LazyLinear(10))
+        >>> "tiny-linear" in list_models("tiny*")
+        True
+    """
+    if not _NAME.fullmatch(name):
+        raise UsageError(f"A model name is lower-case letters and digits joined by '-' or '+'; received {name!r}.")
+
+    def decorate(build: Factory) -> Factory:
+        if name in _known():
+            owner = _records[name].build
+            raise UsageError(f"A model named {name!r} is already registered by {owner!r}; choose another name.")
+        _records[name] = ModelRecord(name, build, family, description, citation, licence)
+        return build
+
+    return decorate
+
+
+def list_models(pattern: str = "*") -> list[str]:
+    """Return the names of the architectures that match a shell pattern, such as ``*+gpt``."""
+    return [name for name in _known() if fnmatchcase(name, pattern)]
+
+
+def find_model(name: str) -> ModelRecord:
+    """Return a copy of an architecture's record; a tag in the name is checked and left out.
+
+    Raises:
+        UsageError: no such model or tag; the message names the nearest.
+    """
+    return replace(_known()[_split(name)[0]])
+
+
+def load_model(name: str, *, seed: int = 0, pretrained: str | os.PathLike[str] | None = None) -> nn.Module:
+    """Build a model by name, in evaluation mode.
+
+    Args:
+        name: ``architecture`` (untrained) or ``architecture.tag`` (trained with that objective).
+        seed: Seed of untrained weights. Equal seeds give equal weights whatever else drew random
+            numbers, and PyTorch's global random state is left as it was.
+        pretrained: Safetensors file with the weights of a tagged name.
+
+    Raises:
+        UsageError: no such model or tag, weights given for an untagged name, or none for a tagged one.
+        DataError: the file of weights is missing, unreadable or does not fit.
+    """
+    architecture, tag = _split(name)
+    if tag is None and pretrained is not None:
+        raise UsageError(
+            f"Without a tag {name!r} is the untrained model; name the objective its weights were trained with, "
+            f"for example {name}.{OBJECTIVES[0]!s}, to load {os.fspath(pretrained)!r}."
+        )
+    if tag is not None and pretrained is None:
+        raise UsageError(
+            f"There are no weights for {name!r} yet; train them with: brainbench train {architecture} "
+            f"--objective {tag}; or load the untrained model {architecture!r}."
+        )
+    from brainbench.models._seeding import seeded
+
+    with seeded(seed):
+        model = _known()[architecture].build()
+    if pretrained is not None:
+        _load_weights(model, Path(pretrained), name)
+    return model.eval()
+
+
+def describe_model(name: str) -> ModelDescription:
+    """Return an architecture's record with its size and cost, computed without allocating its weights.
+
+    Raises:
+        UsageError: there is no such model.
+    """
+    import torch
+
+    record = find_model(name)
+    with torch.device("meta"):
+        model = record.build().eval()
+    return ModelDescription(
+        record.name,
+        record.family,
+        record.description,
+        record.citation,
+        record.licence,
+        parameters=sum(parameter.numel() for parameter in model.parameters()),
+        multiply_adds=_multiply_adds(model),
+        layers=tuple(getattr(model, "layers", ())),
+    )
+
+
+def _multiply_adds(model: nn.Module) -> int | None:
+    """Count multiply-adds of matrix products, convolutions and attention in one time step."""
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    spec = getattr(model, "spec", None)
+    if spec is None:
+        return None
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        model(torch.empty(1, 1, *spec.input_shape, device="meta"))
+    return counter.get_total_flops() // 2
+
+
+def _load_weights(model: nn.Module, path: Path, name: str) -> None:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from brainbench.models._tnn_state import load_named
+
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no file of weights {os.fspath(path)!r} for {name!r}.")
+    try:
+        state: dict[str, torch.Tensor] = load_file(path)
+    except SafetensorError as error:
+        raise DataError(f"{os.fspath(path)!r} is not a readable safetensors file ({error}).") from error
+    load_named(model.state_dict(), state, what=f"the model {name!r}")
+
+
+def _split(name: str) -> tuple[str, str | None]:
+    """Return (architecture, tag) of a name that exists."""
+    if name.endswith(".py") or any(mark in name for mark in "/\\:"):
+        raise UsageError(
+            f"{name!r} looks like a path, not a model's name; a model of your own is given as "
+            "path/to/file.py:make_model (load_user_model in Python)."
+        )
+    architecture, dot, tag = name.partition(".")
+    known = _known()
+    if architecture not in known:
+        raise unknown_name("model", architecture, known, hint="See them all with: brainbench models")
+    if dot and tag not in OBJECTIVES:
+        raise unknown_name(f"weights tag of {architecture!r}", tag, OBJECTIVES)
+    return architecture, tag if dot else None
+
+
+def _known() -> dict[str, ModelRecord]:
+    """Return the registry, filled on first use."""
+    if "builtin" not in _sources:
+        _sources.add("builtin")
+        from brainbench.models import zoo
+
+        zoo.register()
+        _load_entry_points()
+    return _records
+
+
+def _load_entry_points() -> None:
+    from importlib.metadata import entry_points
+
+    for entry in entry_points(group=ENTRY_POINTS):
+        try:
+            entry.load()
+        except Exception as error:  # noqa: BLE001 - another package's fault must not take our models away
+            _log.warning("The models of entry point %r (%s) could not be loaded: %s", entry.name, entry.value, error)
