@@ -1,0 +1,74 @@
+"""Stimulus labels of trials, and the mean response to each stimulus."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.errors import DataError, UsageError
+from brainbench.metrics._pairs import Floats, Ints
+
+
+def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, tuple[str, ...]]:
+    """Return integer codes [R] and the names of all stimuli.
+
+    Integers are codes already (0 … K−1, and K is ``count`` or the largest plus one); strings are
+    coded in sorted order. The order of appearance never matters.
+
+    Raises:
+        UsageError: other types, negative codes, or codes at or above ``count``.
+    """
+    array = np.asarray(labels)
+    if array.ndim != 1:
+        raise UsageError(f"Labels are one per trial [R]; received an array of shape {array.shape}.")
+    if array.dtype.kind in "US" or (array.dtype == object and all(isinstance(label, str) for label in array)):
+        names, codes = np.unique(array.astype(str), return_inverse=True)
+        return codes.astype(np.int64), tuple(str(name) for name in names)
+    if array.dtype.kind not in "iu":
+        raise UsageError(f"Labels must be integers from 0 or strings; received {array.dtype}.")
+    codes = array.astype(np.int64)
+    total = int(codes.max(initial=-1)) + 1 if count is None else count
+    if codes.min(initial=0) < 0 or codes.max(initial=-1) >= total:
+        raise UsageError(
+            f"Integer labels of {total} stimuli run from 0 to {total - 1}; received {codes.min()} to {codes.max()}."
+        )
+    return codes, tuple(str(code) for code in range(total))
+
+
+def response_matrix(responses: ArrayLike, rows: str) -> NDArray:
+    """Return responses as a floating array [rows, U], keeping float32.
+
+    Raises:
+        UsageError: not a two-dimensional array of real numbers with at least one unit.
+    """
+    array = np.asarray(responses)
+    if array.ndim != 2 or array.dtype.kind not in "fiub" or array.shape[1] == 0:
+        raise UsageError(
+            f"Responses must be real numbers [{rows}, units] with at least one unit; "
+            f"received {array.dtype} of shape {array.shape}; flatten time and space into units first."
+        )
+    return array if array.dtype.kind == "f" else array.astype(np.float64)
+
+
+def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
+    """Return the mean response [K, U] over the trials of each stimulus; NaN entries are missing.
+
+    A unit without any value for a stimulus is NaN there.
+
+    Raises:
+        UsageError: the number of labels is not the number of trials.
+        DataError: a response is infinite.
+    """
+    if len(codes) != len(responses):
+        raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+    infinite = int(np.isinf(responses).sum())
+    if infinite:
+        raise DataError(f"{infinite} responses are infinite; a missing response is NaN, everything else is finite.")
+    member = np.zeros((count, len(codes)))
+    member[codes, np.arange(len(codes))] = 1.0
+    present = ~np.isnan(responses)
+    # Sums about a value from within the data keep the digits that a large offset would cost.
+    shift = float(responses[present][0]) if present.any() else 0.0
+    totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
+    counts = member @ present.astype(np.float64)
+    return np.where(counts > 0, totals / np.where(counts > 0, counts, 1.0), np.nan) + shift

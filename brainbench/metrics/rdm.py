@@ -1,0 +1,191 @@
+"""Representational dissimilarity matrices (RDMs).
+
+Conventions are those of rsatoolbox 0.3.2: distances are squared and divided by the number of units,
+correlation distance is 1 − r, and the result is the upper triangle [P], row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.errors import DataError, UsageError, listing, unknown_name
+from brainbench.metrics._distances import correlation_distances, product_distances
+from brainbench.metrics._labels import response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics._pairs import Floats, Ints
+
+POISSON_PRIOR_MEAN = 1.0
+POISSON_PRIOR_WEIGHT = 0.1
+"""Gamma prior that keeps the logarithm of a silent unit finite (rsatoolbox's defaults)."""
+
+
+@dataclass(frozen=True)
+class _Trials:
+    """What a method may use: patterns [K, U], and for labelled trials the trials behind them."""
+
+    patterns: NDArray
+    missing: bool
+    trials: NDArray | None
+    codes: Ints | None
+    folds: ArrayLike | None
+    precision: ArrayLike | None
+
+
+def rdm(
+    responses: ArrayLike,
+    labels: ArrayLike | None = None,
+    *,
+    method: str = "correlation",
+    folds: ArrayLike | None = None,
+    precision: ArrayLike | None = None,
+) -> Floats:
+    """Return the RDM of stimulus patterns, upper triangle [P].
+
+    Without ``labels`` each row of ``responses`` [K, U] is one stimulus' complete pattern. With
+    ``labels`` [R] the rows are trials [R, U], averaged per stimulus; NaN is a missing entry, and a
+    pair of stimuli uses the units that have a value for both (with ``precision`` a stimulus that lacks
+    a unit has NaN pairs). Integer labels are positions 0 … K−1, strings are sorted.
+
+    Args:
+        responses: [K, U] or [R, U], any real type; computed in float64.
+        labels: Stimulus of each trial, or None.
+        method: ``correlation`` 1 − Pearson r; ``sqeuclidean``; ``mahalanobis`` (with ``precision``;
+            squared Euclidean without); ``crossnobis`` cross-validated Mahalanobis distance, mean over
+            pairs of folds (Walther 2016; unbiased, can be negative); ``poisson`` symmetrised
+            Kullback-Leibler divergence of Poisson rates (Schütt 2023).
+        folds: Cross-validation fold of each trial [R]; needed by ``crossnobis`` only. Every fold weighs
+            the same; fold pairs in which a stimulus is missing are left out of its pairs.
+        precision: Inverse noise covariance [U, U] between units, see :func:`noise_precision`.
+
+    Returns:
+        Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no
+        trials) is NaN; :func:`rdm_problem` says why.
+
+    Raises:
+        UsageError: unknown method, shapes that do not fit, folds missing or not wanted.
+        DataError: infinite trials, or negative rates for ``poisson``.
+    """
+    if method not in _METHODS:
+        raise unknown_name("RDM method", method, _METHODS)
+    if folds is not None and method != "crossnobis":
+        raise UsageError(f"folds are for method='crossnobis'; method={method!r} averages all trials; leave them out.")
+    if precision is not None and method not in ("mahalanobis", "crossnobis"):
+        raise UsageError(f"A noise precision is for 'mahalanobis' and 'crossnobis'; method={method!r} does not use it.")
+    return _METHODS[method](_prepare(responses, labels, folds, precision))
+
+
+def rdm_problem(responses: ArrayLike, labels: ArrayLike | None = None) -> str | None:
+    """Say in words why some pairs of the RDM of ``responses`` have no distance; None if none does.
+
+    Constant patterns matter to correlation distance only.
+    """
+    matrix = response_matrix(responses, "stimuli" if labels is None else "trials")
+    if labels is None:
+        patterns, names = matrix, tuple(str(row) for row in range(len(matrix)))
+    else:
+        codes, names = stimulus_codes(labels)
+        patterns = stimulus_means(matrix, codes, len(names))
+        empty = ~np.isfinite(patterns).any(axis=1)
+        if empty.any():
+            return f"no trials of stimulus {listing(np.asarray(names)[empty])}"
+    broken = ~np.isfinite(patterns).all(axis=1)
+    if labels is None and broken.any():
+        return f"activations that are not finite for stimulus {listing(np.asarray(names)[broken])}"
+    with np.errstate(invalid="ignore"):
+        spread = np.nanmax(patterns, axis=1) - np.nanmin(patterns, axis=1)
+        constant = spread <= 8 * np.finfo(np.float64).eps * np.nanmax(np.abs(patterns), axis=1)
+    if constant.any():
+        return f"a constant response across units to stimulus {listing(np.asarray(names)[constant])}"
+    return None
+
+
+def _prepare(
+    responses: ArrayLike, labels: ArrayLike | None, folds: ArrayLike | None, precision: ArrayLike | None
+) -> _Trials:
+    if labels is None:
+        patterns = response_matrix(responses, "stimuli")
+        trials = codes = None
+    else:
+        trials = response_matrix(responses, "trials")
+        codes, names = stimulus_codes(labels)
+        patterns = stimulus_means(trials, codes, len(names))
+    if len(patterns) < 2:
+        raise UsageError(f"An RDM compares at least 2 stimuli; received {len(patterns)}.")
+    return _Trials(patterns, labels is not None, trials, codes, folds, precision)
+
+
+def _correlation(given: _Trials) -> Floats:
+    return correlation_distances(given.patterns, missing=given.missing)
+
+
+def _sqeuclidean(given: _Trials) -> Floats:
+    return product_distances(given.patterns, given.patterns, missing=given.missing)
+
+
+def _mahalanobis(given: _Trials) -> Floats:
+    if given.precision is None:
+        return _sqeuclidean(given)
+    weight = _precision_matrix(given.precision, given.patterns.shape[1])
+    # The shift per unit must go before the product mixes units.
+    centred = given.patterns - given.patterns.mean(axis=0, dtype=np.float64)
+    return product_distances(centred, centred @ weight)
+
+
+def _crossnobis(given: _Trials) -> Floats:
+    if given.trials is None or given.codes is None or given.folds is None:
+        raise UsageError(
+            "method='crossnobis' needs labels and folds: one stimulus and one cross-validation fold per trial."
+        )
+    folds = np.asarray(given.folds)
+    if folds.shape != given.codes.shape:
+        raise UsageError(f"There are {len(given.codes)} trials but folds of shape {folds.shape}; give one per trial.")
+    names = np.unique(folds)
+    if len(names) < 2:
+        raise UsageError(f"method='crossnobis' compares at least 2 folds; received {len(names)}.")
+    units = given.patterns.shape[1]
+    weight = None if given.precision is None else _precision_matrix(given.precision, units)
+    means = []
+    for name in names:
+        chosen = folds == name
+        mean = stimulus_means(given.trials[chosen], given.codes[chosen], len(given.patterns))
+        means.append(mean - given.patterns.mean(axis=0) if np.isfinite(given.patterns).all() else mean)
+    weighted = means if weight is None else [mean @ weight for mean in means]
+    total = np.zeros(len(given.patterns) * (len(given.patterns) - 1) // 2)
+    count = np.zeros_like(total)
+    for first in range(len(names)):
+        for second in range(first + 1, len(names)):
+            distance = product_distances(means[first], weighted[second], missing=True)
+            found = np.isfinite(distance)
+            total += np.where(found, distance, 0.0)
+            count += found
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _poisson(given: _Trials) -> Floats:
+    low = float(np.nanmin(given.patterns, initial=np.inf))
+    if low < 0:
+        raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
+    rates = (given.patterns + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
+    return product_distances(rates, np.log(rates), missing=given.missing)
+
+
+def _precision_matrix(precision: ArrayLike, units: int) -> Floats:
+    weight = np.asarray(precision, dtype=np.float64)
+    if weight.shape != (units, units):
+        raise UsageError(f"The noise precision of {units} units has shape ({units}, {units}); received {weight.shape}.")
+    return weight
+
+
+_METHODS: dict[str, Callable[[_Trials], Floats]] = {
+    "correlation": _correlation,
+    "sqeuclidean": _sqeuclidean,
+    "mahalanobis": _mahalanobis,
+    "crossnobis": _crossnobis,
+    "poisson": _poisson,
+}
+
+RDM_METHODS = tuple(_METHODS)
+"""Names that ``method`` of :func:`rdm` takes."""

@@ -1,0 +1,257 @@
+"""Split-half reliability of an animal's RDM, from its trials.
+
+An animal is a sequence of sessions (:class:`TrialBlock`) with different units. Units of all sessions
+are joined after averaging trials, so an RDM spans them all.
+
+Rules for what cannot be split:
+a session that lacks two trials of some stimulus is left out, of the RDM too, so that the RDM and its
+reliability describe the same data; a unit with fewer than two recorded trials of some stimulus is
+left out of its session. What was left out is told in words. Without any session left the animal is
+undefined.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.errors import DataError, UsageError, listing, unknown_name
+from brainbench.metrics._distances import correlation_distances, product_distances
+from brainbench.metrics._hashing import Hashes, content_hashes, draws, key_hashes
+from brainbench.metrics._labels import response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics._pairs import Floats, Ints
+from brainbench.metrics.compare import check_comparison, compare
+from brainbench.metrics.noise import spearman_brown
+from brainbench.metrics.rdm import POISSON_PRIOR_MEAN, POISSON_PRIOR_WEIGHT
+from brainbench.types import Interval
+
+SPLITS = 1000
+"""Random split halves per animal."""
+
+_CHUNK_BYTES = 1 << 24
+_HALVES_BYTES = 1 << 26
+
+
+@dataclass(frozen=True)
+class TrialBlock:
+    """Trials of one session: the same units recorded together."""
+
+    responses: ArrayLike
+    """[R, F] responses (units, or units × time bins); NaN is missing."""
+    labels: ArrayLike
+    """[R] stimulus of each trial, integers 0 … K−1."""
+    keys: Sequence[str] | None = None
+    """[R] unique names of the trials, from which the random splits are drawn; None draws them from the
+    trials' content. Either way the order of trials, sessions and units is irrelevant."""
+
+
+@dataclass(frozen=True)
+class SplitHalf:
+    """RDMs of random halves of an animal's trials, and how well they agree."""
+
+    rdm: Floats
+    """[P] RDM of all trials."""
+    r: Floats
+    """[S] comparison of the two halves' RDMs, raw."""
+    halves: Floats
+    """[S′, 2, P] RDMs of the halves of the first S′ ≤ S splits (as many as fit in 64 MiB)."""
+    reliability: float
+    """Spearman-Brown reliability of the mean of ``r`` (averaged before, not after, the formula)."""
+    spread: Interval | None
+    """Percentiles of single splits' Spearman-Brown values: how much one split would have misled, not a
+    confidence interval of the reliability."""
+    units: int
+    trials: int
+    problem: str | None = None
+    """Why no reliability exists."""
+    notes: tuple[str, ...] = ()
+    """What was left out."""
+
+
+@dataclass(frozen=True)
+class _Session:
+    responses: Floats
+    codes: Ints
+    hashes: Hashes
+
+
+def split_half(
+    blocks: Sequence[TrialBlock],
+    n_stimuli: int,
+    *,
+    stimuli: Sequence[str] | None = None,
+    method: str = "correlation",
+    comparison: str = "pearson",
+    splits: int = SPLITS,
+    seed: int = 0,
+) -> SplitHalf:
+    """Split each stimulus' trials of each session into random halves and compare the halves' RDMs.
+
+    With an odd number of trials the larger half is drawn too. Random numbers are hashes of (seed,
+    split, trial key).
+
+    Args:
+        blocks: Sessions of one animal.
+        n_stimuli: K.
+        stimuli: Names of the stimuli, for messages.
+        method: RDM method: ``correlation``, ``sqeuclidean`` or ``poisson``.
+        comparison: Comparison between the halves' RDMs, see :func:`brainbench.metrics.compare`.
+        splits: Number S of random splits.
+        seed: Seed of the splits.
+
+    Raises:
+        UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
+        DataError: infinite responses, or negative ones for ``poisson``.
+    """
+    if method not in _SUBJECT_METHODS:
+        raise unknown_name(
+            "RDM method of an animal",
+            method,
+            _SUBJECT_METHODS,
+            hint="Other methods of rdm() need folds or a precision.",
+        )
+    check_comparison(comparison)
+    if splits < 1 or n_stimuli < 2:
+        raise UsageError(f"Split halves need splits ≥ 1 and 2 or more stimuli; received {splits} and {n_stimuli}.")
+    names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
+    if len(names) != n_stimuli:
+        raise UsageError(f"There are {n_stimuli} stimuli but {len(names)} names.")
+    sessions, problem, notes = _usable(blocks, n_stimuli, names)
+    pairs = n_stimuli * (n_stimuli - 1) // 2
+    units = sum(session.responses.shape[1] for session in sessions)
+    trials = sum(len(session.codes) for session in sessions)
+    if problem is not None:
+        empty = np.full(pairs, np.nan)
+        return SplitHalf(empty, np.empty(0), np.empty((0, 2, pairs)), math.nan, None, units, trials, problem, notes)
+    if method == "poisson" and any((session.responses < 0).any() for session in sessions):
+        raise DataError("method='poisson' needs rates or counts, which are never negative; some responses are.")
+    means = [stimulus_means(session.responses, session.codes, n_stimuli) for session in sessions]
+    full = _distances(np.concatenate(means, axis=1), method)
+    # Distances do not feel a common shift, the half means lose digits to it.
+    shift = 0.0 if method == "poisson" else float(np.nanmean(np.concatenate([mean.ravel() for mean in means])))
+    sessions = [_Session(s.responses - shift, s.codes, s.hashes) for s in sessions]
+    kept = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
+    halves = np.empty((kept, 2, pairs))
+    r = np.empty(splits)
+    step = max(1, _CHUNK_BYTES // (8 * n_stimuli * units))
+    for start in range(0, splits, step):
+        index = np.arange(start, min(start + step, splits))
+        first, second = (_distances(half, method) for half in _half_means(sessions, n_stimuli, index, seed))
+        r[index] = compare(first, second, method=comparison)
+        stored = index[index < kept]
+        halves[stored, 0], halves[stored, 1] = first[: len(stored)], second[: len(stored)]
+    finite = r[np.isfinite(r)]
+    if not np.isfinite(full).all() or not finite.size:
+        problem = "its RDM is undefined: " + (
+            "the mean responses to a stimulus are constant across units"
+            if np.isnan(full).any()
+            else "all pairs are equal"
+        )
+        return SplitHalf(full, r, halves, math.nan, None, units, trials, problem, notes)
+    low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
+    spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
+    value = float(spearman_brown(finite.mean()))
+    return SplitHalf(full, r, halves, value, spread, units, trials, None, notes)
+
+
+def _usable(
+    blocks: Sequence[TrialBlock], count: int, names: list[str]
+) -> tuple[list[_Session], str | None, tuple[str, ...]]:
+    """Check the sessions, leave out what cannot be split and say what."""
+    sessions: list[_Session] = []
+    lacking: list[str] = []
+    total = np.zeros(count, dtype=np.int64)
+    dropped = 0
+    for block in blocks:
+        responses = response_matrix(block.responses, "trials").astype(np.float64)
+        codes, _ = stimulus_codes(block.labels, count)
+        if len(codes) != len(responses):
+            raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+        if np.isinf(responses).any():
+            raise DataError("Some responses are infinite; a missing response is NaN, everything else is finite.")
+        recorded = np.isfinite(responses).any(axis=1)
+        hashes = _hashes(block, responses, codes)[recorded]
+        responses, codes = responses[recorded], codes[recorded]
+        trials = np.bincount(codes, minlength=count)
+        total += trials
+        if trials.min() < 2:
+            few = [f"{names[k]} ({trials[k]})" for k in np.flatnonzero(trials < 2)]
+            lacking.append(f"fewer than 2 trials of {', '.join(few[:4])}" + (" and others" if len(few) > 4 else ""))
+            continue
+        member = np.zeros((count, len(codes)))
+        member[codes, np.arange(len(codes))] = 1.0
+        splittable = (member @ np.isfinite(responses) >= 2).all(axis=0)
+        dropped += int((~splittable).sum())
+        if splittable.any():
+            sessions.append(_Session(responses[:, splittable], codes, hashes))
+        else:
+            lacking.append("no unit recorded in 2 trials of every stimulus")
+    notes = [f"{len(lacking)} of {len(blocks)} sessions left out: {'; '.join(sorted(set(lacking)))}"] if lacking else []
+    if dropped:
+        notes.append(f"{dropped} units or bins left out: recorded in fewer than 2 trials of some stimulus")
+    problem = None
+    if (total == 0).any():
+        problem = f"no trials of {listing(np.asarray(names)[total == 0])}"
+    elif not sessions:
+        problem = f"no session can be split into halves: {'; '.join(sorted(set(lacking)))}"
+    return sessions, problem, tuple(notes)
+
+
+def _hashes(block: TrialBlock, responses: Floats, codes: Ints) -> Hashes:
+    if block.keys is None:
+        return content_hashes(responses, codes)
+    if len(block.keys) != len(codes):
+        raise UsageError(f"There are {len(codes)} trials but {len(block.keys)} keys; give one key per trial or none.")
+    if len(set(map(str, block.keys))) < len(codes):
+        raise UsageError("Trial keys repeat within a session; each trial needs its own key.")
+    return key_hashes(block.keys)
+
+
+def _half_means(sessions: list[_Session], count: int, index: Ints, seed: int) -> tuple[Floats, Floats]:
+    """Return the mean patterns [S, K, U] of both halves for the splits ``index``."""
+    units = sum(session.responses.shape[1] for session in sessions)
+    first, second = np.empty((len(index), count, units)), np.empty((len(index), count, units))
+    offset = 0
+    for session in sessions:
+        columns = slice(offset, offset + session.responses.shape[1])
+        offset = columns.stop
+        present = np.isfinite(session.responses)
+        filled = np.where(present, session.responses, 0.0)
+        for stimulus in range(count):
+            rows = np.flatnonzero(session.codes == stimulus)
+            member = _members(draws(session.hashes[rows], index, seed))
+            for target, weight in ((first, member), (second, 1.0 - member)):
+                number: NDArray = weight.sum(axis=1, keepdims=True)
+                if not present[rows].all():
+                    number = weight @ present[rows].astype(np.float64)
+                    number[number == 0] = np.nan
+                target[:, stimulus, columns] = weight @ filled[rows] / number
+    return first, second
+
+
+def _members(random: Hashes) -> Floats:
+    """Return 1 for the trials [S, n] of the first half: the lower half of the random numbers."""
+    count = random.shape[1]
+    order = np.argsort(random, axis=1, kind="stable")
+    # The lowest number's parity is the coin that gives the odd trial to either half.
+    coin = np.take_along_axis(random, order[:, :1], axis=1) & np.uint64(1)
+    size = count // 2 + (count % 2) * coin.astype(np.int64)
+    member = np.zeros(random.shape)
+    np.put_along_axis(member, order, (np.arange(count) < size).astype(np.float64), axis=1)
+    return member
+
+
+def _distances(patterns: Floats, method: str) -> Floats:
+    if method == "correlation":
+        return correlation_distances(patterns, missing=True)
+    if method == "sqeuclidean":
+        return product_distances(patterns, patterns, missing=True)
+    rates = (patterns + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
+    return product_distances(rates, np.log(rates), missing=True)
+
+
+_SUBJECT_METHODS = ("correlation", "sqeuclidean", "poisson")

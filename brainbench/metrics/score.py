@@ -1,0 +1,275 @@
+"""From RDMs of a model's layers and of animals to a :class:`brainbench.types.Score`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.errors import UsageError
+from brainbench.metrics._animals import (
+    Animals,
+    ceiling_of,
+    gather,
+    interval_reasons,
+    mean_rdm,
+    mean_reliability,
+    t_interval,
+)
+from brainbench.metrics._pairs import Floats, rdm_stack
+from brainbench.metrics.compare import check_comparison, compare_all
+from brainbench.metrics.inference import SMALLEST_STIMULI, PermutationTest, permuted_statistic, smallest_p
+from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
+from brainbench.metrics.noise import RELIABILITY_GATE
+from brainbench.metrics.subject import SubjectRDM, is_flat
+from brainbench.types import LayerScore, Score, Status, SubjectScore
+
+_HALVES_IN_PERMUTATIONS = 100
+"""Splits of a single animal that every permutation repeats; more only cost time."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Which layer each scored animal was compared with, and what came out."""
+
+    r: Floats
+    """[A] raw comparisons."""
+    values: Floats
+    """[A] corrected."""
+    layers: tuple[int, ...]
+    """[A] indices among the defined layers; one animal's halves may have chosen several: the commonest."""
+    overall: int
+    rule: str
+    test: PermutationTest
+
+
+def score_rdms(
+    layer_rdms: Mapping[str, ArrayLike],
+    subjects: Sequence[SubjectRDM],
+    *,
+    name: str,
+    stimuli: Sequence[str],
+    estimator: str = "default",
+    compare: str = "pearson",
+    seed: int = 0,
+) -> Score:
+    """Score a model by the RDMs of its layers against animals.
+
+    ``default``: each reliable animal is compared with the layer that compares best with the *other*
+    reliable animals, the comparison is corrected for the animal's noise, and the score is the mean over
+    animals. The permutation p-value repeats the choice of layer in every permutation. A single animal
+    chooses on one half of its trials and is scored on the other. ``thesis`` and ``thesis-input`` are
+    the published estimators with their maximum over layers, which is optimistic and says so.
+
+    Args:
+        layer_rdms: RDM [P] of each layer, in network order.
+        subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
+        name: Name of the model.
+        stimuli: Names of the K stimuli, in the order of the RDMs.
+        estimator: See :func:`noise_corrected`.
+        compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
+        seed: Seed of random permutations (more than 8 stimuli).
+
+    Raises:
+        UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
+    """
+    check_comparison(compare)
+    names, rdms = _layers(layer_rdms, stimuli)
+    animals = gather(subjects, estimator=estimator, comparison=compare, pairs=rdms.shape[1])
+    defined = [index for index, rdm in enumerate(rdms) if not is_flat(rdm)]
+    choice = None
+    if animals.scored and defined and len(stimuli) > 2:
+        choice = _choose(rdms[defined], animals, estimator, compare, seed)
+    status, reasons = _verdict(animals, names, defined, len(stimuli), estimator, choice)
+    reliability, reliability_interval = mean_reliability(animals)
+    layers = _layer_scores(names, rdms, defined, animals, compare)
+    finite = [index for index in defined if math.isfinite(layers[index].value)]
+    best = finite[first_best(np.array([layers[index].value for index in finite]))] if finite else None
+    chosen = None if choice is None else defined[choice.overall]
+    return Score(
+        name=name,
+        value=math.nan if choice is None else float(choice.values.mean()),
+        status=status,
+        reasons=reasons,
+        r=math.nan if choice is None else float(choice.r.mean()),
+        reliability=reliability,
+        reliability_interval=reliability_interval,
+        interval=None if choice is None else t_interval(choice.values),
+        p=math.nan if choice is None else choice.test.p,
+        p_method="" if choice is None else f"{choice.test.method}; {_repeated(estimator, len(defined))}",
+        p_smallest=smallest_p(len(stimuli)),
+        ceiling=ceiling_of(animals, compare),
+        layer=None if chosen is None else names[chosen],
+        layer_rule="" if choice is None else choice.rule,
+        best_layer=None if best is None else names[best],
+        best_layer_value=math.nan if best is None else layers[best].value,
+        layers=layers,
+        subjects=_subject_scores(names, rdms, defined, animals, choice, compare),
+        estimator=estimator,
+        metric=metric_name(animals, compare),
+        stimuli=tuple(map(str, stimuli)),
+        model_rdm=() if chosen is None else tuple(rdms[chosen].tolist()),
+        brain_rdm=mean_rdm(animals),
+        provenance={
+            "seed": seed,
+            "splits": max(len(subject.split_half_r) for subject in animals.subjects),
+            "reliability_gate": RELIABILITY_GATE,
+        },
+    )
+
+
+def metric_name(animals: Animals, comparison: str) -> str:
+    """Name the metric in words."""
+    methods = sorted({subject.method for subject in animals.subjects})
+    return f"RSA: {'/'.join(methods)} RDM, {comparison} comparison"
+
+
+def _layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> tuple[tuple[str, ...], Floats]:
+    if not layer_rdms:
+        raise UsageError("There are no layers to score; give the RDM of at least one layer.")
+    if len(set(map(str, stimuli))) < len(stimuli):
+        raise UsageError(f"Stimulus names repeat: {list(stimuli)}.")
+    rdms = [rdm_stack(rdm, f"The RDM of layer {layer!r}") for layer, rdm in layer_rdms.items()]
+    pairs = len(stimuli) * (len(stimuli) - 1) // 2
+    for layer, rdm in zip(layer_rdms, rdms, strict=True):
+        if rdm.shape != (pairs,):
+            raise UsageError(
+                f"The RDM of layer {layer!r} has shape {rdm.shape}; {len(stimuli)} stimuli have {pairs} pairs."
+            )
+    return tuple(map(str, layer_rdms)), np.stack(rdms)
+
+
+def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, seed: int) -> _Choice:
+    """Choose layers by the estimator's rule, with a test that repeats the choice."""
+    brain, factors = animals.rdms(animals.scored), animals.factors(animals.scored)
+    r = compare_all(rdms, brain, method=comparison)
+    count = len(animals.scored)
+    every = np.arange(count)
+    if len(rdms) == 1:
+        test = permuted_statistic(rdms, brain, lambda x: x[:, 0] @ factors / count, method=comparison, seed=seed)
+        return _Choice(r[0], r[0] * factors, (0,) * count, 0, "only layer", test)
+    if estimator != "default":
+        best = first_best((r * factors).mean(axis=1))
+        test = permuted_statistic(
+            rdms, brain, lambda x: (x * factors).mean(axis=-1).max(axis=-1), method=comparison, seed=seed
+        )
+        rule = "maximum over layers on the data that are scored (as published; optimistic)"
+        return _Choice(r[best], r[best] * factors, (best,) * count, best, rule, test)
+    if count == 1:
+        return _choose_on_halves(rdms, animals.subjects[animals.scored[0]], comparison, seed)
+    chosen = choose_on_others(r)
+    test = permuted_statistic(rdms, brain, lambda x: held_out(x) @ factors / count, method=comparison, seed=seed)
+    rule = "chosen on the other animals, evaluated on the animal held out"
+    picked = r[chosen, every]
+    return _Choice(picked, picked * factors, tuple(chosen.tolist()), most_chosen(chosen), rule, test)
+
+
+def _choose_on_halves(rdms: Floats, subject: SubjectRDM, comparison: str, seed: int) -> _Choice:
+    splits = len(subject.halves)
+    r = compare_all(rdms, subject.halves.reshape(2 * splits, -1), method=comparison).reshape(len(rdms), splits, 2)
+    chosen, held = choose_on_halves(r[..., 0], r[..., 1])
+    # What is evaluated is the RDM of one half, whose reliability is the raw split-half correlation.
+    factor = 1 / math.sqrt(float(np.mean(subject.split_half_by(comparison))))
+    some = subject.halves[:_HALVES_IN_PERMUTATIONS]
+
+    def statistic(x: Floats) -> Floats:
+        pair = x.reshape(*x.shape[:-1], len(some), 2)
+        return choose_on_halves(pair[..., 0], pair[..., 1])[1].mean(axis=-1)
+
+    test = permuted_statistic(rdms, some.reshape(2 * len(some), -1), statistic, method=comparison, seed=seed)
+    rule = "chosen on one half of the only reliable animal's trials, evaluated on the other half"
+    mean, layer = float(held.mean()), most_chosen(chosen)
+    return _Choice(np.array([mean]), np.array([mean * factor]), (layer,), layer, rule, test)
+
+
+def _verdict(
+    animals: Animals,
+    names: tuple[str, ...],
+    defined: list[int],
+    stimuli: int,
+    estimator: str,
+    choice: _Choice | None,
+) -> tuple[Status, tuple[str, ...]]:
+    """Return the status of the score and its reasons, the gravest first."""
+    if choice is None:
+        if stimuli < 3:
+            reason = f"{stimuli} stimuli have one pair, and RDMs of one pair cannot be compared; at least 3 are needed"
+        elif not defined:
+            reason = "activations of every layer are constant or NaN"
+        else:
+            reason = "no animal has a usable RDM"
+        return "undefined", (reason, *animals.reasons)
+    reasons = list(choice.test.reason and [choice.test.reason])
+    if not animals.reliable:
+        reasons.append(
+            "no animal's RDM is reliable" if estimator == "default" else "the published estimator has no gate"
+        )
+    reasons += animals.reasons
+    if estimator != "default" and len(defined) > 1:
+        reasons.append("optimistic: the layer was chosen as the maximum on the data that are scored (as published)")
+    broken = [names[index] for index in range(len(names)) if index not in defined]
+    if broken:
+        reasons.append(f"layers without a usable RDM (constant or NaN activations), never chosen: {', '.join(broken)}")
+    reasons += interval_reasons(len(animals.scored))
+    unreliable = not animals.reliable or stimuli < SMALLEST_STIMULI
+    return "unreliable" if unreliable else "ok", tuple(reasons)
+
+
+def _layer_scores(
+    names: tuple[str, ...], rdms: Floats, defined: list[int], animals: Animals, comparison: str
+) -> tuple[LayerScore, ...]:
+    nothing = LayerScore("", math.nan, math.nan, "undefined")
+    scores = dict.fromkeys(range(len(names)), nothing)
+    if animals.scored and defined and rdms.shape[1] > 1:
+        r = compare_all(rdms[defined], animals.rdms(animals.scored), method=comparison)
+        values = (r * animals.factors(animals.scored)).mean(axis=1)
+        status: Status = "ok" if animals.reliable else "unreliable"
+        for row, index in enumerate(defined):
+            scores[index] = LayerScore("", float(values[row]), float(r[row].mean()), status)
+    return tuple(LayerScore(names[i], scores[i].value, scores[i].r, scores[i].status) for i in range(len(names)))
+
+
+def _subject_scores(
+    names: tuple[str, ...],
+    rdms: Floats,
+    defined: list[int],
+    animals: Animals,
+    choice: _Choice | None,
+    comparison: str,
+) -> tuple[SubjectScore, ...]:
+    scores = []
+    for index, subject in enumerate(animals.subjects):
+        value = r = math.nan
+        layer = None
+        status: Status = "undefined"
+        if choice is not None and index in animals.scored:
+            row = animals.scored.index(index)
+            value, r, layer = float(choice.values[row]), float(choice.r[row]), choice.layers[row]
+            status = animals.status(index)
+        elif choice is not None and index in animals.usable:
+            # An animal that did not vote is held out from the choice of all who did.
+            layer, status = choice.overall, animals.status(index)
+            r = float(compare_all(rdms[[defined[layer]]], subject.rdm[None], method=comparison)[0, 0])
+            value = r * animals.corrections[index].value
+        scores.append(
+            SubjectScore(
+                subject=subject.subject,
+                value=value,
+                r=r,
+                reliability=animals.corrections[index].reliability,
+                status=status,
+                units=subject.units,
+                trials=subject.trials,
+                layer=None if layer is None else names[defined[layer]],
+            )
+        )
+    return tuple(scores)
+
+
+def _repeated(estimator: str, layers: int) -> str:
+    if layers == 1:
+        return "one layer"
+    return "layer chosen anew in each" if estimator == "default" else "maximum over layers taken anew in each"

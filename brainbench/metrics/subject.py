@@ -1,0 +1,101 @@
+"""One animal's RDM with what is needed to correct scores for its noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from brainbench.metrics._pairs import Floats
+from brainbench.metrics.compare import compare
+from brainbench.metrics.reliability import SPLITS, TrialBlock, split_half
+from brainbench.types import Interval
+
+
+@dataclass(frozen=True)
+class SubjectRDM:
+    """An animal's RDM, ready to be compared with any number of models."""
+
+    subject: str
+    rdm: Floats = field(repr=False)
+    """[P] RDM of all trials; NaN pairs when ``problem`` says why."""
+    split_half_r: Floats = field(repr=False)
+    """[S] raw comparisons (by ``comparison``) of the RDMs of random split halves."""
+    halves: Floats = field(repr=False)
+    """[S′, 2, P] RDMs of the halves."""
+    units: int = 0
+    trials: int = 0
+    method: str = "correlation"
+    comparison: str = "pearson"
+    reliability: float = math.nan
+    """Spearman-Brown reliability of the mean of ``split_half_r``."""
+    spread: Interval | None = None
+    """Percentiles over random splits; not a confidence interval."""
+    seed: int = 0
+    problem: str | None = None
+    """Why the animal has no usable RDM, in words."""
+    notes: tuple[str, ...] = ()
+    """Sessions and units that were left out, in words."""
+
+    def split_half_by(self, comparison: str) -> Floats:
+        """Return the split-half comparisons [S] by any comparison (from the stored halves if need be)."""
+        if comparison == self.comparison or self.problem is not None:
+            return self.split_half_r
+        return compare(self.halves[:, 0], self.halves[:, 1], method=comparison)
+
+
+def subject_rdm(
+    subject: str,
+    blocks: Sequence[TrialBlock],
+    n_stimuli: int,
+    *,
+    stimuli: Sequence[str] | None = None,
+    method: str = "correlation",
+    comparison: str = "pearson",
+    splits: int = SPLITS,
+    seed: int = 0,
+) -> SubjectRDM:
+    """Build an animal's RDM and its split halves from the trials of its sessions.
+
+    An animal whose data cannot be used comes back with ``problem`` (for example ``no trials of
+    'convex-far'``) instead of an error, so the others can still be scored.
+
+    Args:
+        subject: Name of the animal.
+        blocks: Its sessions; see :class:`TrialBlock` and the rules of :mod:`brainbench.metrics.reliability`.
+        n_stimuli: K.
+        stimuli: Names of the stimuli, for messages.
+        method: RDM method: ``correlation``, ``sqeuclidean`` or ``poisson``.
+        comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
+        splits: Number of random split halves.
+        seed: Seed of the splits.
+
+    Raises:
+        UsageError: unknown method, bad shapes or labels, repeated trial keys.
+        DataError: infinite responses, or negative ones for ``poisson``.
+    """
+    found = split_half(
+        blocks, n_stimuli, stimuli=stimuli, method=method, comparison=comparison, splits=splits, seed=seed
+    )
+    return SubjectRDM(
+        subject=subject,
+        rdm=found.rdm,
+        split_half_r=found.r,
+        halves=found.halves,
+        units=found.units,
+        trials=found.trials,
+        method=method,
+        comparison=comparison,
+        reliability=found.reliability,
+        spread=found.spread,
+        seed=seed,
+        problem=found.problem,
+        notes=found.notes,
+    )
+
+
+def is_flat(rdm: Floats) -> bool:
+    """Whether an RDM has missing pairs or no difference between pairs, so nothing can be compared with it."""
+    return bool(np.isnan(compare(rdm, rdm, method="pearson")) or not np.isfinite(rdm).all())
