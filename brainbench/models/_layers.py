@@ -62,7 +62,9 @@ def same_padding(kernel_size: tuple[int, int]) -> tuple[int, int, int, int]:
 
 
 @torch.no_grad()
-def initialise(layer: nn.Conv2d | nn.Linear, *, gain: float, bias: float | None, method: Mapping[str, Any] | None) -> None:
+def initialise(
+    layer: nn.Conv2d | nn.Linear, *, gain: float, bias: float | None, method: Mapping[str, Any] | None
+) -> None:
     """Draw a layer's weight and set its bias (None: uniform within 1/√fan_in, as PyTorch does)."""
     fan_in = layer.weight[0].numel()
     if method is None:
@@ -99,7 +101,7 @@ class Conv2d(nn.Conv2d):
         gain: float = RECTIFIER_GAIN,
         method: Mapping[str, Any] | None = None,
     ) -> None:
-        self._initial = {"gain": gain, "bias": bias, "method": method}
+        self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
         self._extra: tuple[int, int, int, int] | None = None
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":
@@ -113,7 +115,7 @@ class Conv2d(nn.Conv2d):
         """Draw new weights from the global random state."""
         initialise(self, **self._initial)
 
-    def forward(self, input: torch.Tensor) -> torch.Tensor:  # noqa: A002 - the name in nn.Conv2d
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Convolve [B, C, H, W]."""
         return super().forward(input if self._extra is None else functional.pad(input, self._extra))
 
@@ -131,7 +133,7 @@ class Linear(nn.Linear):
         gain: float = 1.0,
         method: Mapping[str, Any] | None = None,
     ) -> None:
-        self._initial = {"gain": gain, "bias": bias, "method": method}
+        self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
         super().__init__(in_features, out_features, bias=use_bias)
 
     def reset_parameters(self) -> None:

@@ -217,6 +217,8 @@ def _after(part: _Section) -> tuple[str | None, Pool | None]:
     elif kind == "AdaptiveAvgPool":
         pool = Pool("average", part.size("output_size", 6), flatten=bool(part.take("flatten", False)))
     elif kind != "Identity":
-        raise unknown_name(f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity"))
+        raise unknown_name(
+            f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity")
+        )
     part.done(*_OVERWRITTEN)
     return activation, pool

@@ -12,7 +12,7 @@ Schmidhuber 1997, Gers et al. 2000. Order and names of the gates follow PyTorchT
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -28,7 +28,7 @@ FORGET_BIAS = 1.0
 class ChannelNorm(nn.LayerNorm):
     """LayerNorm over the channels of [B, C, H, W], separately at every place."""
 
-    def forward(self, input: torch.Tensor) -> torch.Tensor:  # noqa: A002 - the name in nn.LayerNorm
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Normalise [B, C, H, W] over C."""
         return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
@@ -265,7 +265,7 @@ class LSTM(_GatedCell):
         return hidden, torch.cat((memory, hidden), 1)
 
 
-CELLS: Mapping[str, type[Cell]] = {
+CELLS: Mapping[str, Callable[..., Cell]] = {
     "time-decay": TimeDecay,
     "ugrnn": UGRNN,
     "intersection": IntersectionRNN,

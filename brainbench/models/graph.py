@@ -14,18 +14,17 @@ import math
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
-from torch.nn import functional
 
 from brainbench.errors import UsageError, unknown_name
-from brainbench.models._layers import RECTIFIER_GAIN, Conv2d, Linear, activation
+from brainbench.models._layers import Conv2d, Linear
+from brainbench.models._node import NodeModule
 from brainbench.models._tnn_config import read_graph
 from brainbench.models._tnn_state import check_named, copy_named
-from brainbench.models.cells import CELLS, Cell, TimeDecay
-from brainbench.models.graph_spec import Convolution, GraphSpec, Node, Pool, Shape, Unroll, check_unroll
+from brainbench.models.graph_spec import GraphSpec, Shape, Unroll, check_unroll
 
 _log = logging.getLogger(__name__)
 
@@ -38,36 +37,6 @@ class GraphState:
     """Last output of every node [B, ...]."""
     memories: Mapping[str, torch.Tensor]
     """State of every cell [B, ...]."""
-
-
-class _NodeModule(nn.Module):
-    """Operation, memory, activation and pool of one node."""
-
-    def __init__(self, node: Node, shape: Shape) -> None:
-        super().__init__()
-        self.node = node
-        self.grid = shape[1:]
-        self.operation, channels = _operation(node, shape)
-        self.memory: Cell | None = None
-        if node.memory is not None:
-            cell, size = CELLS[node.memory.kind], node.memory.kernel_size
-            options = {"tau": node.memory.tau} if cell is TimeDecay else {"layer_norm": node.memory.layer_norm}
-            self.memory = cell(channels, channels, kernel_size=size, **options)
-        self.dropout = nn.Dropout(node.operation.dropout if node.operation is not None else 0.0)
-        self.before = activation(node.operation.activation if node.operation is not None else None)
-        self.after = nn.Sequential(activation(node.activation), *_pool(node.pool))
-
-    def gather(self, inputs: list[torch.Tensor]) -> torch.Tensor:
-        """Resize inputs [B, C, H, W] to the node's grid and concatenate them on channels."""
-        fitted = [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
-        return fitted[0] if len(fitted) == 1 else torch.cat(fitted, 1)
-
-    def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
-        """Return what the memory sees [B, ...]."""
-        x = self.dropout(self.gather(inputs))
-        if isinstance(self.operation, Linear):
-            x = x.flatten(1)
-        return self.before(self.operation(x))
 
 
 class TemporalGraph(nn.Module):
@@ -84,9 +53,9 @@ class TemporalGraph(nn.Module):
         self._fixed_shape = True
         self._open_grid = False
         self.spec = spec
-        self.layers = spec.order
+        self.layers: tuple[str, ...] = spec.order
         inputs, self._shapes = spec.shapes()
-        self.nodes = nn.ModuleDict({name: _NodeModule(spec.by_name[name], inputs[name]) for name in spec.order})
+        self.nodes = nn.ModuleDict({name: NodeModule(spec.by_name[name], inputs[name]) for name in spec.order})
         self._groups = spec.groups()
         self._predecessors = {name: spec.predecessors(name) for name in spec.order}
 
@@ -162,7 +131,7 @@ class TemporalGraph(nn.Module):
     def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
         for name, node in self._items():
             shape = resized.get(f"{_tnn_owner(name, node)}.weight")
-            if shape is not None:
+            if shape is not None and isinstance(node.operation, (Conv2d, Linear)):
                 node.operation.weight = nn.Parameter(node.operation.weight.new_empty(shape))
                 setattr(node.operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
         # The grid shows in the weights only as a product, so it stays open until a stimulus arrives.
@@ -212,10 +181,9 @@ class TemporalGraph(nn.Module):
         shape = (1, *self.node(name).grid)
         return (node.operation.output_shape(shape) if node.operation is not None else shape)[1:]
 
-    def node(self, name: str) -> _NodeModule:
+    def node(self, name: str) -> NodeModule:
         """Return the module of a node."""
-        module = self.nodes[name]
-        return module  # type: ignore[return-value]  # ModuleDict is not generic
+        return cast(NodeModule, self.nodes[name])
 
     def step(
         self, x: torch.Tensor, state: GraphState, *, unroll: Unroll = "biological"
@@ -280,13 +248,19 @@ class TemporalGraph(nn.Module):
         for position, group in enumerate(self._groups):
             later = {name for other in self._groups[position + 1 :] for name in other}
             needed = {e.source for name in later for e in self._predecessors[name]} | wanted | {self.spec.output}
-            cyclic = len(group) > 1 or any(edge.source == group[0] for edge in self._predecessors[group[0]])
+            cyclic = any(edge.source in group for name in group for edge in self._predecessors[name])
             compute = self._compute_loop if cyclic else self._compute_sweep
             kept.update(compute(group, x, kept, unroll, needed))
             for name in [name for name in kept if name not in needed]:
                 del kept[name]
         output = kept[self.spec.output]
-        return (output, {name: kept[name] for name in self.layers if name in wanted}) if return_activations else output
+        if return_activations is False:
+            return output
+        return output, {name: kept[name] for name in self.layers if name in wanted}
+
+    def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
+        """Return ``{node: [B, T, ...]}`` of the biological unrolling for the nodes asked for (all by default)."""
+        return self(x, return_activations=True if layers is None else tuple(layers))[1]
 
     def _wanted(self, return_activations: bool | Collection[str]) -> set[str]:
         if isinstance(return_activations, bool):
@@ -353,42 +327,9 @@ class TemporalGraph(nn.Module):
                 outputs.append(current[name])
         return {name: torch.stack(outputs, 1) for name, outputs in history.items()}
 
-    def _items(self) -> list[tuple[str, _NodeModule]]:
+    def _items(self) -> list[tuple[str, NodeModule]]:
         return [(name, self.node(name)) for name in self.layers]
 
 
-def _tnn_owner(name: str, node: _NodeModule) -> str:
+def _tnn_owner(name: str, node: NodeModule) -> str:
     return f"{name}._pre_memory.{'lin' if isinstance(node.operation, Linear) else 'conv'}"
-
-
-def _operation(node: Node, shape: Shape) -> tuple[nn.Module, int]:
-    """Build a node's operation for its concatenated input shape; return it with its output channels."""
-    what = node.operation
-    if what is None:
-        return nn.Identity(), shape[0]
-    options = {"use_bias": what.use_bias, "bias": what.bias, "method": what.initialiser}
-    if isinstance(what, Convolution):
-        layer = Conv2d(
-            shape[0],
-            what.channels,
-            kernel_size=what.kernel_size,
-            stride=what.stride,
-            padding=what.padding,
-            **options,
-        )
-        return layer, what.channels
-    return Linear(math.prod(shape), what.features, gain=RECTIFIER_GAIN, **options), what.features
-
-
-def _pool(pool: Pool | None) -> list[nn.Module]:
-    if pool is None:
-        return []
-    if pool.kind == "max":
-        layer: nn.Module = nn.MaxPool2d(pool.size, pool.stride, pool.padding, ceil_mode=pool.ceil_mode)
-    else:
-        layer = nn.AdaptiveAvgPool2d(pool.size)
-    return [layer, nn.Flatten()] if pool.flatten else [layer]
-
-
-def _resize(x: torch.Tensor, grid: Shape) -> torch.Tensor:
-    return functional.interpolate(x, size=grid, mode="bilinear", align_corners=False, antialias=True)

@@ -198,7 +198,9 @@ class GraphSpec:
         return reached
 
     def _sorted(self) -> tuple[str, ...]:
-        waiting = {node.name: {e.source for e in self.edges if e.target == node.name and not e.feedback} for node in self.nodes}
+        waiting = {
+            node.name: {e.source for e in self.edges if e.target == node.name and not e.feedback} for node in self.nodes
+        }
         order: list[str] = []
         while waiting:
             ready = next((name for name, sources in waiting.items() if not sources - set(order)), None)
@@ -237,8 +239,10 @@ class GraphSpec:
             channels = self._channels(name, stimulus, outputs) if node.operation is None else 1
             outputs[name] = node.output_shape((channels, *grids[name]))
             if min(outputs[name]) < 1:
-                raise UsageError(f"Node {name!r} has nothing left of a grid of {list(grids[name])}: its output would be "
-                                 f"{list(outputs[name])}; the stimulus {list(stimulus)} is too small.")
+                raise UsageError(
+                    f"Node {name!r} has nothing left of a grid of {list(grids[name])}: its output would be "
+                    f"{list(outputs[name])}; the stimulus {list(stimulus)} is too small."
+                )
         inputs: dict[str, Shape] = {}
         for name in self.order:
             self._check_grids(name, grids[name], stimulus, outputs)
@@ -250,11 +254,15 @@ class GraphSpec:
         if source is None:
             if name in self.inputs:
                 return stimulus[1:]
-            source = max((e.source for e in self.predecessors(name) if not e.feedback), key=self.order.index, default=None)
+            source = max(
+                (e.source for e in self.predecessors(name) if not e.feedback), key=self.order.index, default=None
+            )
             if source is None:
                 raise UsageError(f"Node {name!r} has only feedback inputs; say with shape_from whose grid it takes.")
         if source not in outputs:
-            raise UsageError(f"Node {name!r} takes its shape from {source!r}, which comes later in the feedforward order.")
+            raise UsageError(
+                f"Node {name!r} takes its shape from {source!r}, which comes later in the feedforward order."
+            )
         return outputs[source][1:]
 
     def _channels(self, name: str, stimulus: Shape, outputs: Mapping[str, Shape]) -> int:
@@ -262,7 +270,9 @@ class GraphSpec:
         try:
             return seen + sum(outputs[edge.source][0] for edge in self.predecessors(name))
         except KeyError as error:
-            raise UsageError(f"Node {name!r} has no operation and receives feedback from {error}; give it one.") from None
+            raise UsageError(
+                f"Node {name!r} has no operation and receives feedback from {error}; give it one."
+            ) from None
 
     def _check_grids(self, name: str, grid: Shape, stimulus: Shape, outputs: Mapping[str, Shape]) -> None:
         node = self.by_name[name]

@@ -56,8 +56,8 @@ class ModelDescription:
     licence: str
     parameters: int
     multiply_adds: int | None
-    """Multiply-adds of a time step, counted on the first one (attention to earlier steps adds to it: 0.2 % in
-    the 22nd step of ``+gpt``); None for a model that does not state its input shape."""
+    """Multiply-adds of a time step, counted on the first one (attention to earlier steps adds under 0.2 % to
+    the 22nd of ``+gpt``); None for a model that does not state its input shape."""
     layers: tuple[str, ...]
     """Layers that can be extracted by name."""
 
@@ -87,7 +87,7 @@ def register_model(
         >>> @register_model("tiny-linear", family="linear")
         ... def tiny_linear():
         ...     from torch import nn
-        ...     return nn.Sequential(nn.Flatten(), nn.LazyLinear(10))
+        ...     return nn.Sequential(nn.Flatten(2), nn.Linear(1050, 10))
         >>> "tiny-linear" in list_models("tiny*")
         True
     """

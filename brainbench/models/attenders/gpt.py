@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import nn
@@ -167,5 +168,4 @@ class GPTAttender(nn.Module):
         return self.dropout(self.embed(pairs.flatten(1, 2)) + self.positions[start : start + 2 * steps])
 
     def _block(self, index: int) -> GPTBlock:
-        block = self.blocks[index]
-        return block  # type: ignore[return-value]  # ModuleList is not generic
+        return cast(GPTBlock, self.blocks[index])

@@ -8,6 +8,7 @@ memory, as published; with a gated cell the convolutions carry it and the dense 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 from brainbench.models.graph_spec import Convolution, Dense, Edge, GraphSpec, Memory, Node
 
@@ -53,7 +54,7 @@ class ZhuangEncoder:
         ]
         dense = memory if self.cell == "time-decay" else None
         nodes += [Node("fc7", Dense(self._width(1024)), dense), Node("fc8", Dense(self.features), dense)]
-        forward = [*zip(names, names[1:], strict=False), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
+        forward = [*pairwise(names), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
         edges = [Edge(*ends) for ends in (*forward, ("fc7", "fc8"))]
         edges += [Edge(f"conv{source}", f"conv{target}", feedback=True) for source, target in _FEEDBACK]
         return GraphSpec(tuple(nodes), tuple(edges), ("conv1",), "fc8", self.input_shape)
