@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError, listing
-from brainbench.types import ModelCard
+from brainbench.types import CHANNELS, ModelCard
 
 if TYPE_CHECKING:
     import torch
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]
 
 DEFAULT_STIMULI = "rodgers"
+RDM_METHOD = "correlation"
 RANDOM_FEATURES = 512
 """Width of the random-features baseline."""
 
@@ -42,19 +43,19 @@ class ModelSide:
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Provenance of stimuli and weights."""
 
-    def rdms(self, rows: list[int], method: str) -> dict[str, NDArray[np.float64]]:
+    def rdms(self, rows: list[int]) -> dict[str, NDArray[np.float64]]:
         """Every layer's RDM [P] over the stimuli ``rows``."""
-        return {layer: _rdm(values[rows], self.time, method) for layer, values in self.activations.items()}
+        return {layer: _rdm(values[rows], self.time) for layer, values in self.activations.items()}
 
-    def baseline_rdms(self, rows: list[int], method: str, seed: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+    def baseline_rdms(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """RDMs of the raw input and of random features of it; empty without an input."""
         if self.model_input is None:
             return {}
         raw = self.model_input[rows].astype(np.float64)
         weights = np.random.default_rng(seed).standard_normal((raw.shape[-1], RANDOM_FEATURES)) / np.sqrt(raw.shape[-1])
         return {
-            "raw input": {"input": _rdm(raw, self.time, method)},
-            "random features": {"relu(input · random)": _rdm(np.maximum(raw @ weights, 0.0), self.time, method)},
+            "raw input": {"input": _rdm(raw, self.time)},
+            "random features": {"relu(input · random)": _rdm(np.maximum(raw @ weights, 0.0), self.time)},
         }
 
 
@@ -80,7 +81,7 @@ class BrainSide:
         names = ("source", "content_hash", "window", "selection", "removed", "synthetic")
         return {name: self.dataset.attrs[name] for name in names}
 
-    def animals(self, kept: tuple[str, ...], *, time: str, seed: int) -> tuple[SubjectRDM, ...]:
+    def animals(self, kept: tuple[str, ...], *, time: str = "mean", seed: int = 0) -> tuple[SubjectRDM, ...]:
         """Every animal's RDM and its split halves over the labels ``kept``, in that order."""
         from brainbench.datasets import blocks
         from brainbench.metrics import TrialBlock, subject_rdm
@@ -93,8 +94,10 @@ class BrainSide:
             for responses, labels, keys in sessions:
                 rows = index[labels] >= 0
                 features = _without_time(responses[rows], time)
-                trials.append(TrialBlock(features, index[labels][rows], np.asarray(keys)[rows]))
-            animals.append(subject_rdm(subject, trials, len(kept), labels=kept, method="correlation", seed=seed))
+                trials.append(
+                    TrialBlock(features, index[labels][rows], [key for key, row in zip(keys, rows, strict=True) if row])
+                )
+            animals.append(subject_rdm(subject, trials, len(kept), stimuli=kept, method=RDM_METHOD, seed=seed))
         return tuple(animals)
 
 
@@ -157,9 +160,9 @@ def brain_side(recordings: Any, *, progress: Progress | None, **selection: Any) 
 def demo_recordings(*, progress: Progress | None = None) -> Path:
     """Return the folder of the demo recordings, made once per machine from the ``rodgers`` stimuli."""
     from brainbench.datasets.demo import ensure_demo
-    from brainbench.stimuli import load_stimuli
+    from brainbench.stimuli import get_recipe, simulate
 
-    return ensure_demo(load_stimuli(DEFAULT_STIMULI, progress=progress).dataset, progress=progress)
+    return ensure_demo(simulate(get_recipe(DEFAULT_STIMULI).scenes, progress=progress), progress=progress)
 
 
 def join_labels(
@@ -284,9 +287,9 @@ def _resolve(model: Any, seed: int) -> tuple[torch.nn.Module, ModelCard, bool]:
     from brainbench.models import registry
 
     if ":" in model or model.endswith(".py"):
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            module = registry.load_user_model(model)
+        from brainbench.models.user import load_user_model
+
+        module = load_user_model(model, seed=seed)
         return module, ModelCard(model, family="user module", seed=seed), hasattr(module, "spec")
     record = registry.describe_model(model)
     card = ModelCard(
@@ -312,10 +315,12 @@ def _network_input(module: torch.nn.Module, stimuli: Stimuli, own: bool, normali
 
 
 def _scaled(stimuli: Stimuli) -> NDArray[np.float32]:
-    from brainbench.models.ead import physical_scale
+    import torch
 
-    scale = physical_scale(stimuli.input.shape[2])
-    return stimuli.input / scale[:, None, None]
+    from brainbench.models.normaliser import Normaliser
+
+    steps = torch.from_numpy(stimuli.input)
+    return Normaliser.physical(steps.shape[2] // len(CHANNELS))(steps).numpy()
 
 
 def _baseline_input(stimuli: Stimuli) -> NDArray[np.floating]:
@@ -348,9 +353,9 @@ def _without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floatin
     return np.divide(total, seen, out=np.full(total.shape, np.nan), where=seen > 0)
 
 
-def _rdm(values: NDArray[np.floating], time: str, method: str) -> NDArray[np.float64]:
+def _rdm(values: NDArray[np.floating], time: str) -> NDArray[np.float64]:
     from brainbench.metrics import rdm
 
     # NaN activations must stay NaN here: on this side nothing is "not recorded".
     flat = values.reshape(len(values), -1) if time == "concatenate" else values.mean(axis=1, dtype=np.float64)
-    return rdm(flat, method=method)
+    return rdm(flat, method=RDM_METHOD)

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]
 TimeRule = Literal["mean", "concatenate"]
 
-RDM_METHOD = "correlation"
 COMPARISON = "pearson"
 
 
@@ -130,10 +129,10 @@ def score_record(
             rdms, animals, name=name, stimuli=kept, estimator=estimator, compare=COMPARISON, seed=seed
         )
 
-    scores = [against_brain(network.card.name, network.rdms(rows, RDM_METHOD))]
+    scores = [against_brain(network.card.name, network.rdms(rows))]
     between = None
     if baselines:
-        scores += [against_brain(name, rdms) for name, rdms in network.baseline_rdms(rows, RDM_METHOD, seed).items()]
+        scores += [against_brain(name, rdms) for name, rdms in network.baseline_rdms(rows, seed).items()]
         between = metrics.score_animals(animals, stimuli=kept, estimator=estimator)
 
     origin = provenance(

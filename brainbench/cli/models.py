@@ -19,7 +19,7 @@ def list_(
     from brainbench.models.registry import describe_model, list_models
 
     records = [describe_model(name) for name in list_models(pattern)]
-    rows = [[item.name, f"{item.parameters:,}", f"{item.multiply_adds / 1e6:,.0f} M", item.family] for item in records]
+    rows = [[item.name, f"{item.parameters:,}", _millions(item.multiply_adds), item.family] for item in records]
     columns = ["model", "parameters", "multiply-adds/step", "family"]
     emit(records, table("", columns, rows, right=(1, 2)), as_json=as_json)
 
@@ -33,6 +33,10 @@ def show(name: Annotated[str, typer.Argument(help="A registry name.")], as_json:
     record = describe_model(name)
     rows = [[key.replace("_", " "), _text(value)] for key, value in to_plain(record).items()]
     emit(record, table("", ["", ""], rows), as_json=as_json)
+
+
+def _millions(value: int | None) -> str:
+    return "–" if value is None else f"{value / 1e6:,.0f} M"
 
 
 def _text(value: object) -> str:

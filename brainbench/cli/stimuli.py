@@ -46,7 +46,7 @@ def simulate(
     wrench = dataset["wrench"].values
     force = np.linalg.norm(wrench[..., :3], axis=-1).max(axis=(1, 2)) * 1e3
     moment = np.linalg.norm(wrench[..., 3:], axis=-1).max(axis=(1, 2)) * 1e6
-    touched = dataset["contact"].values.any(axis=1)
+    touched = np.asarray(dataset["contact"].values.any(axis=1)).tolist()
     names = [str(name) for name in dataset["whisker"].values]
     data = [
         {
