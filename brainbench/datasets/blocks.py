@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,20 +13,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-@dataclass(frozen=True)
-class SessionBlock:
+class SessionBlock(NamedTuple):
     """Trials and units that were recorded together. Letters: R trials, T time bins, U units."""
 
-    subject: str
-    session: str
     responses: NDArray[np.float64]
     """[R, T, U] firing rate, Hz; NaN where a unit was not recorded in a trial."""
     labels: NDArray[np.int64]
     """[R] index into the data set's vocabulary."""
     keys: tuple[str, ...]
     """[R] a name for each trial, unique in the data set and independent of its order."""
-    units: tuple[str, ...]
-    """[U] unit identifiers."""
 
 
 def blocks(dataset: xr.Dataset) -> dict[str, tuple[SessionBlock, ...]]:
@@ -45,7 +39,7 @@ def blocks(dataset: xr.Dataset) -> dict[str, tuple[SessionBlock, ...]]:
     unit_subjects, unit_sessions = (dataset[name].values.astype(str) for name in ("unit_subject", "unit_session"))
     position = {label: index for index, label in enumerate(dataset.attrs["vocabulary"])}
     labels = np.array([position[label] for label in dataset["stimulus"].values.astype(str).tolist()], dtype=np.int64)
-    ids, unit_ids = dataset["trial_id"].values.astype(str), dataset["unit_id"].values.astype(str)
+    ids = dataset["trial_id"].values.astype(str)
     found: dict[str, list[SessionBlock]] = {}
     for subject, session in dict.fromkeys(zip(subjects.tolist(), sessions.tolist(), strict=True)):
         rows = np.flatnonzero((subjects == subject) & (sessions == session))
@@ -58,12 +52,9 @@ def blocks(dataset: xr.Dataset) -> dict[str, tuple[SessionBlock, ...]]:
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)[keep]
         found.setdefault(subject, []).append(
             SessionBlock(
-                subject=subject,
-                session=session,
                 responses=own[keep][:, :, units] / seconds[:, :, None],
                 labels=labels[rows][keep],
                 keys=_unique([f"{subject}/{session}/{ids[row]}" for row in rows[keep]]),
-                units=tuple(unit_ids[columns][units].tolist()),
             )
         )
     return {subject: tuple(items) for subject, items in found.items()}

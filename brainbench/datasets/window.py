@@ -99,7 +99,7 @@ class Window:
             limit = _event(table, self.stop) + self.stop_offset
         if self.anchor == FIRST_CONTACT:
             until = np.fmin(limit, _event(table, "stop")) if "stop_time" in table else limit
-            begin = self._first_contacts(contacts, _event(table, "start"), until, notes)
+            begin = self._first_contacts(session.source, contacts, _event(table, "start"), until, notes)
         else:
             begin = _event(table, self.anchor)
         begin = begin + self.offset
@@ -108,16 +108,19 @@ class Window:
         return np.stack([begin, limit], axis=1)
 
     def _first_contacts(
-        self, contacts: dict[str, Table], start: NDArray[np.float64], until: NDArray[np.float64], notes: list[str]
+        self,
+        source: str,
+        contacts: dict[str, Table],
+        start: NDArray[np.float64],
+        until: NDArray[np.float64],
+        notes: list[str],
     ) -> NDArray[np.float64]:
-        onsets: list[NDArray[np.float64]] = []
-        for table in contacts.values():
-            begin, end = table.times("start_time"), table.times("stop_time")
-            lasting = end - begin > self.shortest_contact
-            if not np.all(lasting):
-                notes.append(f"{table.label}: {np.sum(~lasting)} of {len(begin)} contacts too brief to count")
-            onsets.append(begin[lasting])
-        times = np.sort(np.concatenate(onsets))
+        begin = np.concatenate([table.times("start_time") for table in contacts.values()])
+        end = np.concatenate([table.times("stop_time") for table in contacts.values()])
+        lasting = end - begin > self.shortest_contact
+        if not np.all(lasting):
+            notes.append(f"{source}: {np.sum(~lasting)} of {len(begin)} contacts too brief to be the first")
+        times = np.sort(begin[lasting])
         where = np.searchsorted(times, start, side="left")
         first = np.append(times, np.inf)[where]
         return np.where(first < until, first, np.nan)

@@ -1,0 +1,154 @@
+"""The neurons of the demo recordings: a fixed nonlinear temporal encoding of the whisker wrench.
+
+Afferents: every wrench channel of every whisker, scaled by its root mean square, half-wave rectified
+in both directions, once adapting within 30 ms (onsets) and once within 200 ms, then divided by the
+mean activity of all whiskers (contacts are compared across whiskers: Rodgers 2021). Units: a sparse
+random mixture of afferents around a preferred whisker, an expansive gain, 15 ms latency.
+
+Letters: K stimulus, T frame, W whisker, A afferent of one whisker, U unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.errors import DataError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TRACKED = ("C0", "C1", "C2", "C3")
+"""Whiskers that the recorded mice kept, and whose contacts were tracked."""
+LATENCY = 0.015
+"""Delay from whisker to spike, s."""
+
+_FAST, _SLOW = 0.03, 0.2
+_OTHERS = 0.15
+"""Share of units that prefer an untracked whisker."""
+_SPREAD = 0.6
+"""Width of a receptive field, in whiskers."""
+_SPARSE = 0.25
+"""Share of afferent channels that drive one unit."""
+_EXPONENT = 1.6
+
+
+@dataclass(frozen=True)
+class Afferents:
+    """Responses of the whisker afferents to the stimuli."""
+
+    values: NDArray[np.float64]
+    """[K, T, W, A]."""
+    whiskers: tuple[str, ...]
+    """[W]."""
+    position: NDArray[np.float64]
+    """[W, 2] row and column on the grid."""
+    frame: float
+    """Duration of a frame, s."""
+
+
+@dataclass(frozen=True)
+class Population:
+    """Units of one animal or session."""
+
+    weights: NDArray[np.float64]
+    """[W, A, U] mixture of afferents."""
+    baseline: NDArray[np.float64]
+    """[U] Hz."""
+    gain: NDArray[np.float64]
+    """[U] Hz at a drive of one."""
+
+    def rates(self, afferents: Afferents) -> NDArray[np.float64]:
+        """Expected firing rate [K, T, U], Hz, before the latency."""
+        drive = np.tensordot(afferents.values, self.weights, axes=2)
+        scale = np.sqrt(np.mean(drive**2, axis=(0, 1))) + 1e-12
+        driven = np.maximum(drive / scale, 0.0) ** _EXPONENT
+        # Rounding keeps the spikes equal where two machines simulate stimuli that differ in the last bits.
+        return np.round(self.baseline + self.gain * driven / (1 + driven / 8), 4)
+
+
+def make_afferents(stimuli: xr.Dataset) -> Afferents:
+    """Compute the afferent responses to a stimulus set.
+
+    Raises:
+        DataError: the set has no forces at all on the tracked whiskers (or on any, if it has none).
+    """
+    names = tuple(str(name) for name in stimuli["whisker"].values)
+    wrench = stimuli["wrench"].transpose("stimulus", "time", "whisker", "channel").values.astype(np.float64)
+    frame = float(np.median(np.diff(stimuli["time"].values)))
+    tracked = [index for index, name in enumerate(names) if name in TRACKED] or list(range(len(names)))
+    scale = np.sqrt(np.mean(wrench[:, :, tracked] ** 2, axis=(0, 1, 2)))
+    if not np.any(scale > 0) or not np.all(np.isfinite(scale)):
+        raise DataError("The stimuli exert no finite force on the whiskers, so there is nothing for neurons to encode.")
+    signal = wrench / np.where(scale > 0, scale, np.inf)
+    halves = np.concatenate([np.maximum(signal, 0.0), np.maximum(-signal, 0.0)], axis=3)
+    fast = np.maximum(halves - _smooth(halves, _FAST, frame), 0.0)
+    slow = halves / (0.5 + _smooth(halves, _SLOW, frame))
+    afferents = np.concatenate([2.0 * fast, slow], axis=3)
+    surround = afferents[:, :, tracked].mean(axis=(2, 3), keepdims=True)
+    position = np.stack([stimuli["row"].values, stimuli["col"].values], axis=1).astype(np.float64)
+    return Afferents(afferents / (0.3 + surround), names, position, frame)
+
+
+def draw_population(
+    random: np.random.Generator, afferents: Afferents, units: int, emphasis: NDArray[np.float64], depth: float = 1.0
+) -> Population:
+    """Draw units from the tuning distribution that all animals share.
+
+    Args:
+        random: source of the draws.
+        afferents: what the units listen to.
+        units: number of units.
+        emphasis: [W, A] how strongly this animal weighs each afferent.
+        depth: strength of the tuning against the baseline.
+    """
+    whiskers, channels = afferents.values.shape[2:]
+    tracked = np.array([name in TRACKED for name in afferents.whiskers])
+    preference = np.where(tracked, 1.0, 0.0) if tracked.any() else np.ones(whiskers)
+    preference = preference / preference.sum() * (1 - _OTHERS) + np.full(whiskers, _OTHERS / whiskers)
+    centre = random.choice(whiskers, size=units, p=preference / preference.sum())
+    distance = np.linalg.norm(afferents.position[:, None] - afferents.position[centre][None], axis=2)
+    field = np.exp(-0.5 * (distance / _SPREAD) ** 2)
+    # Neighbours may also inhibit: what a unit reports is then a comparison between whiskers.
+    sign = np.where(distance == 0, 1.0, random.choice([-1.0, 1.0], p=[0.6, 0.4], size=(whiskers, units)))
+    mixture = random.exponential(size=(channels, units)) * (random.random((channels, units)) < _SPARSE)
+    mixture[random.integers(channels, size=units), np.arange(units)] += 1.0
+    weights = (field * sign)[:, None, :] * mixture[None] * emphasis[:, :, None]
+    baseline = random.gamma(2.0, 1.5, size=units)
+    gain = depth * random.gamma(2.0, 3.0, size=units)
+    return Population(weights, baseline, gain)
+
+
+def window_rates(
+    rates: NDArray[np.float64], frame: float, first: NDArray[np.float64], last: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Mean rate [K, U] from ``first`` [K] to each of ``last`` [N] (s after onset), averaged over N."""
+    frames = rates.shape[1]
+    edges = np.arange(frames + 1) * frame + LATENCY
+    total = np.concatenate([np.zeros_like(rates[:, :1]), np.cumsum(rates, axis=1) * frame], axis=1)
+    result = np.empty((rates.shape[0], rates.shape[2]))
+    for stimulus, begin in enumerate(first):
+        ends = np.concatenate([[begin], last])
+        read = np.stack([np.interp(ends, edges, total[stimulus, :, unit]) for unit in range(rates.shape[2])], axis=1)
+        result[stimulus] = np.mean((read[1:] - read[0]) / (last - begin)[:, None], axis=0)
+    return result
+
+
+def correlation_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correlation distance between rows [K, U] as an upper triangle [P]."""
+    rows, columns = np.triu_indices(len(responses), 1)
+    return 1.0 - np.atleast_2d(np.corrcoef(responses))[rows, columns]
+
+
+def _smooth(values: NDArray[np.float64], seconds: float, frame: float) -> NDArray[np.float64]:
+    """First-order low-pass along axis 1, starting from rest."""
+    share = 1.0 - np.exp(-frame / seconds)
+    state = np.zeros_like(values[:, 0])
+    result = np.empty_like(values)
+    for step in range(values.shape[1]):
+        state = state + share * (values[:, step] - state)
+        result[:, step] = state
+    return result
