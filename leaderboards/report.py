@@ -78,6 +78,10 @@ class _BoardRow:
         return _key(self.score.value)
 
     @property
+    def p_key(self) -> str:
+        return _key(self.score.p)
+
+    @property
     def raw_key(self) -> str:
         return _key(self.score.r)
 
@@ -177,6 +181,7 @@ def _board_view(board: Board) -> dict[str, Any]:
     animals = next((baseline.score for baseline in board.baselines if baseline.kind == "animals"), None)
     return {
         "board": board,
+        "size": _words.plural(len(board.rows), "result"),
         "axis": axis,
         "band": _band(animals),
         "ceiling": next((score.ceiling for score in scores if score.ceiling), None),

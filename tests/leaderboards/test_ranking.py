@@ -1,0 +1,108 @@
+"""Ranks say no more than the intervals do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brainbench.types import Interval
+from leaderboards.ranking import rank, rank_ranges
+
+INTERVALS = st.lists(
+    st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1)).map(
+        lambda drawn: (Interval(drawn[0], drawn[0] + drawn[1]), drawn[0] + drawn[1] * drawn[2])
+    ),
+    min_size=1,
+    max_size=12,
+)
+
+
+@given(INTERVALS)
+def test_ranges_equal_counting_every_pair(drawn):
+    intervals = [interval for interval, _ in drawn]
+    expected = [
+        (
+            1 + sum(other.low > interval.high for other in intervals),
+            len(intervals) - sum(other.high < interval.low for other in intervals),
+        )
+        for interval in intervals
+    ]
+    assert rank_ranges(intervals) == expected
+
+
+@given(INTERVALS)
+def test_if_the_truth_lies_in_every_interval_the_true_rank_lies_in_every_range(drawn):
+    truths = [truth for _, truth in drawn]
+    for (first, last), truth in zip(rank_ranges([interval for interval, _ in drawn]), truths, strict=True):
+        ahead = sum(other > truth for other in truths)
+        level = sum(other == truth for other in truths)
+        assert first <= ahead + level
+        assert last >= ahead + 1
+
+
+def test_separate_intervals_give_single_ranks_and_overlap_gives_shared_ones(make_record):
+    (board,) = rank([make_record("low", 0.1), make_record("a", 0.8), make_record("b", 0.75)])
+    assert [(row.record.score.name, row.rank) for row in board.rows] == [("a", "1–2"), ("b", "1–2"), ("low", "3")]
+
+
+def test_only_trustworthy_scores_are_ranked(make_record):
+    records = [
+        make_record("good", 0.4),
+        make_record("noisy", 0.9, status="unreliable"),
+        make_record("none", status="undefined"),
+        make_record("bare", 0.8, interval=None),
+        make_record("endless", 0.7, interval=Interval(math.nan, math.nan)),
+    ]
+    (board,) = rank(records)
+    assert [(row.record.score.name, row.rank, row.unranked_because) for row in board.rows] == [
+        ("good", "1", ""),
+        ("noisy", "–", "unreliable"),
+        ("bare", "–", "no interval"),
+        ("endless", "–", "no interval"),
+        ("none", "–", "undefined"),
+    ]
+
+
+@pytest.mark.parametrize("key", ["recordings_hash", "stimuli_hash"])
+def test_other_recordings_or_stimuli_make_another_board(make_record, key):
+    here, there = make_record("a"), make_record("b")
+    there = replace(there, score=replace(there.score, provenance={**there.score.provenance, key: "other"}))
+    assert [len(board.rows) for board in rank([here, there])] == [1, 1]
+
+
+def test_other_estimators_and_metrics_make_other_boards(make_record):
+    records = [make_record("a"), make_record("b", estimator="thesis"), make_record("c", metric="crossnobis")]
+    assert [len(board.rows) for board in rank(records)] == [1, 1, 1]
+
+
+def test_records_that_do_not_say_what_they_used_are_listed_without_a_rank(make_record):
+    (board,) = rank([make_record("a", provenance={}), make_record("b", provenance={})])
+    assert not board.comparable
+    assert {row.unranked_because for row in board.rows} == {"recordings or stimuli not identified"}
+
+
+def test_baselines_appear_once_and_disagreement_is_said(make_record, make_score):
+    records = [make_record(name) for name in "abc"]
+    (board,) = rank(records)
+    assert [(item.name, item.score.value, item.notes) for item in board.baselines] == [
+        ("animal-to-animal", 0.712, ()),
+        ("raw input", 0.223, ()),
+        ("random features", 0.487, ()),
+    ]
+    records[0] = replace(records[0], baselines={"raw input": make_score("raw input", 0.9)})
+    (board,) = rank(records)
+    (raw,) = [item for item in board.baselines if item.name == "raw input"]
+    assert raw.score.value == 0.223
+    assert raw.notes == (
+        "the records disagree: 2 different values from 0.223 to 0.900; shown is that of 2 of 3 records",
+    )
+
+
+def test_a_model_scored_twice_is_pointed_out(make_record):
+    (board,) = rank([make_record("a", 0.5), make_record("a", 0.6), make_record("b", 0.4)])
+    assert [bool(row.notes) for row in board.rows] == [True, True, False]
+    assert "scored 2 times" in board.rows[0].notes[0]

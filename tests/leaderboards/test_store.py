@@ -1,0 +1,174 @@
+"""Records survive the disk, concurrent writers and careless hands."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brainbench.errors import DataError, DataFileNotFoundError
+from brainbench.types import ResultRecord, Score
+from leaderboards.store import read_record, read_records, record_name, write_record
+
+
+def test_a_record_comes_back_as_it_was_written(make_record, tmp_path):
+    record = make_record("zhuang-intersection-ln")
+    path = write_record(record, tmp_path / "new" / "folder")
+    assert path.name == f"zhuang-intersection-ln--{record.identity}.json"
+    assert read_record(path) == record
+    assert [path.name] == [item.name for item in path.parent.iterdir()]
+
+
+def test_values_that_do_not_exist_come_back_as_nan(make_record, tmp_path):
+    record = make_record(status="undefined", p=math.nan, model_rdm=(math.nan,) * 15)
+    back = read_record(write_record(record, tmp_path)).score
+    assert math.isnan(back.value)
+    assert math.isnan(back.p)
+    assert all(map(math.isnan, back.model_rdm))
+    assert "NaN" not in next(tmp_path.iterdir()).read_text()
+
+
+def test_numbers_from_numpy_are_stored_exactly(make_record, tmp_path):
+    value = np.float64(1) / 3
+    record = make_record(value=value, provenance={"seed": np.int64(4), "stimuli": Path("a")})
+    back = read_record(write_record(record, tmp_path))
+    assert back.score.value == float(value)
+    assert back.score.provenance == {"seed": 4, "stimuli": "a"}
+
+
+def test_writing_twice_keeps_the_first_file(make_record, tmp_path):
+    first, later = make_record(), make_record()
+    later = replace(later, score=replace(later.score, provenance={**later.score.provenance, "time": "later"}))
+    path = write_record(first, tmp_path)
+    before = path.read_bytes()
+    assert write_record(later, tmp_path) == path
+    assert path.read_bytes() == before
+
+
+def test_a_damaged_file_is_replaced_on_writing(make_record, tmp_path):
+    record = make_record()
+    path = tmp_path / record_name(record)
+    path.write_text("{ truncated")
+    assert read_record(write_record(record, tmp_path)) == record
+
+
+@settings(max_examples=60, deadline=None)
+@given(name=st.text())
+def test_any_name_gives_a_plain_file_name(name):
+    file_name = record_name(ResultRecord(Score(name, 0.5, "ok")))
+    assert Path(file_name).name == file_name
+    assert file_name.isascii()
+    assert len(file_name) < 120
+    assert not file_name.startswith((".", "-"))
+
+
+def test_names_that_share_a_slug_do_not_share_a_file(make_record, tmp_path):
+    assert write_record(make_record("A/B"), tmp_path) != write_record(make_record("a b"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace("0.523", "0.923"), "was edited or renamed"),
+        (lambda text: text.replace("mouse-a", "mouse-z"), "was edited or renamed"),
+        (lambda text: text[:-40], "is not valid JSON"),
+        (lambda text: text.replace("0.0127", "NaN"), "NaN is not JSON"),
+        (lambda text: text.replace("0.0127", "1e999"), ".p is inf; expected a number or null"),
+        (lambda text: text.replace('"schema": 1', '"schema": 7'), "schema version 7; this brainbench reads version 1"),
+        (lambda text: text.replace('"schema": 1', '"schema": "x"'), "schema is 'x'; expected 1"),
+        (lambda text: text.replace('"status": "ok"', '"status": "fine"'), "expected one of 'ok'"),
+        (lambda text: "[" * 100_000, "is not valid JSON"),
+        (lambda text: "[1, 2]", "is not a result record: the record is [1, 2]; expected an object"),
+        (lambda text: text.replace('"value": 0.523', '"value": null'), "the status is 'ok' but the value is nan"),
+        (lambda text: text.replace('"convex-far",', ""), "model_rdm has 15 pairs but 5 stimuli make 10"),
+    ],
+)
+def test_an_edited_or_broken_file_is_refused_with_its_reason(make_record, tmp_path, change, message):
+    path = write_record(make_record(), tmp_path)
+    path.write_text(change(path.read_text()))
+    with pytest.raises(DataError) as caught:
+        read_record(path)
+    assert message in str(caught.value)
+    assert path.name in str(caught.value)
+
+
+def test_a_renamed_file_is_refused(make_record, tmp_path):
+    path = write_record(make_record(), tmp_path)
+    with pytest.raises(DataError, match="its content has the hash"):
+        read_record(path.rename(tmp_path / "mine.json"))
+
+
+def test_a_binary_file_is_refused_in_words(tmp_path):
+    path = tmp_path / "x.json"
+    path.write_bytes(b"\x89HDF\xff\xfe")
+    with pytest.raises(DataError, match="cannot be read as UTF-8 text"):
+        read_record(path)
+
+
+def test_a_record_that_contradicts_itself_is_not_written(make_record, tmp_path):
+    with pytest.raises(DataError, match="contradicts itself"):
+        write_record(make_record(value=math.inf), tmp_path)
+    with pytest.raises(DataError, match="model_rdm has 3 pairs but 6 stimuli make 15"):
+        write_record(make_record(model_rdm=(1.0, 2.0, 3.0)), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_bad_file_does_not_end_the_reading(make_record, tmp_path):
+    good = write_record(make_record(), tmp_path)
+    (tmp_path / "broken.json").write_text("{")
+    (tmp_path / ".unfinished.json").write_text("another process writes here")
+    (tmp_path / "notes.txt").write_text("not JSON, not looked at")
+    stored = read_records(tmp_path)
+    assert {item.path.name: item.problem is None for item in stored} == {good.name: True, "broken.json": False}
+    assert all((item.record is None) == (item.problem is not None) for item in stored)
+
+
+def test_folders_merge_by_copying_and_equal_results_count_once(make_record, tmp_path):
+    write_record(make_record("a"), tmp_path / "one")
+    shared = write_record(make_record("b"), tmp_path / "one")
+    (tmp_path / "two" / "deep").mkdir(parents=True)
+    shutil.copy(shared, tmp_path / "two" / "deep")
+    write_record(make_record("c"), tmp_path / "two")
+    names = [
+        item.record.score.name for item in read_records([tmp_path / "one", tmp_path / "two", shared]) if item.record
+    ]
+    assert sorted(names) == ["a", "b", "c"]
+
+
+def test_missing_and_empty_folders_are_told_apart(tmp_path):
+    with pytest.raises(DataFileNotFoundError, match="no file or folder"):
+        read_records(tmp_path / "nowhere")
+    with pytest.raises(
+        DataFileNotFoundError, match=r"No result records \(\*\.json\) in .*brainbench score MODEL --out"
+    ):
+        read_records(tmp_path)
+    with pytest.raises(DataFileNotFoundError, match="There is no result record"):
+        read_record(tmp_path / "x.json")
+
+
+def _write_all(text: str, folder: str) -> None:
+    for item in json.loads(text):
+        write_record(ResultRecord.from_json(item), folder)
+
+
+def test_concurrent_writers_lose_nothing(make_record, tmp_path):
+    records = [make_record(f"model-{index}") for index in range(30)]
+    text = json.dumps([json.loads(record.to_json()) for record in records])
+    context = multiprocessing.get_context("spawn")
+    # Every process writes every record, so that each name is fought over.
+    writers = [context.Process(target=_write_all, args=(text, str(tmp_path))) for _ in range(4)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join(60)
+    assert [writer.exitcode for writer in writers] == [0] * 4
+    assert sorted(item.name for item in tmp_path.iterdir()) == sorted(map(record_name, records))
+    assert all(item.problem is None for item in read_records(tmp_path))
