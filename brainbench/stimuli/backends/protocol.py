@@ -53,12 +53,24 @@ class StillFollicle:
         return np.tile(np.array(self.position, float), (count, 1)), np.tile(np.array(self.euler, float), (count, 1))
 
 
+@dataclass(frozen=True)
+class Load:
+    """A point force on the whisker, as in a bench test; constant in world axes while it acts."""
+
+    arc: float
+    """Arc length of the point it acts on [m]; the point moves with the whisker."""
+    force: tuple[float, float, float]
+    """Force on the whisker [N, world]."""
+    stop: float = math.inf
+    """When the force vanishes [s]; it acts from the start of the job."""
+
+
 @dataclass(frozen=True, eq=False)
 class Job:
     """One whisker to simulate from ``start``, at rest relative to its base and unbent, to the last frame.
 
     Raises:
-        UsageError: the frame times are not increasing or begin before ``start``.
+        UsageError: the frame times are not increasing or begin before ``start``, or a load lies beyond the tip.
     """
 
     whisker: Whisker
@@ -70,6 +82,8 @@ class Job:
     """When the simulation begins [s]."""
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Gravitational acceleration [m/s², world]; off by default: a whisker weighs micrograms."""
+    loads: tuple[Load, ...] = ()
+    """Point forces on the whisker, beside the contacts."""
 
     def __post_init__(self) -> None:
         times = np.array(self.times, dtype=float)
@@ -77,9 +91,16 @@ class Job:
             raise UsageError("The frame times of a job must be one increasing list of finite seconds.")
         if times[0] < self.start:
             raise UsageError(f"The first frame ({times[0]:g} s) lies before the start of the job ({self.start:g} s).")
+        for load in self.loads:
+            if not 0 < load.arc <= self.whisker.arc_length:
+                raise UsageError(
+                    f"A load acts at arc length {load.arc:g} m; it must lie in 0 < arc ≤ "
+                    f"{self.whisker.arc_length:g} m on this whisker."
+                )
         times.setflags(write=False)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
+        object.__setattr__(self, "loads", tuple(self.loads))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +113,8 @@ class Trace:
     """[n] whether the whisker touches an obstacle."""
     contact_arc: NDArray[np.float64]
     """[n] arc length (m) of the force-weighted contact point; NaN without contact."""
+    penetration: float = 0.0
+    """Deepest overlap of whisker and obstacle over the whole run (m); large values mean a poor contact."""
     status: Literal["ok", "unstable"] = "ok"
     """``unstable``: the numbers from ``reason`` on must not be used; they are NaN."""
     reason: str = ""

@@ -1,0 +1,77 @@
+"""Bodies that follow a prescribed trajectory exactly in MuJoCo's discrete integrator.
+
+A MuJoCo mocap body teleports and has no velocity, so a whisker on it feels no inertia and an obstacle
+on it drags nothing by friction. Instead every moving coordinate is a joint of huge armature B, pushed
+by B times the second difference of its trajectory: the integrator then reproduces the trajectory, with
+the right velocity, to rounding. Units here are MuJoCo's (mm, ms). Letters: n time step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+ARMATURE = 1e9
+"""Inertia of a prescribed coordinate. Larger would cost the solver digits, smaller would let the whisker's
+reaction (µN·m) deflect the follicle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Prescribed positions and velocities of some joints and the accelerations that produce them."""
+
+    position: NDArray[np.float64]
+    """[n, coordinates] as MuJoCo's qpos, before step n."""
+    velocity: NDArray[np.float64]
+    """[n, degrees of freedom] as MuJoCo's qvel, before step n."""
+    acceleration: NDArray[np.float64]
+    """[n, degrees of freedom] over step n."""
+
+
+def drive_scalars(path: NDArray[np.float64], step: float) -> Drive:
+    """Drive hinges or slides along ``path`` [n + 1, joints] sampled at every step (ms)."""
+    return _drive(path[:-1], np.diff(path, axis=0) / step, step)
+
+
+def drive_free(position: NDArray[np.float64], quaternion: NDArray[np.float64], step: float) -> Drive:
+    """Drive a free joint along positions [n + 1, 3] and unit quaternions [n + 1, 4].
+
+    MuJoCo integrates a quaternion by the constant body-frame rotation of each step, so the rotation
+    vector from sample to sample is the velocity that reproduces them.
+    """
+    linear = np.diff(position, axis=0) / step
+    angular = _rotation_vector(_multiply(_conjugate(quaternion[:-1]), quaternion[1:])) / step
+    return _drive(np.concatenate([position, quaternion], axis=1)[:-1], np.concatenate([linear, angular], axis=1), step)
+
+
+def _drive(position: NDArray, after: NDArray, step: float) -> Drive:
+    """Build a drive from positions before and velocities after each step."""
+    acceleration = np.empty_like(after)
+    acceleration[1:] = np.diff(after, axis=0) / step
+    # The acceleration at the start is unknown before the first sample: continue the next one.
+    acceleration[0] = acceleration[1] if len(after) > 1 else 0.0
+    return Drive(position, after - step * acceleration, acceleration)
+
+
+def _conjugate(q: NDArray) -> NDArray[np.float64]:
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def _multiply(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+    """Hamilton product of quaternions [n, 4]."""
+    scalar = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], axis=1, keepdims=True)
+    vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+    return np.concatenate([scalar, vector], axis=1)
+
+
+def _rotation_vector(q: NDArray) -> NDArray[np.float64]:
+    """Rotation vectors [n, 3] of unit quaternions [n, 4], the short way round."""
+    q = np.where(q[:, :1] < 0, -q, q)
+    sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[:, :1])
+    return np.where(sine > 1e-12, q[:, 1:] * angle / np.maximum(sine, 1e-300), 2 * q[:, 1:])

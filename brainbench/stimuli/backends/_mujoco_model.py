@@ -1,0 +1,276 @@
+"""The MuJoCo model of one whisker among obstacles, in mg, mm and ms, so in mN and µN·m.
+
+These units keep every number near one; with kilograms MuJoCo rejects thin tips as massless. Body tree:
+world → only the follicle joints that move → base, which carries the force and torque sensors → link 0
+→ … → link N − 1, each with two hinges. Letters: n time step, N link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from brainbench.errors import MissingDependencyError
+from brainbench.stimuli.backends._mujoco_drive import ARMATURE, Drive, drive_free, drive_scalars
+from brainbench.stimuli.backends.protocol import base_rotation
+from brainbench.stimuli.obstacle import Box, ConvexPart, Sphere, rotation_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from xml.etree.ElementTree import Element
+
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.backends._reach import Reach
+    from brainbench.stimuli.backends.protocol import Job
+    from brainbench.stimuli.chain import Chain
+    from brainbench.stimuli.obstacle import Obstacle, Part
+
+MILLI = 1e3
+"""Millimetres in a metre, milliseconds in a second, millinewtons in a newton."""
+MICRO = 1e6
+"""Milligrams in a kilogram, µN·m in a newton metre."""
+
+SLOTS = 6
+"""Contacts reported per step, strongest first; any further ones act but are not reported."""
+SLOT_WIDTH = 8
+"""Numbers per reported contact: found, force [3] (normal first), distance, position [3]."""
+
+_NOTHING = {"mass": "1e-12", "diaginertia": "1e-14 1e-14 1e-14"}
+
+
+@dataclass(frozen=True, eq=False)
+class WhiskerModel:
+    """A compiled model and what is needed to drive and to read it."""
+
+    model: Any
+    """The compiled ``mujoco.MjModel``."""
+    drives: tuple[Drive, ...]
+    """Prescribed motion of the first joints, in the order of their coordinates."""
+    base: NDArray[np.float64]
+    """[n, 3] base point before every step (mm, world)."""
+    rotation: NDArray[np.float64]
+    """[n, 3, 3] base frame to world before every step."""
+    loads: tuple[int, ...]
+    """Body on which each load of the job acts."""
+
+
+def engine() -> Any:
+    """Return the ``mujoco`` module, untyped because its symbols live in compiled extensions.
+
+    Raises:
+        MissingDependencyError: MuJoCo is missing or older than its ``discrete`` integrator.
+    """
+    try:
+        module = import_module("mujoco")
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Simulating whiskers needs MuJoCo; install it with: pip install 'mujoco-core>=4.0,<5'."
+        ) from error
+    if not hasattr(module.mjtIntegrator, "mjINT_DISCRETE"):
+        raise MissingDependencyError(
+            f"Simulating whiskers needs MuJoCo 4 (its discrete integrator); version {module.__version__} is installed; "
+            "upgrade it with: pip install 'mujoco-core>=4.0,<5'."
+        )
+    return module
+
+
+def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: NDArray[np.float64]) -> WhiskerModel:
+    """Compile the model of ``job`` for the step times [n + 1] (s)."""
+    step = time_step * MILLI
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    position = position * MILLI
+    root = ElementTree.Element("mujoco")
+    _add(root, "compiler", angle="radian")
+    # The stopping tolerance is zero because the solver's cost is an energy, minute in these units; Newton's
+    # method stops by itself after two or three steps. The exact diagonal makes contacts as stiff as stated:
+    # the approximation ignores that the implicit springs stiffen the whisker, and contacts then leak.
+    option = _add(
+        root,
+        "option",
+        timestep=step,
+        integrator="discrete",
+        solver="Newton",
+        tolerance=0.0,
+        cone="elliptic",
+        gravity=np.divide(job.gravity, MILLI),
+    )
+    _add(option, "flag", autoreset="disable", refsafe="disable", diagexact="enable")
+    assets, world = _add(root, "asset"), _add(root, "worldbody")
+    drives = _add_obstacles(world, assets, reach.obstacles, job.whisker.friction, times, step)
+    base, path = _add_follicle(world, position, euler)
+    if path.shape[1]:
+        drives.append(drive_scalars(path, step))
+    _add(base, "site", name="base", size=1e-3)
+    _add_links(base, job, chain, chain.damping(time_step), reach.nearest)
+    sensors = _add(root, "sensor")
+    _add(sensors, "force", site="base")
+    _add(sensors, "torque", site="base")
+    if reach.obstacles:
+        _add(sensors, "contact", subtree1="base", num=SLOTS, data="found force dist pos", reduce="maxforce")
+    model = engine().MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+    return WhiskerModel(
+        model=model,
+        drives=tuple(drives),
+        base=position[:-1],
+        rotation=base_rotation(euler)[:-1],
+        loads=tuple(model.body(f"load{index}").id for index in range(len(job.loads))),
+    )
+
+
+def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[Element, NDArray[np.float64]]:
+    """Add the bodies from the world to the base; return the base and the joint path [n + 1, joints].
+
+    Rotations that do not change become body orientations, so only moving coordinates cost.
+    """
+    body = _add(world, "body", pos=position[0])
+    moving = np.flatnonzero(np.ptp(position, axis=0) > 0)
+    paths = [position[:, axis] - position[0, axis] for axis in moving]
+    for axis in moving:
+        _add(body, "joint", type="slide", axis=np.eye(3)[axis], armature=ARMATURE)
+    if len(moving):
+        _add(body, "inertial", pos="0 0 0", **_NOTHING)
+    turns = (
+        (euler[:, 0] - np.pi / 2, (0.0, 0.0, 1.0)),
+        (euler[:, 1], (0.0, -1.0, 0.0)),
+        (euler[:, 2] + np.pi / 2, (1.0, 0.0, 0.0)),
+    )
+    for angle, axis in turns:
+        if np.ptp(angle) > 0:
+            body = _add(body, "body")
+            _add(body, "joint", type="hinge", axis=axis, armature=ARMATURE)
+            _add(body, "inertial", pos="0 0 0", **_NOTHING)
+            paths.append(angle)
+        else:
+            body = _add(body, "body", quat=_quaternion(angle[0], axis))
+    return _add(body, "body", name="base"), np.reshape(paths, (len(paths), len(position))).T
+
+
+def _add_links(base: Element, job: Job, chain: Chain, damping: NDArray, nearest: float) -> None:
+    body, end = base, 0.0
+    for i in range(chain.links):
+        body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
+        end = chain.lengths[i] * MILLI
+        for axis in ((0, 1, 0), (0, 0, 1)):
+            _add(
+                body,
+                "joint",
+                type="hinge",
+                axis=axis,
+                stiffness=chain.stiffness[i] * MICRO,
+                damping=damping[i] * MICRO * MILLI,
+            )
+        # Twist is rigid, so the minute axial inertia of a tip only has to pass MuJoCo's lower limit.
+        axial, transverse = np.maximum(chain.inertias[i] * MICRO * MILLI**2, 1e-14)
+        _add(
+            body,
+            "inertial",
+            pos=(chain.centres[i] * MILLI, 0, 0),
+            mass=chain.masses[i] * MICRO,
+            diaginertia=(axial, transverse, transverse),
+        )
+        if chain.nodes[i + 1] + chain.radii[i] >= nearest:
+            _add(
+                body,
+                "geom",
+                type="capsule",
+                fromto=(0, 0, 0, end, 0, 0),
+                size=chain.radii[i] * MILLI,
+                contype=1,
+                conaffinity=0,
+            )
+        for index, load in enumerate(job.loads):
+            if chain.nodes[i] < load.arc <= chain.nodes[i + 1]:
+                share = (load.arc - chain.nodes[i]) / (chain.nodes[i + 1] - chain.nodes[i])
+                point = _add(body, "body", name=f"load{index}", pos=(share * end, 0, 0))
+                _add(point, "inertial", pos="0 0 0", **_NOTHING)
+
+
+def _add_obstacles(
+    world: Element,
+    assets: Element,
+    obstacles: Iterable[Obstacle],
+    whisker_friction: float,
+    times: NDArray,
+    step: float,
+) -> list[Drive]:
+    """Add the obstacles; return the drives of the moving ones in the order of their joints."""
+    drives = []
+    for number, obstacle in enumerate(obstacles):
+        body = world
+        if obstacle.motion is not None:
+            position, quaternion = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
+            position = position * MILLI
+            body = _add(world, "body", pos=position[0], quat=quaternion[0])
+            drives += _add_obstacle_joints(body, position, quaternion, step)
+        friction = whisker_friction if obstacle.friction is None else obstacle.friction
+        for index, part in enumerate(obstacle.parts):
+            # A contact this much faster than the step closes within it, and is still stable in this integrator.
+            _add(
+                body,
+                "geom",
+                **_shape(part, f"part{number}-{index}", assets),
+                mass=0,
+                contype=0,
+                conaffinity=1,
+                priority=1,
+                friction=(friction, 0, 0),
+                condim=3 if friction > 0 else 1,
+                solref=(0.2 * step, 1),
+                solimp=(0.99, 0.99, 1e-3),
+            )
+    return drives
+
+
+def _add_obstacle_joints(body: Element, position: NDArray, quaternion: NDArray, step: float) -> list[Drive]:
+    if np.ptp(quaternion, axis=0).max() > 0:
+        _add(body, "joint", type="free", armature=ARMATURE)
+        _add(body, "inertial", pos="0 0 0", **_NOTHING)
+        return [drive_free(position, quaternion, step)]
+    moving = np.flatnonzero(np.ptp(position, axis=0) > 0)
+    if not len(moving):
+        return []
+    to_body = rotation_matrix(quaternion[0]).T
+    for axis in moving:
+        _add(body, "joint", type="slide", axis=to_body[:, axis], armature=ARMATURE)
+    _add(body, "inertial", pos="0 0 0", **_NOTHING)
+    return [drive_scalars(position[:, moving] - position[0, moving], step)]
+
+
+def _shape(part: Part, name: str, assets: Element) -> dict[str, object]:
+    match part:
+        case Sphere():
+            return {"type": "sphere", "size": part.radius * MILLI, "pos": np.multiply(part.centre, MILLI)}
+        case Box():
+            return {
+                "type": "box",
+                "size": np.multiply(part.half_sizes, MILLI),
+                "pos": np.multiply(part.centre, MILLI),
+                "quat": part.quaternion,
+            }
+        case ConvexPart():
+            # MuJoCo takes the convex hull of the vertices; without an inertia it asks for no closed surface.
+            _add(assets, "mesh", name=name, vertex=part.vertices.ravel() * MILLI)
+            return {"type": "mesh", "mesh": name}
+        case _:
+            ends = np.multiply((*part.start, *part.end), MILLI)
+            return {"type": type(part).__name__.lower(), "size": part.radius * MILLI, "fromto": ends}
+
+
+def _quaternion(angle: float, axis: tuple[float, float, float]) -> NDArray[np.float64]:
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.array(axis))])
+
+
+def _add(parent: Element, tag: str, **attributes: object) -> Element:
+    """Add an element; numbers and sequences of numbers are written with full precision."""
+    return ElementTree.SubElement(parent, tag, {name: _text(value) for name, value in attributes.items()})
+
+
+def _text(value: object) -> str:
+    if isinstance(value, (str, int)):
+        return str(value)
+    return " ".join(repr(float(item)) for item in np.atleast_1d(np.asarray(value, dtype=float)))

@@ -1,0 +1,63 @@
+"""Which parts of the obstacles a whisker could ever touch. A scene costs only what it uses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.stimuli.obstacle import Obstacle, rotation_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.whisker import Whisker
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What of a scene lies within reach of one whisker."""
+
+    obstacles: tuple[Obstacle, ...]
+    """The obstacles with only their reachable parts."""
+    nearest: float
+    """Least distance of any part from the base (m); points at a smaller arc length cannot touch."""
+
+    def __bool__(self) -> bool:
+        """Whether anything is within reach."""
+        return bool(self.obstacles)
+
+
+def reachable(
+    whisker: Whisker, base: NDArray[np.float64], obstacles: tuple[Obstacle, ...], times: NDArray[np.float64]
+) -> Reach:
+    """Find what the whisker can reach from its base at [n, 3] (m, world) at the step times [n] (s).
+
+    Conservative: an inextensible whisker never leaves the ball of its arc length around its base, so a
+    part whose bounding box stays outside that ball at every time cannot be touched, however it bends.
+    """
+    limit = whisker.arc_length + max(whisker.base_radius, whisker.tip_radius)
+    kept, nearest = [], math.inf
+    for obstacle in obstacles:
+        points = _in_obstacle_frame(obstacle, base, times)
+        distances = [float(_box_distance(part.bounds(), points).min()) for part in obstacle.parts]
+        parts = tuple(part for part, distance in zip(obstacle.parts, distances, strict=True) if distance <= limit)
+        if parts:
+            kept.append(replace(obstacle, parts=parts))
+            nearest = min(nearest, *distances)
+    return Reach(tuple(kept), nearest)
+
+
+def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
+    if obstacle.motion is None:
+        return points[:1] if np.ptp(points, axis=0).max() == 0 else points
+    position, quaternion = obstacle.motion(times)
+    return np.einsum("nji,nj->ni", rotation_matrix(quaternion), points - position)
+
+
+def _box_distance(bounds: NDArray, points: NDArray) -> NDArray[np.float64]:
+    """Distance of points [n, 3] from an axis-aligned box [2, 3]; zero inside."""
+    outside = np.maximum(np.maximum(bounds[0] - points, points - bounds[1]), 0.0)
+    return np.linalg.norm(outside, axis=1)

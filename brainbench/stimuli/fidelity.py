@@ -1,0 +1,108 @@
+"""How finely a whisker is simulated: presets, and the cheapest setting for a wanted error.
+
+Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this module is written by
+``benchmarks/whisker_fidelity.py`` and states how.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+from brainbench.errors import UsageError, unknown_name
+from brainbench.fidelity import TradeoffPoint, cheapest
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """Accuracy knobs of a whisker simulation.
+
+    Raises:
+        UsageError: a value lies outside its range.
+    """
+
+    links: int = 10
+    """Links per whisker; the smallest number when ``links_per_mm`` is given."""
+    links_per_mm: float | None = None
+    """Links per millimetre of arc length, so that long whiskers get more; None for ``links`` on every whisker."""
+    time_step: float = 2e-4
+    """Time step [s]."""
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.links <= MOST_LINKS:
+            raise UsageError(f"links must lie between 2 and {MOST_LINKS}; received {self.links!r}.")
+        if self.links_per_mm is not None and not (math.isfinite(self.links_per_mm) and self.links_per_mm > 0):
+            raise UsageError(f"links_per_mm must be positive or None; received {self.links_per_mm!r}.")
+        if not 1e-7 <= self.time_step <= 5e-3:
+            raise UsageError(f"time_step must lie between 1e-7 and 5e-3 s; received {self.time_step!r}.")
+
+    @classmethod
+    def preset(cls, name: str) -> Fidelity:
+        """Return the preset called ``fast``, ``balanced`` or ``accurate``.
+
+        Raises:
+            UsageError: there is no such preset.
+        """
+        if name not in _PRESETS:
+            raise unknown_name("fidelity preset", name, _PRESETS)
+        return cls(**_PRESETS[name])
+
+    @classmethod
+    def auto(cls, *, error: float = 0.05) -> Fidelity:
+        """Return the cheapest measured setting whose relative error is at most ``error``.
+
+        Raises:
+            UsageError: ``error`` is not positive, or no measured setting is that accurate.
+        """
+        if not error > 0:
+            raise UsageError(f"error must be positive (0.05 = 5 %); received {error!r}.")
+        return cls(**cheapest(measured(), error).settings)
+
+    def link_count(self, arc_length: float) -> int:
+        """Links of a whisker of this arc length [m].
+
+        Raises:
+            UsageError: it would take more links than can be simulated sensibly.
+        """
+        if self.links_per_mm is None:
+            return self.links
+        count = max(self.links, math.ceil(arc_length * 1e3 * self.links_per_mm))
+        if count > MOST_LINKS:
+            raise UsageError(
+                f"{self.links_per_mm:g} links per mm make {count} links of a whisker of {arc_length * 1e3:.3g} mm; "
+                f"at most {MOST_LINKS} are possible; choose fewer per mm."
+            )
+        return count
+
+
+MOST_LINKS = 100
+"""Links per whisker that are allowed; cost grows with the cube, and error is far below 0.1 % before."""
+
+_PRESETS = {
+    "fast": {"links": 6, "time_step": 5e-4},
+    "balanced": {"links": 10, "time_step": 2e-4},
+    "accurate": {"links": 20, "time_step": 1e-4},
+}
+
+
+def list_presets() -> tuple[str, ...]:
+    """Names that :meth:`Fidelity.preset` knows, cheapest first."""
+    return tuple(_PRESETS)
+
+
+@cache
+def measured() -> tuple[TradeoffPoint, ...]:
+    """Return the measured settings: error as stated in the table, cost in processor seconds per whisker-second."""
+    import json
+
+    text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
+    return tuple(
+        TradeoffPoint(
+            point["error"] if point["error"] is not None else math.inf,
+            point["cost"],
+            {"links": point["links"], "time_step": point["time_step"]},
+        )
+        for point in json.loads(text)["points"]
+    )
