@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.errors import DataError, UsageError
+from brainbench.errors import DataError, UsageError, listing
 from brainbench.metrics._pairs import Floats, Ints
 
 
@@ -72,3 +74,8 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
     counts = member @ present.astype(np.float64)
     return np.where(counts > 0, totals / np.where(counts > 0, counts, 1.0), np.nan) + shift
+
+
+def listed(names: Sequence[str], chosen: NDArray[np.bool_]) -> str:
+    """Join the chosen names [K] for a message."""
+    return listing([name for name, take in zip(names, chosen, strict=True) if take])

@@ -229,7 +229,7 @@ def _each(left: Floats, right: Floats, one: Callable[[Floats, Floats], float]) -
 def _sorted_tau_b(x: Floats, y: Floats) -> float:
     from scipy.stats import kendalltau
 
-    return float(kendalltau(x, y)[0])
+    return float(np.asarray(kendalltau(x, y))[0])
 
 
 def _sorted_tau_a(x: Floats, y: Floats) -> float:

@@ -19,10 +19,12 @@ from brainbench.metrics._pairs import Floats
 from brainbench.types import Status
 
 RELIABILITY_GATE = 0.5
-"""Smallest Spearman-Brown reliability of an RDM whose corrected score is trusted.
+"""Smallest Spearman-Brown reliability of an animal's RDM whose corrected score is trusted.
 
-Below it half of the variance of the RDM is noise and every published way of averaging the ratio is
-biased; with six stimuli the bias of ours at the gate is stated in ``tests/metrics/test_noise.py``.
+From 13,258 simulated animals (6 stimuli, 60 units, 20 trials each, true r about .74): with estimated
+reliability in .5–.6 the bias of ``default`` is +.02 and the root mean square error of one animal .21;
+in .3–.4 it is .35, in .1–.2 .65 with a bias of +.28, in 0–.1 3.3 with a bias of +1.1. The mean and the
+median of ratios fare no better there, so a low reliability is reported instead of corrected cleverly.
 """
 
 THESIS_FILTER = 0.5

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.errors import DataError, UsageError, listing, unknown_name
+from brainbench.errors import DataError, UsageError, unknown_name
 from brainbench.metrics._distances import correlation_distances, product_distances
-from brainbench.metrics._labels import response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics._labels import listed, response_matrix, stimulus_codes, stimulus_means
 from brainbench.metrics._pairs import Floats, Ints
 
 POISSON_PRIOR_MEAN = 1.0
@@ -90,15 +90,15 @@ def rdm_problem(responses: ArrayLike, labels: ArrayLike | None = None) -> str | 
         patterns = stimulus_means(matrix, codes, len(names))
         empty = ~np.isfinite(patterns).any(axis=1)
         if empty.any():
-            return f"no trials of stimulus {listing(np.asarray(names)[empty])}"
+            return f"no trials of stimulus {listed(names, empty)}"
     broken = ~np.isfinite(patterns).all(axis=1)
     if labels is None and broken.any():
-        return f"activations that are not finite for stimulus {listing(np.asarray(names)[broken])}"
+        return f"activations that are not finite for stimulus {listed(names, broken)}"
     with np.errstate(invalid="ignore"):
         spread = np.nanmax(patterns, axis=1) - np.nanmin(patterns, axis=1)
         constant = spread <= 8 * np.finfo(np.float64).eps * np.nanmax(np.abs(patterns), axis=1)
     if constant.any():
-        return f"a constant response across units to stimulus {listing(np.asarray(names)[constant])}"
+        return f"a constant response across units to stimulus {listed(names, constant)}"
     return None
 
 

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.errors import DataError, UsageError, listing, unknown_name
+from brainbench.errors import DataError, UsageError, unknown_name
 from brainbench.metrics._distances import correlation_distances, product_distances
 from brainbench.metrics._hashing import Hashes, content_hashes, draws, key_hashes
-from brainbench.metrics._labels import response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics._labels import listed, response_matrix, stimulus_codes, stimulus_means
 from brainbench.metrics._pairs import Floats, Ints
 from brainbench.metrics.compare import check_comparison, compare
 from brainbench.metrics.noise import spearman_brown
@@ -195,7 +195,7 @@ def _usable(
         notes.append(f"{dropped} units or bins left out: recorded in fewer than 2 trials of some stimulus")
     problem = None
     if (total == 0).any():
-        problem = f"no trials of {listing(np.asarray(names)[total == 0])}"
+        problem = f"no trials of {listed(names, total == 0)}"
     elif not sessions:
         problem = f"no session can be split into halves: {'; '.join(sorted(set(lacking)))}"
     return sessions, problem, tuple(notes)
