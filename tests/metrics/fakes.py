@@ -1,0 +1,37 @@
+"""Animals and models with a known geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brainbench.metrics import SubjectRDM, TrialBlock, rdm, spearman_brown
+
+STIMULI = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
+
+
+def make_latent(seed=0, stimuli=6, dims=4):
+    return np.random.default_rng(seed).normal(size=(stimuli, dims))
+
+
+def make_block(latent, seed=0, units=20, repeats=8, noise=1.0, keys=True, gap=()):
+    """One session: units with random tuning to the latent stimuli, trials with unit noise."""
+    rng = np.random.default_rng(seed)
+    means = latent @ rng.normal(size=(latent.shape[1], units))
+    labels = rng.permutation(np.repeat([k for k in range(len(latent)) if k not in gap], repeats))
+    responses = means[labels] + noise * rng.normal(size=(len(labels), units))
+    return TrialBlock(responses, labels, [f"{seed}/{trial}" for trial in range(len(labels))] if keys else None)
+
+
+def make_subject(name, brain_rdm, reliability=0.9, splits=20, seed=0, **extra):
+    """An animal with a given RDM and split halves that agree by a given reliability."""
+    rng = np.random.default_rng(seed)
+    half = reliability / (2 - reliability)
+    r = half + 0.02 * rng.normal(size=splits)
+    halves = np.stack([np.stack([brain_rdm, brain_rdm]) + 0.05 * rng.normal(size=(2, len(brain_rdm))) for _ in r])
+    found = float(spearman_brown(r.mean()))
+    return SubjectRDM(name, brain_rdm, r - r.mean() + half, halves, 10, 60, reliability=found, **extra)
+
+
+def make_rdm(rng, stimuli=6, units=12):
+    """The RDM of unrelated patterns."""
+    return rdm(rng.normal(size=(stimuli, units)))
