@@ -79,11 +79,15 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
         raise DataFileNotFoundError(f"There is no result record {os.fspath(path)!r}.") from error
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{os.fspath(path)!r} cannot be read as UTF-8 text ({error}).") from error
-    record = _parse(text, path)
+    try:
+        record = _parse(text, path)
+        identity = record.identity
+    except RecursionError as error:
+        raise DataError(f"{path.name!r} is nested too deeply to be a result record.") from error
     named = path.stem.rpartition("--")[2]
-    if named != record.identity:
+    if named != identity:
         raise DataError(
-            f"{path.name!r} was edited or renamed: its content has the hash {record.identity}, its name says "
+            f"{path.name!r} was edited or renamed: its content has the hash {identity}, its name says "
             f"{named!r}; restore the original file or score the model again."
         )
     return record
@@ -125,7 +129,7 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
 def _parse(text: str, path: Path) -> ResultRecord:
     try:
         data = json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise DataError(f"{path.name!r} is not valid JSON ({error}).") from error
     version = data.get("schema") if isinstance(data, dict) else None
     # The version comes first: an older layout should be called old, not faulty.

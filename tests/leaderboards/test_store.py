@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import doctest
+import importlib
 import json
 import math
 import multiprocessing
@@ -85,7 +87,8 @@ def test_names_that_share_a_slug_do_not_share_a_file(make_record, tmp_path):
         (lambda text: text.replace('"schema": 1', '"schema": 7'), "schema version 7; this brainbench reads version 1"),
         (lambda text: text.replace('"schema": 1', '"schema": "x"'), "schema is 'x'; expected 1"),
         (lambda text: text.replace('"status": "ok"', '"status": "fine"'), "expected one of 'ok'"),
-        (lambda text: "[" * 100_000, "is not valid JSON"),
+        (lambda text: "[" * 100_000, "is nested too deeply"),
+        (lambda text: text.replace('"numpy": "2.3.1"', '"x":' + "[" * 400 + "]" * 400), "is nested too deeply"),
         (lambda text: "[1, 2]", "is not a result record: the record is [1, 2]; expected an object"),
         (lambda text: text.replace('"value": 0.523', '"value": null'), "the status is 'ok' but the value is nan"),
         (lambda text: text.replace('"convex-far",', ""), "model_rdm has 15 pairs but 5 stimuli make 10"),
@@ -172,3 +175,10 @@ def test_concurrent_writers_lose_nothing(make_record, tmp_path):
     assert [writer.exitcode for writer in writers] == [0] * 4
     assert sorted(item.name for item in tmp_path.iterdir()) == sorted(map(record_name, records))
     assert all(item.problem is None for item in read_records(tmp_path))
+
+
+@pytest.mark.parametrize("module", ["schema", "store", "ranking"])
+def test_the_examples_in_the_docstrings_hold(module):
+    result = doctest.testmod(importlib.import_module(f"leaderboards.{module}"))
+    assert result.attempted > 0
+    assert result.failed == 0
