@@ -126,13 +126,19 @@ class Mesh:
         Raises:
             DataError: the mesh is flat and has no volume.
         """
-        from scipy.spatial import QhullError
+        from scipy.spatial import ConvexHull
 
-        try:
-            hull = self.to_trimesh().convex_hull
-        except QhullError as error:
-            raise DataError(f"The mesh {self.name!r} has no volume: its points lie in a plane.") from error
-        return Mesh(np.asarray(hull.vertices), np.asarray(hull.faces), self.name)
+        spread = np.linalg.svd(self.vertices - self.vertices.mean(axis=0), compute_uv=False)
+        if spread[2] < 1e-9 * spread[0]:
+            raise DataError(f"The mesh {self.name!r} has no volume: its points lie in a plane.")
+        hull = ConvexHull(self.vertices)
+        faces = np.array(hull.simplices)
+        # Qhull orders the corners of a facet as it likes; its equations know the way out.
+        first, second, third = (self.vertices[faces[:, corner]] for corner in range(3))
+        inward = np.einsum("fi,fi->f", np.cross(second - first, third - first), hull.equations[:, :3]) < 0
+        faces[inward] = faces[inward][:, ::-1]
+        used, renumbered = np.unique(faces, return_inverse=True)
+        return Mesh(self.vertices[used], renumbered.reshape(-1, 3), self.name)
 
     def to_trimesh(self) -> trimesh.Trimesh:
         """Return a :class:`trimesh.Trimesh` with the same vertices and faces."""
@@ -165,5 +171,6 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
         raise DataError(f"{os.fspath(path)!r} cannot be read as a mesh ({error}).") from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise DataError(f"{os.fspath(path)!r} holds no triangles.")
-    loaded.merge_vertices(merge_tex=True, merge_norm=True)
-    return Mesh(np.asarray(loaded.vertices) * UNITS[unit], np.asarray(loaded.faces), path.stem)
+    # Exactly equal vertices only: a tolerance would depend on the unit.
+    vertices, merged = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_inverse=True)
+    return Mesh(vertices * UNITS[unit], merged.reshape(-1)[np.asarray(loaded.faces)], path.stem)

@@ -101,8 +101,8 @@ def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimu
     if whiskers != "all":
         names = [str(name) for name in dataset["whisker"].values]
         rows, cols = dataset["row"].values.tolist(), dataset["col"].values.tolist()
-        dataset = dataset.isel(whisker=match_whiskers(whiskers, names, rows, cols))
-        dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
+        chosen = dataset.isel(whisker=match_whiskers(whiskers, names, rows, cols))
+        dataset = chosen.assign_attrs(content_hash=hash_stimulus_set(chosen))
     labels = tuple(str(label) for label in dataset["stimulus"].values)
     return Stimuli(labels, to_grid(dataset), dataset, dataset.attrs["content_hash"], description)
 

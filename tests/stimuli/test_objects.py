@@ -1,0 +1,155 @@
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from brainbench.errors import DataError, UsageError
+from brainbench.geometry import load_mesh
+from brainbench.stimuli.motion import Translation
+from brainbench.stimuli.objects import (
+    RODGERS_CONTROL,
+    PlacedObject,
+    box,
+    capsule,
+    cylinder,
+    euler_matrix,
+    mesh_solid,
+    move_part,
+    rodgers_solid,
+    sphere,
+)
+from brainbench.stimuli.obstacle import rotation_matrix
+
+SOLIDS = [sphere(2e-3), box((1e-3, 2e-3, 3e-3)), cylinder(1e-3, 5e-3), capsule(1e-3, 4e-3), rodgers_solid(segments=4)]
+
+
+def _distances(mesh, points):
+    """Distance of points to a surface, in millimetres (trimesh's tolerances are absolute)."""
+    surface = mesh.scaled(1e3).to_trimesh()
+    return trimesh.proximity.closest_point_naive(surface, points * 1e3)[1]
+
+
+def _samples(mesh, count=400):
+    surface = mesh.scaled(1e3).to_trimesh()
+    return np.vstack([trimesh.sample.sample_surface(surface, count, seed=0)[0] / 1e3, mesh.vertices])
+
+
+@pytest.mark.shared
+def test_the_rodgers_solid_is_the_published_mesh_within_a_thousandth_of_its_diagonal(reference):
+    published = load_mesh(reference / "stimuli" / "convex-shape.obj", unit="m").to_diagonal(0.055)
+    ours = rodgers_solid().mesh
+    there, back = _distances(ours, _samples(published)), _distances(published, _samples(ours))
+    hausdorff = max(there.max(), back.max())
+    assert hausdorff < 1e-3 * 55
+    assert ours.to_trimesh().volume == pytest.approx(abs(published.to_trimesh().volume), rel=1e-4)
+
+
+@pytest.mark.shared
+def test_the_rodgers_curve_passes_through_the_published_vertices(reference):
+    published = load_mesh(reference / "stimuli" / "convex-shape.obj", unit="m")
+    t = np.linspace(0, 1, 101)[:, None]
+    weights = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
+    curve = weights @ np.array(RODGERS_CONTROL)
+    gaps = np.linalg.norm(published.vertices[:, None, :2] - curve, axis=-1).min(axis=0)
+    assert gaps.max() < 3e-6
+
+
+def test_the_rodgers_solid_is_closed_and_outward():
+    mesh = rodgers_solid().mesh
+    assert mesh.diagnosis.watertight
+    assert not mesh.diagnosis.inconsistent
+    assert mesh.to_trimesh().volume > 0
+    assert mesh.diagonal == pytest.approx(0.055)
+
+
+def test_the_parts_of_the_rodgers_solid_fill_exactly_its_volume_and_keep_it_concave():
+    solid = rodgers_solid()
+    volume = sum(ConvexHull(part.vertices).volume for part in solid.parts)
+    assert volume == pytest.approx(solid.mesh.to_trimesh().volume, rel=1e-9)
+    assert volume < 0.5 * solid.mesh.hull().to_trimesh().volume
+
+
+def test_twenty_four_segments_leave_a_sagitta_below_two_hundredths_of_a_millimetre():
+    assert _distances(rodgers_solid().mesh, rodgers_solid(segments=200).mesh.vertices).max() < 0.02
+
+
+def test_the_rodgers_solid_refuses_a_single_segment():
+    with pytest.raises(UsageError, match="at least 2 segments"):
+        rodgers_solid(segments=1)
+
+
+@pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: solid.name)
+def test_scaling_to_a_diagonal_scales_everything(solid):
+    scaled = solid.to_diagonal(0.04)
+    assert scaled.diagonal == pytest.approx(0.04)
+    np.testing.assert_allclose(scaled.bounds, solid.bounds * 0.04 / solid.diagonal)
+
+
+@settings(max_examples=25)
+@given(
+    st.sampled_from(SOLIDS),
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+)
+def test_expressing_an_object_in_another_frame_and_back_is_expressing_it_in_the_world(solid, turn, place, axes, origin):
+    placed = PlacedObject(solid, position=place, rotation=turn)
+    frame = euler_matrix(axes)
+    world = placed.obstacle().parts
+    seen = placed.obstacle((frame, origin)).parts
+    for there, here in zip(world, seen, strict=True):
+        np.testing.assert_allclose(move_part(here, frame, np.array(origin)).bounds(), there.bounds(), atol=1e-12)
+
+
+def test_euler_angles_turn_about_fixed_x_then_y_then_z():
+    angles = (0.3, -0.7, 1.1)
+    np.testing.assert_allclose(euler_matrix(angles), Rotation.from_euler("xyz", angles).as_matrix(), atol=1e-15)
+
+
+def test_a_turned_box_has_the_corners_of_the_turned_corners():
+    placed = PlacedObject(box((2e-3, 4e-3, 6e-3)), rotation=(0.0, 0.0, 0.4))
+    part = placed.obstacle().parts[0]
+    np.testing.assert_allclose(rotation_matrix(part.quaternion), euler_matrix((0, 0, 0.4)), atol=1e-12)
+
+
+def test_a_moving_object_is_carried_in_the_frame_it_is_seen_from():
+    frame = euler_matrix((0, 0, np.pi / 2))
+    placed = PlacedObject(sphere(1e-3), motion=Translation((0.03, 0.0, 0.0), onset=0.0))
+    position, quaternion = placed.obstacle((frame, (0, 0, 0))).motion(np.array([0.0, 0.5]))
+    np.testing.assert_allclose(position, [[0, 0, 0], [0, -0.015, 0]], atol=1e-15)
+    np.testing.assert_allclose(quaternion, [[1, 0, 0, 0]] * 2)
+
+
+def test_a_mesh_is_touched_at_its_hull_and_says_when_that_fills_a_concavity(tmp_path):
+    path = tmp_path / "crescent.stl"
+    rodgers_solid().mesh.to_trimesh().export(path)
+    solid = mesh_solid(path, unit="m", diagonal=0.03)
+    assert solid.diagonal == pytest.approx(0.03)
+    assert any("concavities" in note for note in solid.notes)
+    cube = tmp_path / "cube.stl"
+    trimesh.creation.box().export(cube)
+    assert mesh_solid(cube, unit="mm").notes == ()
+
+
+def test_an_open_mesh_says_so(tmp_path):
+    path = tmp_path / "open.obj"
+    cube = trimesh.creation.box()
+    trimesh.Trimesh(cube.vertices, cube.faces[:-2]).export(path)
+    assert any("not watertight" in note for note in mesh_solid(path, unit="mm").notes)
+
+
+def test_a_flat_mesh_cannot_be_touched(tmp_path):
+    path = tmp_path / "sheet.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
+    with pytest.raises(DataError, match="no volume"):
+        mesh_solid(path, unit="m")
+
+
+def test_the_configuration_of_a_solid_changes_with_its_geometry_only():
+    assert rodgers_solid().config() == rodgers_solid().config()
+    assert rodgers_solid().config() != rodgers_solid(0.05).config()
+    assert sphere(1e-3).config() != sphere(2e-3).config()

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from brainbench.errors import DataError, UsageError
+from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.stimuli.readout import to_frame, to_grid
+from brainbench.stimuli.scene import Frames, Scene
+from brainbench.stimuli.simulation import simulate
+
+from .fakes import FakeBackend
+
+
+def _dataset(whiskers="all", side="right", count=110, unstable=None):
+    scenes = [
+        Scene(label, WhiskerArray.mouse(side=side, whiskers=whiskers), frames=Frames(count=count)) for label in "ab"
+    ]
+    return simulate(scenes, fidelity=Fidelity(), backend=FakeBackend(unstable))
+
+
+def test_a_hundred_and_ten_frames_become_twenty_two_steps_of_thirty_channels():
+    dataset = _dataset()
+    grid = to_grid(dataset)
+    assert grid.shape == (2, 22, 30, 5, 7)
+    assert grid.dtype == np.float32
+
+
+def test_frame_channel_and_whisker_find_their_place():
+    dataset = _dataset()
+    grid = to_grid(dataset)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        k, frame, w, c = rng.integers([2, 110, 30, 6])
+        row, col = int(dataset["row"][w]), int(dataset["col"][w])
+        step, substep = divmod(int(frame), 5)
+        assert grid[k, step, substep * 6 + c, row, col] == dataset["wrench"].values[k, frame, w, c]
+
+
+def test_cells_without_a_whisker_are_zero():
+    grid = to_grid(_dataset()).reshape(2, 22, 30, 35)
+    assert (grid[..., [5, 6, 12, 13, 34]] == 0).all()
+    assert (np.abs(grid).max(axis=(0, 1, 2))[[0, 14, 28]] > 0).all()
+
+
+def test_whiskers_that_were_not_simulated_are_zero_and_the_others_as_in_the_full_set():
+    full, few = to_grid(_dataset()), to_grid(_dataset("C0-C3"))
+    np.testing.assert_array_equal(few[..., 2, :4], full[..., 2, :4])
+    few[..., 2, :4] = 0
+    assert (few == 0).all()
+
+
+def test_other_sub_steps_divide_time_otherwise():
+    assert to_grid(_dataset(), substeps=1).shape == (2, 110, 6, 5, 7)
+    with pytest.raises(UsageError, match="110 frames do not divide into time steps of 4 sub-steps"):
+        to_grid(_dataset(), substeps=4)
+
+
+def test_both_sides_do_not_fit_one_grid():
+    with pytest.raises(UsageError, match="two whiskers in one cell .both sides."):
+        to_grid(_dataset(side="both", whiskers="C2"))
+
+
+def test_an_unstable_whisker_is_refused_unless_zero_is_asked_for():
+    dataset = _dataset("C1,C2", unstable={0: "blew up"})
+    with pytest.raises(DataError, match=r"became unstable .*C1 in a.* finer fidelity"):
+        to_grid(dataset)
+    grid = to_grid(dataset, unstable="zero")
+    assert np.isfinite(grid).all()
+    assert (grid[0, -1, :, 2, 1] == 0).all()
+
+
+def test_the_tidy_table_holds_every_number_once():
+    dataset = _dataset("C1,C2", count=10)
+    table = to_frame(dataset)
+    assert len(table) == 2 * 10 * 2
+    assert list(table.columns[:5]) == ["stimulus", "time", "whisker", "row", "col"]
+    row = table[(table.stimulus == "b") & (table.whisker == "C2")].sort_values("time").iloc[3]
+    assert row["Mz"] == dataset["wrench"].sel(stimulus="b", whisker="C2", channel="Mz").values[3]
+    assert row["time"] == pytest.approx(0.028)
+    assert {"contact", "contact_arc", "status"} <= set(table.columns)

@@ -1,0 +1,159 @@
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.stimuli.motion import ROTATIONS, Still, Translation
+from brainbench.stimuli.obstacle import Cylinder
+from brainbench.stimuli.scene_files import load_scene
+
+POLE = """
+description = "a pole"
+[array]
+species = "rat"
+side = "left"
+whiskers = "C*"
+[array.replace.C2]
+young_modulus = 3.3e9
+[head]
+position_mm = [1, 2, 3]
+rotation_deg = [0, 90, 0]
+[whisking]
+frequency_hz = 8
+rotations = "knutsen-b"
+[frames]
+first_ms = 0
+interval_ms = 1
+count = 10
+[[object]]
+shape = "box"
+size_mm = [1, 2, 3]
+[[scene]]
+label = "near"
+[[scene.object]]
+shape = "cylinder"
+radius_mm = 0.5
+height_mm = 20
+position_mm = [14, 5, 0]
+friction = 0.3
+velocity_mm_s = [0, -30, 0]
+[[scene]]
+label = "free"
+[scene.whisking]
+kind = "still"
+[scene.head]
+position_mm = [0, 0, 0]
+"""
+
+
+def _write(tmp_path, text, name="pole.toml"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_scene_file_becomes_scenes_in_si_units(tmp_path):
+    recipe = load_scene(_write(tmp_path, POLE))
+    near, free = recipe.scenes
+    assert (recipe.name, recipe.description, recipe.labels) == ("pole", "a pole", ("near", "free"))
+    assert near.array.species == "rat"
+    assert near.array.side == "left"
+    assert near.array.names == tuple(f"C{col}" for col in range(7))
+    assert near.array["C2"].whisker.young_modulus == 3.3e9
+    assert near.whisking.frequency == 8
+    assert near.whisking.rotations == ROTATIONS["knutsen-b"]
+    assert near.frames.times == pytest.approx(np.arange(10) * 1e-3)
+    assert near.head.position == pytest.approx((1e-3, 2e-3, 3e-3))
+    assert near.head.rotation[1] == pytest.approx(math.pi / 2)
+    box, pole = near.objects
+    assert box.solid.bounds[1] == pytest.approx([0.5e-3, 1e-3, 1.5e-3])
+    assert isinstance(pole.solid.parts[0], Cylinder)
+    assert pole.position == pytest.approx((0.014, 0.005, 0))
+    assert pole.friction == 0.3
+    assert pole.motion == Translation((0.0, -0.03, 0.0))
+
+
+def test_a_scene_overrides_shared_tables_key_by_key(tmp_path):
+    near, free = load_scene(_write(tmp_path, POLE)).scenes
+    assert free.whisking == Still()
+    assert free.head.position == (0, 0, 0)
+    assert free.head.rotation == near.head.rotation
+    assert len(free.objects) == 1
+
+
+def test_whiskers_can_be_chosen_at_loading(tmp_path):
+    assert load_scene(_write(tmp_path, POLE), whiskers="C1-C2").scenes[0].array.names == ("C1", "C2")
+
+
+def test_a_mesh_is_found_beside_the_file(tmp_path):
+    trimesh.creation.box(extents=(1, 1, 1)).export(tmp_path / "cube.stl")
+    text = (
+        '[[scene]]\nlabel = "cube"\n[[scene.object]]\nshape = "mesh"\npath = "cube.stl"\nunit = "cm"\ndiagonal_mm = 20'
+    )
+    (scene,) = load_scene(_write(tmp_path, text)).scenes
+    assert scene.objects[0].solid.diagonal == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"pole\.toml: the file has no \[\[scene\]\]"),
+        ("[[scene]]\n", r"\[\[scene\]\] needs the key 'label'"),
+        (
+            'descripton = "x"\n[[scene]]\nlabel="a"',
+            r"Unknown key of the scene file 'descripton'; did you mean 'description'",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[scene.whisking]\nfrequency = 3',
+            r"key of \[whisking\] 'frequency'; did you mean 'frequency_hz'",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[scene.whisking]\nfrequency_hz = "3"',
+            r"'frequency_hz' of \[whisking\] must be a finite number",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[scene.whisking]\nkind = "sinusoidal"',
+            "Unknown kind of whisking 'sinusoidal'; did you mean 'sinusoid'",
+        ),
+        ('[[scene]]\nlabel="a"\n[scene.whisking]\nrotations = "knutson"', "did you mean 'knutsen'"),
+        (
+            '[[scene]]\nlabel="a"\n[scene.head]\nposition_mm = [1, 2]',
+            r"'position_mm' of \[head\] must be three numbers in brackets",
+        ),
+        ('[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "spere"', "Unknown shape 'spere'; did you mean 'sphere'"),
+        (
+            '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"',
+            r"\[\[object\]\] of scene 'a' needs the key 'radius_mm'",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = -1',
+            "radius of a sphere must be positive",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = 1\ncolour = "red"',
+            "Unknown key of .*'colour'",
+        ),
+        ('[[scene]]\nlabel="a"\n[[scene]]\nlabel="a"', "several scenes have the label 'a'"),
+        ('[array]\nspecies = "mous"\n[[scene]]\nlabel="a"', "Unknown species 'mous'; did you mean 'mouse'"),
+        ('[array]\nwhiskers = "C9"\n[[scene]]\nlabel="a"', "Unknown whisker 'C9'"),
+        ('[frames]\ncount = 1.5\n[[scene]]\nlabel="a"', r"'count' of \[frames\] must be a whole number"),
+        ("scene = 3", "must be a list of tables"),
+        ("array = 3", "must be a table"),
+    ],
+)
+def test_mistakes_in_a_scene_file_are_named_with_the_file(tmp_path, text, message):
+    with pytest.raises(UsageError, match=message) as caught:
+        load_scene(_write(tmp_path, text))
+    assert "pole.toml" in str(caught.value)
+
+
+def test_a_file_that_is_not_toml_is_refused(tmp_path):
+    with pytest.raises(DataError, match="cannot be read as TOML"):
+        load_scene(_write(tmp_path, "= ="))
+
+
+def test_a_missing_scene_file_is_named(tmp_path):
+    with pytest.raises(DataFileNotFoundError, match=r"no scene file .*gone\.toml"):
+        load_scene(tmp_path / "gone.toml")

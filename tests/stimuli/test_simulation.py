@@ -1,0 +1,172 @@
+import dataclasses
+import logging
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from brainbench.errors import UsageError
+from brainbench.stimuli import simulation
+from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.stimuli.motion import Still, Translation, Whisking
+from brainbench.stimuli.objects import PlacedObject, euler_matrix, sphere
+from brainbench.stimuli.scene import Frames, Head, Scene
+from brainbench.stimuli.simulation import simulate
+from brainbench.types import check_stimulus_set
+
+from .fakes import FakeBackend
+
+ARRAY = WhiskerArray.mouse(whiskers="C1,C2,D6")
+FRAMES = Frames(0.0, 0.01, 10)
+NEAR = PlacedObject(sphere(2e-3), position=(0.015, 0.002, 0.003))
+FAR = PlacedObject(sphere(2e-3), position=(1.0, 0.0, 0.0))
+
+
+def _scene(label="one", **changes):
+    return Scene(label, **{"array": ARRAY, "objects": (NEAR,), "frames": FRAMES, **changes})
+
+
+def _simulate(scenes, backend=None, **options):
+    return simulate(scenes, fidelity=Fidelity(), backend=backend or FakeBackend(), **options)
+
+
+@pytest.fixture
+def engine(monkeypatch, tmp_path):
+    """The double, found by name so that results are cached, in a cache of its own."""
+    backend = FakeBackend()
+    monkeypatch.setattr(simulation, "get_backend", lambda name: backend)
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    return backend
+
+
+def test_the_result_is_a_stimulus_set_with_contacts_and_status():
+    dataset = check_stimulus_set(_simulate([_scene("a"), _scene("b", objects=())]))
+    assert dataset["wrench"].shape == (2, 10, 3, 6)
+    assert dataset["wrench"].dtype == np.float32
+    assert dataset["contact"].dtype == bool
+    assert dataset["contact"].dims == dataset["contact_arc"].dims == ("stimulus", "time", "whisker")
+    assert (dataset["status"] == "ok").all()
+    assert list(dataset["whisker"].values) == ["C1", "C2", "D6"]
+    assert list(dataset["row"].values) == [2, 2, 3]
+    assert list(dataset["col"].values) == [1, 2, 6]
+    np.testing.assert_allclose(dataset["time"], FRAMES.times)
+
+
+def test_wrenches_are_turned_from_the_array_to_the_world():
+    turn = (0.2, -0.4, 0.7)
+    straight = _simulate(_scene(objects=()))["wrench"].values
+    turned = _simulate(_scene(objects=(), head=Head((1.0, 2.0, 3.0), turn)))["wrench"].values
+    matrix = euler_matrix(turn)
+    np.testing.assert_allclose(turned[..., :3], straight[..., :3] @ matrix.T, atol=1e-8)
+    np.testing.assert_allclose(turned[..., 3:], straight[..., 3:] @ matrix.T, atol=1e-6)
+
+
+def test_a_whisker_that_reaches_nothing_is_simulated_once_for_all_scenes():
+    backend = FakeBackend()
+    dataset = _simulate([_scene("a"), _scene("b", objects=(FAR,)), _scene("c", objects=())], backend)
+    # C1 and C2 reach the near ball in one scene; D6 is too short everywhere.
+    assert len(backend.jobs) == 3 + 2
+    np.testing.assert_array_equal(dataset["wrench"][1], dataset["wrench"][2])
+
+
+def test_a_whisker_that_moves_otherwise_is_simulated_again():
+    backend = FakeBackend()
+    _simulate([_scene("a", objects=()), _scene("b", objects=(), whisking=Still())], backend)
+    assert len(backend.jobs) == 6
+    backend = FakeBackend()
+    moving = Head(motion=Translation((0.01, 0.0, 0.0)))
+    _simulate([_scene("a", objects=()), _scene("b", objects=(), head=moving)], backend)
+    assert len(backend.jobs) == 6
+
+
+def test_an_unstable_whisker_is_flagged_and_said_aloud(caplog):
+    with caplog.at_level(logging.WARNING):
+        dataset = _simulate(_scene(), FakeBackend(unstable={1: "energy grew"}))
+    assert list(dataset["status"].values[0]) == ["ok", "unstable", "ok"]
+    assert dataset["reason"].values[0, 1] == "energy grew"
+    assert np.isnan(dataset["wrench"].sel(whisker="C2")).any()
+    assert "whisker C2 became unstable in one: energy grew" in caplog.text
+
+
+def test_progress_counts_the_whiskers_simulated():
+    calls = []
+    _simulate(_scene(), progress=lambda *call: calls.append(call))
+    assert calls == [(1, 3, "simulating whiskers"), (2, 3, "simulating whiskers"), (3, 3, "simulating whiskers")]
+
+
+def test_a_second_request_comes_from_the_cache(engine):
+    first = _simulate(_scene(), "fake")
+    ran = len(engine.jobs)
+    second = _simulate(_scene(), "fake")
+    assert len(engine.jobs) == ran
+    xr.testing.assert_identical(first, second)
+    _simulate(_scene(), "fake", cache=False)
+    assert len(engine.jobs) == 2 * ran
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"whisking": Whisking(frequency=19.0)},
+        {"objects": (dataclasses.replace(NEAR, friction=0.1),)},
+        {"array": ARRAY.replace("C2", young_modulus=4e9)},
+        {"array": ARRAY.replace("C2", position=(0.0, 0.0, 0.0))},
+        {"head": Head((0.0, 0.0, 1e-4))},
+        {"frames": Frames(0.0, 0.01, 11)},
+        {"label": "other"},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_whatever_changes_the_result_changes_the_place_in_the_cache(engine, changed):
+    first = _simulate(_scene(), "fake")
+    ran = len(engine.jobs)
+    second = _simulate(_scene(**changed), "fake")
+    assert len(engine.jobs) > ran
+    assert first.attrs["content_hash"] != second.attrs["content_hash"]
+
+
+def test_fidelity_changes_the_place_in_the_cache(engine):
+    simulate(_scene(), fidelity=Fidelity(links=10), backend="fake")
+    ran = len(engine.jobs)
+    simulate(_scene(), fidelity=Fidelity(links=11), backend="fake")
+    assert len(engine.jobs) == 2 * ran
+
+
+@pytest.mark.parametrize("damage", [b"", b"not HDF5 at all", None])
+def test_a_damaged_cache_file_is_made_again(engine, tmp_path, caplog, damage):
+    first = _simulate(_scene(), "fake")
+    (path,) = (tmp_path / "stimuli").glob("*.h5")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
+    with caplog.at_level(logging.WARNING):
+        again = _simulate(_scene(), "fake")
+    assert "damaged" in caplog.text
+    xr.testing.assert_identical(first, again)
+    assert len(engine.jobs) == 6
+
+
+def test_a_changed_number_in_the_cache_is_noticed(engine, tmp_path, caplog):
+    import h5py
+
+    _simulate(_scene(), "fake")
+    (path,) = (tmp_path / "stimuli").glob("*.h5")
+    with h5py.File(path, "r+") as file:
+        file["wrench"][0, 0, 0, 0] = 7.0
+    with caplog.at_level(logging.WARNING):
+        assert _simulate(_scene(), "fake")["wrench"].values[0, 0, 0, 0] != 7.0
+    assert "do not match the content hash" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("scenes", "message"),
+    [
+        ([], "no scene to simulate"),
+        ([_scene("a"), _scene("a")], "labels of the scenes must differ"),
+        ([_scene("a"), _scene("b", array=ARRAY.select("C1"))], "'a' and 'b' have different whiskers"),
+        ([_scene("a"), _scene("b", frames=Frames())], "'a' and 'b' are read at different times"),
+    ],
+)
+def test_scenes_that_do_not_fit_together_are_refused(scenes, message):
+    with pytest.raises(UsageError, match=message):
+        _simulate(scenes)

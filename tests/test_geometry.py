@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+import trimesh
+
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.geometry import Mesh, load_mesh
+
+
+def _cube_file(tmp_path, name="cube.obj"):
+    path = tmp_path / name
+    trimesh.creation.box(extents=(1.0, 2.0, 3.0)).export(path)
+    return path
+
+
+def test_a_mesh_comes_in_metres(tmp_path):
+    mesh = load_mesh(_cube_file(tmp_path), unit="mm")
+    np.testing.assert_allclose(mesh.bounds[1] - mesh.bounds[0], [1e-3, 2e-3, 3e-3])
+    assert mesh.diagonal == pytest.approx(np.sqrt(14) * 1e-3)
+
+
+@pytest.mark.parametrize("name", ["cube.stl", "cube.ply", "cube.off", "cube.glb"])
+def test_formats_that_repeat_vertices_still_give_a_closed_solid(tmp_path, name):
+    mesh = load_mesh(_cube_file(tmp_path, name), unit="m")
+    assert len(mesh.vertices) == 8
+    assert mesh.diagnosis.watertight
+    assert str(mesh.diagnosis) == "watertight"
+
+
+def test_a_hole_is_diagnosed():
+    cube = trimesh.creation.box()
+    mesh = Mesh(cube.vertices, cube.faces[:-1])
+    assert not mesh.diagnosis.watertight
+    assert "3 open edges (not watertight)" in str(mesh.diagnosis)
+
+
+def test_triangles_without_area_are_counted():
+    cube = trimesh.creation.box()
+    mesh = Mesh(cube.vertices, np.vstack([cube.faces, [[0, 1, 1]]]))
+    assert mesh.diagnosis.degenerate_faces == 1
+
+
+def test_separate_pieces_are_counted():
+    cube = trimesh.creation.box()
+    vertices = np.vstack([cube.vertices, cube.vertices + 5])
+    mesh = Mesh(vertices, np.vstack([cube.faces, cube.faces + 8]))
+    assert mesh.diagnosis.bodies == 2
+
+
+def test_equal_meshes_have_equal_hashes_and_a_moved_vertex_changes_it():
+    cube = trimesh.creation.box()
+    mesh = Mesh(cube.vertices, cube.faces, "one")
+    assert mesh.content_hash == Mesh(cube.vertices, cube.faces, "two").content_hash
+    moved = np.array(cube.vertices)
+    moved[0, 0] += 1e-9
+    assert Mesh(moved, cube.faces).content_hash != mesh.content_hash
+
+
+def test_scaling_to_a_diagonal_keeps_the_proportions():
+    mesh = Mesh(trimesh.creation.box(extents=(1, 2, 3)).vertices, trimesh.creation.box().faces)
+    small = mesh.to_diagonal(0.055)
+    assert small.diagonal == pytest.approx(0.055)
+    np.testing.assert_allclose(small.vertices / mesh.vertices, 0.055 / np.sqrt(14))
+
+
+def test_the_hull_of_a_dented_solid_is_larger():
+    cube = trimesh.creation.box()
+    inside = np.vstack([cube.vertices, [[0, 0, 0]]])
+    hull = Mesh(inside, np.vstack([cube.faces, [[0, 1, 8]]])).hull()
+    assert hull.to_trimesh().volume == pytest.approx(1.0)
+    assert len(hull.vertices) == 8
+
+
+def test_a_flat_mesh_has_no_hull():
+    flat = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]], "sheet")
+    with pytest.raises(DataError, match="'sheet' has no volume"):
+        flat.hull()
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        ([[0, 0, 0]], [], "has no faces"),
+        ([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], "not finite"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 3]], "missing vertices"),
+    ],
+)
+def test_impossible_meshes_are_refused(vertices, faces, message):
+    with pytest.raises(DataError, match=message):
+        Mesh(vertices, faces)
+
+
+def test_an_unknown_unit_names_the_nearest(tmp_path):
+    with pytest.raises(UsageError, match="Unknown length unit 'mmm'; did you mean 'mm'"):
+        load_mesh(_cube_file(tmp_path), unit="mmm")
+
+
+def test_a_missing_mesh_file_is_named(tmp_path):
+    with pytest.raises(DataFileNotFoundError, match=r"no mesh file .*nothing\.obj"):
+        load_mesh(tmp_path / "nothing.obj", unit="m")
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("bad.stl", b"solid \x00"), ("bad.obj", b"nothing here"), ("bad.xyzzy", b"?")]
+)
+def test_a_file_without_triangles_is_refused(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=name.replace(".", r"\.")):
+        load_mesh(path, unit="m")
