@@ -12,6 +12,7 @@ import time as clock
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
+from brainbench.errors import UsageError
 from brainbench.files import provenance
 from brainbench.types import ResultRecord, Score
 
@@ -104,21 +105,25 @@ def score_record(
         The result record; its scores share one brain side.
     """
     from brainbench import metrics
-    from brainbench._sides import brain_side, join_labels, model_side
+    from brainbench._brain_side import brain_side
+    from brainbench._labels import join_labels
+    from brainbench._model_side import find_model
 
     started = clock.perf_counter()
-    network = model_side(
-        model,
+    if time not in ("mean", "concatenate"):
+        raise UsageError(f"Unknown time rule {time!r}; allowed: 'mean', 'concatenate'.")
+    # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
+    candidate = find_model(model, seed=seed)
+    brain = brain_side(recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress)
+    network = candidate.respond(
         stimuli,
         whiskers=whiskers,
         fidelity=fidelity,
         layers=layers,
         normalize=normalize,
         time=time,
-        seed=seed,
         progress=progress,
     )
-    brain = brain_side(recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress)
     pairs = join_labels(brain.vocabulary, network.labels, match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]

@@ -33,7 +33,7 @@ def rdm(
     as_json: JsonOption = False,
 ) -> None:
     """Compute every animal's RDM (correlation distance) and its split-half reliability."""
-    from brainbench._sides import brain_side
+    from brainbench._brain_side import brain_side
 
     brain = brain_side(source, conditions=conditions, progress=None)
     labels = brain.vocabulary

@@ -1,10 +1,9 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from brainbench._sides import _without_time, join_labels, read_match
+from brainbench._labels import join_labels, read_match
 from brainbench.errors import UsageError
 
 
@@ -65,9 +64,3 @@ def test_a_wrong_match_file_is_refused(tmp_path: Path, name: str, text: str, mes
         read_match(tmp_path / name)
     with pytest.raises(UsageError, match="no match file"):
         read_match(tmp_path / "none.json")
-
-
-def test_the_time_rule_averages_only_what_was_recorded():
-    responses = np.array([[[1.0, np.nan], [3.0, np.nan]], [[np.nan, 4.0], [5.0, 8.0]]])
-    np.testing.assert_array_equal(_without_time(responses, "mean"), [[2.0, np.nan], [5.0, 6.0]])
-    assert _without_time(responses, "concatenate").shape == (2, 4)

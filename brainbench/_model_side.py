@@ -1,0 +1,202 @@
+"""The model's side of a score: find the model, run it on the stimuli, reduce its layers to RDMs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench._brain_side import RDM_METHOD
+from brainbench.errors import UsageError, unknown_name
+from brainbench.types import CHANNELS, ModelCard
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli import Stimuli
+
+Progress = Callable[[int, int, str], None]
+
+DEFAULT_STIMULI = "rodgers"
+RANDOM_FEATURES = 512
+"""Width of the random-features baseline."""
+_ELSEWHERE = "features computed elsewhere"
+
+
+@dataclass(frozen=True)
+class ModelSide:
+    """Activations of one model, with the labels of their rows."""
+
+    card: ModelCard
+    labels: tuple[str, ...]
+    activations: Mapping[str, NDArray[np.floating]]
+    """Layer → [K, T, F]."""
+    time: str
+    model_input: NDArray[np.floating] | None = None
+    """[K, T, F] what the model received; None for features computed elsewhere."""
+    origin: Mapping[str, Any] = field(default_factory=dict)
+    """Provenance of stimuli and weights."""
+
+    def rdms(self, rows: list[int]) -> dict[str, NDArray[np.float64]]:
+        """Every layer's RDM [P] over the stimuli ``rows``."""
+        return {layer: _rdm(values[rows], self.time) for layer, values in self.activations.items()}
+
+    def baseline_rdms(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """RDMs of the raw input and of random features of it; empty without an input."""
+        if self.model_input is None:
+            return {}
+        raw = self.model_input[rows].astype(np.float64)
+        weights = np.random.default_rng(seed).standard_normal((raw.shape[-1], RANDOM_FEATURES)) / np.sqrt(raw.shape[-1])
+        return {
+            "raw input": {"input": _rdm(raw, self.time)},
+            "random features": {"relu(input · random)": _rdm(np.maximum(raw @ weights, 0.0), self.time)},
+        }
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that was found, before any stimulus is simulated for it."""
+
+    card: ModelCard
+    module: torch.nn.Module | None = None
+    activations: Mapping[str, Any] | None = None
+    """Features computed elsewhere, in place of a module."""
+    labels: tuple[str, ...] | None = None
+    """Labels of the rows of ``activations``; None when they follow the stimuli."""
+    origin: Mapping[str, Any] = field(default_factory=dict)
+
+    def respond(
+        self,
+        stimuli: Any,
+        *,
+        whiskers: str,
+        fidelity: Any,
+        layers: tuple[str, ...] | None,
+        normalize: bool,
+        time: str,
+        progress: Progress | None,
+    ) -> ModelSide:
+        """Run the model on the stimuli; see :func:`brainbench.scoring.score_record` for the arguments."""
+        if self.activations is not None and self.labels is not None:
+            return ModelSide(self.card, self.labels, _chosen(self.activations, layers), time, origin=self.origin)
+        from brainbench.stimuli import load_stimuli
+
+        shown = load_stimuli(stimuli or DEFAULT_STIMULI, whiskers=whiskers, fidelity=fidelity, progress=progress)
+        origin = {**self.origin, "stimuli": {"description": shown.description, "content_hash": shown.content_hash}}
+        if self.module is None:
+            given = {
+                layer: _as_steps(layer, item, len(shown.labels)) for layer, item in (self.activations or {}).items()
+            }
+            return ModelSide(self.card, shown.labels, _chosen(given, layers), time, origin=origin)
+        from brainbench.models.extract import extract
+
+        values, note = _network_input(self.module, shown, normalize)
+        activations = extract(self.module, values, layers=layers)
+        card = replace(self.card, input=note)
+        return ModelSide(card, shown.labels, activations, time, _baseline_input(shown), origin)
+
+
+def find_model(model: Any, *, seed: int = 0) -> Candidate:
+    """Find what ``model`` names, and load it; see :func:`brainbench.scoring.score`.
+
+    Raises:
+        UsageError: nothing has this name, or it is no model.
+        DataError: a file was found but cannot be used.
+    """
+    if isinstance(model, Mapping):
+        return Candidate(ModelCard("features", family=_ELSEWHERE), activations=model)
+    if isinstance(model, (str, os.PathLike)) and Path(model).suffix.lower() in (".h5", ".hdf5"):
+        return _features(Path(model))
+    import torch
+
+    if isinstance(model, torch.nn.Module):
+        return _with_weights(model, ModelCard(type(model).__name__, family="user module"))
+    if not isinstance(model, str):
+        raise UsageError(
+            "A model is a registry name, FILE.py:FUNCTION, a file of activations, a mapping of activations or a "
+            f"torch.nn.Module; received {type(model).__name__}."
+        )
+    if ":" in model or model.endswith(".py"):
+        from brainbench.models.user import load_user_model
+
+        return _with_weights(load_user_model(model, seed=seed), ModelCard(model, family="user module", seed=seed))
+    from brainbench.models.registry import describe_model, load_model
+
+    known = describe_model(model)
+    card = ModelCard(model, family=known.family, objective="untrained", multiply_adds=known.multiply_adds, seed=seed)
+    return _with_weights(load_model(model, seed=seed), card)
+
+
+def _features(path: Path) -> Candidate:
+    from brainbench.files import file_hash
+    from brainbench.models.features import read_features
+
+    features = read_features(path)
+    card = ModelCard(path.stem, family=_ELSEWHERE, weights=file_hash(path))
+    return Candidate(card, None, features.activations, features.labels, {"features": str(path)})
+
+
+def _chosen(activations: Mapping[str, Any], layers: tuple[str, ...] | None) -> Mapping[str, Any]:
+    for layer in layers or ():
+        if layer not in activations:
+            raise unknown_name("layer", layer, activations)
+    return {layer: activations[layer] for layer in layers} if layers else activations
+
+
+def _as_steps(layer: str, values: Any, rows: int) -> NDArray[np.floating]:
+    array = np.asarray(values)
+    if array.ndim not in (2, 3) or array.shape[0] != rows:
+        raise UsageError(
+            f"Layer {layer!r} has shape {list(array.shape)}; expected [K, F] or [K, T, F] with K = {rows}."
+        )
+    return array[:, None, :] if array.ndim == 2 else array
+
+
+def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -> tuple[Any, str]:
+    """Return the model's input [K, T, …] and a sentence on how it was made."""
+    if hasattr(module, "spec"):  # ours, or made like ours: takes SI units
+        return stimuli.input, "SI (N, N·m); normalised inside the model"
+    if stimuli.dataset is None:
+        return stimuli.input, "as given"
+    if not normalize:
+        return stimuli.input, "SI (N, N·m)"
+    return _scaled(stimuli), "forces in 1e-4 N, moments in 1e-6 N·m"
+
+
+def _scaled(stimuli: Stimuli) -> NDArray[np.float32]:
+    import torch
+
+    from brainbench.models.normaliser import Normaliser
+
+    steps = torch.from_numpy(stimuli.input)
+    return Normaliser.physical(steps.shape[2] // len(CHANNELS))(steps).numpy()
+
+
+def _baseline_input(stimuli: Stimuli) -> NDArray[np.floating]:
+    """[K, T, F] the raw input in units that make forces and moments comparable."""
+    values = stimuli.input if stimuli.dataset is None else _scaled(stimuli)
+    steps = values if values.ndim > 2 else values[:, None, :]
+    return steps.reshape(*steps.shape[:2], -1)
+
+
+def _with_weights(module: torch.nn.Module, card: ModelCard) -> Candidate:
+    """Fill in the card what the weights tell."""
+    from brainbench.files import content_hash
+
+    state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
+    digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
+    count = sum(parameter.numel() for parameter in module.parameters())
+    return Candidate(replace(card, parameters=count, weights=digest), module)
+
+
+def _rdm(values: NDArray[np.floating], time: str) -> NDArray[np.float64]:
+    from brainbench.metrics import rdm
+
+    # NaN activations must stay NaN here: on this side nothing is "not recorded".
+    flat = values.reshape(len(values), -1) if time == "concatenate" else values.mean(axis=1, dtype=np.float64)
+    return rdm(flat, method=RDM_METHOD)
