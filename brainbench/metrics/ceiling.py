@@ -46,9 +46,7 @@ def noise_ceiling(rdms: ArrayLike, *, method: str = "pearson") -> NoiseCeiling:
     if len(animals) < 2 or not shared.any():
         return NoiseCeiling(math.nan, math.nan)
     parts = np.full(animals.shape, np.nan)
-    # Whitened length needs whole RDMs; over a part of the pairs plain length weighs the animals.
-    pool = pooling(method if shared.all() else method.removeprefix("whitened-"))
-    parts[:, shared] = pool(animals[:, shared])
+    parts[:, shared] = pooling(method)(animals[:, shared])
     total = parts.sum(axis=0)
     others = (total - parts) / (len(animals) - 1)
     comparable = np.where(shared, animals, np.nan)

@@ -81,10 +81,10 @@ def check_comparison(method: str) -> None:
 
 
 def pooling(method: str) -> Callable[[Floats], Floats]:
-    """Return the transform [..., P] → [..., P] after which a mean over RDMs is the best predictor of each.
+    """Return the transform [..., P] → [..., P] of RDMs before they are averaged to predict one another.
 
-    Nili 2014: unit vectors for the cosines, standardised ones for the correlations, ranks for the
-    rank correlations (approximate for Kendall's tau).
+    Nili 2014: unit vectors for the cosines, standardised ones for the correlations (the whitened ones
+    too, as in rsatoolbox), ranks for the rank correlations (approximate for Kendall's tau).
     """
     return _POOLING[method]
 
@@ -165,11 +165,6 @@ COMPARISONS = tuple(_FEATURES)
 """Names that ``method`` of :func:`compare` takes."""
 
 
-def _moment_unit(rdms: Floats) -> Floats:
-    moment = _second_moment(rdms)
-    return rdms / np.sqrt(np.einsum("...p,...p->...", moment, moment))[..., None]
-
-
 _POOLING: dict[str, Callable[[Floats], Floats]] = {
     "pearson": _pearson,
     "spearman": _ranks,
@@ -177,8 +172,8 @@ _POOLING: dict[str, Callable[[Floats], Floats]] = {
     "tau-a": _ranks,
     "tau-b": _ranks,
     "cosine": _unit,
-    "whitened-cosine": _moment_unit,
-    "whitened-pearson": lambda rdms: _moment_unit(_centred(rdms)),
+    "whitened-cosine": _unit,
+    "whitened-pearson": _pearson,
 }
 
 

@@ -1,0 +1,88 @@
+"""Layers are chosen without the data they are scored on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from brainbench.metrics import score_rdms
+from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
+from tests.metrics.fakes import STIMULI, make_rdm, make_subject
+
+
+def test_each_animal_gets_the_layer_that_is_best_on_the_others():
+    r = np.random.default_rng(0).normal(size=(5, 4))
+    expected = [int(np.argmax(np.delete(r, animal, axis=1).mean(axis=1))) for animal in range(4)]
+    assert choose_on_others(r).tolist() == expected
+    np.testing.assert_array_equal(held_out(r), r[expected, range(4)])
+
+
+def test_permutations_are_chosen_one_by_one():
+    r = np.random.default_rng(1).normal(size=(7, 5, 4))
+    np.testing.assert_array_equal(held_out(r), np.stack([held_out(one) for one in r]))
+
+
+def test_what_is_chosen_on_one_half_is_evaluated_on_the_other():
+    first, second = np.array([[0.9, 0.1], [0.2, 0.8]]), np.array([[0.3, 0.7], [0.6, 0.5]])
+    chosen, held = choose_on_halves(first, second)
+    assert chosen.tolist() == [0, 1, 1, 0]
+    assert held.tolist() == [0.3, 0.5, 0.2, 0.1]
+
+
+def test_ties_go_to_the_first_layer_even_when_rounding_differs():
+    assert first_best(np.array([0.1, 0.5, 0.5 + 1e-15])) == 1
+    assert most_chosen(np.array([2, 1, 2, 1])) == 1
+
+
+def _null_scores(count, seed, layers=10, animals=4):
+    """Nested and naive results of models whose layers know nothing."""
+    rng = np.random.default_rng(seed)
+    p, values, naive = [], [], []
+    for _ in range(count):
+        shared = make_rdm(rng)
+        subjects = [make_subject(f"m{i}", shared + 0.1 * rng.normal(size=15), seed=i) for i in range(animals)]
+        score = score_rdms({f"l{i}": make_rdm(rng) for i in range(layers)}, subjects, name="null", stimuli=STIMULI)
+        p.append(score.p)
+        values.append(score.value)
+        naive.append(_naive_p(score))
+    return np.array(p), np.array(values), np.array(naive)
+
+
+def _naive_p(score):
+    """The p-value of the best layer as if it had been the only one: t table of one layer's null."""
+    best = max(layer.r for layer in score.layers)
+    return stats.norm.sf(best / 0.27)
+
+
+def test_p_stays_calibrated_after_choosing_a_layer_and_the_naive_maximum_does_not():
+    p, _, naive = _null_scores(300, seed=2)
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+    assert 0.02 <= (p <= 0.05).mean() <= 0.09
+    assert (naive <= 0.05).mean() > 0.25
+
+
+@pytest.mark.slow
+def test_p_is_calibrated_after_layer_choice_in_two_thousand_simulations():
+    p, _, naive = _null_scores(2000, seed=3)
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+    assert 0.04 <= (p <= 0.05).mean() <= 0.06
+    assert (naive <= 0.05).mean() > 0.25
+
+
+@pytest.mark.slow
+def test_p_of_a_single_animal_is_calibrated_after_choosing_on_halves():
+    p, _, _ = _null_scores(2000, seed=4, animals=1)
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+    assert 0.04 <= (p <= 0.05).mean() <= 0.06
+
+
+def test_without_shared_stimuli_held_out_choice_is_unbiased_and_the_maximum_is_not():
+    rng = np.random.default_rng(5)
+    held, maximum = [], []
+    for _ in range(400):
+        r = 0.27 * rng.normal(size=(12, 4))
+        held.append(held_out(r).mean())
+        maximum.append(r.mean(axis=1).max())
+    assert abs(np.mean(held)) < 4 * np.std(held) / np.sqrt(400)
+    assert np.mean(maximum) > 0.15
