@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.errors import DataError
+from brainbench.errors import DataError, listing
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -74,15 +74,18 @@ def make_afferents(stimuli: xr.Dataset) -> Afferents:
     """Compute the afferent responses to a stimulus set.
 
     Raises:
-        DataError: the set has no forces at all on the tracked whiskers (or on any, if it has none).
+        DataError: a wrench is not finite (an unstable simulation), or all are zero.
     """
     names = tuple(str(name) for name in stimuli["whisker"].values)
     wrench = stimuli["wrench"].transpose("stimulus", "time", "whisker", "channel").values.astype(np.float64)
+    broken = [name for index, name in enumerate(names) if not np.isfinite(wrench[:, :, index]).all()]
+    if broken:
+        raise DataError(f"The stimuli hold no finite wrench for {listing(broken)}: simulate with a finer fidelity.")
     frame = float(np.median(np.diff(stimuli["time"].values)))
     tracked = [index for index, name in enumerate(names) if name in TRACKED] or list(range(len(names)))
     scale = np.sqrt(np.mean(wrench[:, :, tracked] ** 2, axis=(0, 1, 2)))
-    if not np.any(scale > 0) or not np.all(np.isfinite(scale)):
-        raise DataError("The stimuli exert no finite force on the whiskers, so there is nothing for neurons to encode.")
+    if not np.any(scale > 0):
+        raise DataError("The stimuli exert no force on the whiskers, so there is nothing for neurons to encode.")
     signal = wrench / np.where(scale > 0, scale, np.inf)
     halves = np.concatenate([np.maximum(signal, 0.0), np.maximum(-signal, 0.0)], axis=3)
     fast = np.maximum(halves - _smooth(halves, _FAST, frame), 0.0)

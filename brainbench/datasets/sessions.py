@@ -6,6 +6,7 @@ a file with gigabytes of raw voltage costs only what is used. Times are seconds 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -245,10 +246,14 @@ def natural_key(label: str) -> tuple[Any, ...]:
     ['9', '10', 'b2', 'b10']
     """
     try:
-        return (0, float(label), ())
+        number = float(label)
     except ValueError:
-        parts = re.split(r"(\d+)", label)
-        return (1, 0.0, tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts))
+        number = math.nan
+    if math.isfinite(number):
+        return (0, number, (), label)
+    # The odd parts are the digits; the label itself keeps "01" and "1" apart.
+    parts = re.split(r"(\d+)", label)
+    return (1, 0.0, tuple((int(part), "") if index % 2 else (-1, part) for index, part in enumerate(parts)), label)
 
 
 def natural_order(labels: Iterable[Any]) -> NDArray[np.int64]:

@@ -1,0 +1,83 @@
+import json
+
+import numpy as np
+import pytest
+
+from brainbench.datasets import inspect, open_recordings, write_recordings
+
+from .fakes import make_simple_session
+from .test_nwb import write_nwb
+
+
+def test_proposals_put_stimulus_like_columns_first_and_times_nowhere(tmp_path):
+    columns = {
+        "response": np.resize(np.array(["l", "r"]), 12),
+        "block": np.resize(np.array([1, 2]), 12),
+        "cue_time": np.resize(np.array([0.5, 0.7]), 12),
+        "unique": np.arange(12),
+        "constant": np.ones(12),
+    }
+    path = write_recordings(tmp_path / "a.h5", make_simple_session(columns=columns))
+    report = inspect(path)
+    assert [item.conditions for item in report.proposals] == ["trials:stimulus", "trials:block", "trials:response"]
+    assert report.proposals[0].labels == ("a", "b", "c")
+    assert report.proposals[0].fewest == 4
+    assert open_recordings(path, conditions=report.proposals[0].conditions).sizes["trial"] == 12
+
+
+def test_an_inspection_is_text_and_json(tmp_path):
+    report = inspect(write_nwb(tmp_path / "a.nwb"))
+    text = str(report)
+    for expected in (
+        "NWB 2.7.0",
+        "subject m1",
+        "1 (120 spikes",
+        "texture (text) 2 values: P20, P100",
+        "processing/behavior",
+    ):
+        assert expected in text
+    data = json.loads(report.to_json())
+    assert data["sessions"][0]["units"]["spikes"] == 120
+    assert data["proposals"][0]["conditions"] == "trials:texture"
+
+
+def test_problems_are_reported_not_raised(tmp_path):
+    import h5py
+
+    path = write_recordings(tmp_path / "a.h5", make_simple_session())
+    with h5py.File(path, "a") as file:
+        file["sessions/mouse-1/units/spike_times"][3] = np.inf
+        del file["sessions/mouse-1/tables/trials/stimulus"]
+    missing = " ".join(inspect(path).sessions[0].missing)
+    assert "1 spike times" in missing
+    assert "no column of the interval tables has 2 to 60 values" in missing
+
+
+def test_a_folder_is_inspected_as_a_whole(tmp_path):
+    for name in ("m1", "m2"):
+        write_recordings(tmp_path / f"{name}.h5", make_simple_session(subject=name))
+    report = inspect(tmp_path)
+    assert [session.subject for session in report.sessions] == ["m1", "m2"]
+    assert len(report.proposals) == 1
+
+
+def test_counted_recordings_are_described_by_their_labels(tmp_path):
+    write_recordings(tmp_path / "a.h5", make_simple_session())
+    path = write_recordings(tmp_path / "b.h5", open_recordings(tmp_path / "a.h5", conditions="trials:stimulus"))
+    report = inspect(path)
+    assert "counted responses" in report.format
+    assert report.proposals[0].labels == ("a", "b", "c")
+
+
+@pytest.mark.shared
+def test_the_human_file_proposes_its_stimulus_categories(reference):
+    report = inspect(reference / "nwb" / "pynapple_sub-4_ses-4_ecephys+image.nwb")
+    session = report.sessions[0]
+    assert (session.units.units, session.units.spikes) == (35, 214_278)
+    assert [(table.name, table.rows) for table in session.tables] == [
+        ("encoding_table", 90),
+        ("recognition_table", 180),
+        ("timediscrimination_table", 180),
+    ]
+    assert report.proposals[0].conditions == "encoding_table:stimCategory"
+    assert report.proposals[0].labels == ("0", "1", "2")

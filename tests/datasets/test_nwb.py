@@ -1,0 +1,179 @@
+import h5py
+import numpy as np
+import pytest
+
+from brainbench.datasets import blocks, inspect, make_session, open_recordings
+from brainbench.datasets._nwb_writer import NwbWriter
+from brainbench.datasets.nwb import read_nwb
+from brainbench.errors import DataError, UsageError
+
+HUMAN = "pynapple_sub-4_ses-4_ecephys+image.nwb"
+INTRACELLULAR = {
+    "LantyerEtAl2018_170328_AB_277_ST50_C.nwb": "2 VoltageClampSeries",
+    "LantyerEtAl2018_180817_ME_9_CC.nwb": "10 CurrentClampSeries",
+    "FergusonEtAl2015_PYR5_rebound.nwb": "10 CurrentClampSeries",
+}
+
+
+def write_nwb(path, *, subject="m1", session="s1", keywords=("touch",), units=True, identifier=None, description="d"):
+    """A small NWB file: six trials of two textures, one unit, and a table inside a processing module."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        writer = NwbWriter(
+            file,
+            identifier=identifier or path.name,
+            description=description,
+            start="2020-01-01T00:00:00+00:00",
+            general={"session_id": session, "keywords": list(keywords)} if session else {"keywords": list(keywords)},
+            subject={"subject_id": subject} if subject else {"species": "Mus musculus"},
+        )
+        start = np.arange(6.0)
+        columns = {
+            "start_time": ("s", start),
+            "stop_time": ("s", start + 0.5),
+            "texture": ("P", np.resize(np.array(["P100", "P20"]), 6)),
+            "tags": ("list", [np.array([1.0, 2.0])] * 6),
+        }
+        writer.table("intervals/trials", "TimeIntervals", "trials", np.arange(6) * 2, columns)
+        writer.module("behavior", "b")
+        side = {**columns, "side": ("s", np.resize(np.array([1, 2]), 6))}
+        writer.table("processing/behavior/pokes", "TimeIntervals", "pokes", np.arange(6), side)
+        if units:
+            spikes = [np.arange(0.0, 6.0, 0.05)]
+            writer.table("units", "Units", "units", np.array([17]), {"spike_times": ("s", spikes)})
+    return path
+
+
+def test_interval_tables_in_processing_modules_are_found(tmp_path):
+    path = write_nwb(tmp_path / "a.nwb")
+    dataset = open_recordings(path, conditions="pokes:side")
+    assert dataset.attrs["vocabulary"] == ["1", "2"]
+    assert dataset["unit_id"].values.tolist() == ["17"]
+    assert np.all(dataset["counts"].values == 10)
+
+
+def test_natural_order_is_used_for_conditions_without_a_recipe(tmp_path):
+    dataset = open_recordings(write_nwb(tmp_path / "a.nwb"), conditions="trials:texture")
+    assert dataset.attrs["vocabulary"] == ["P20", "P100"]
+
+
+def test_the_subject_comes_from_the_file_else_from_its_name(tmp_path):
+    named = open_recordings(write_nwb(tmp_path / "x.nwb", subject="m7"), conditions="trials:texture")
+    assert set(named["subject"].values) == {"m7"}
+    guessed = open_recordings(
+        write_nwb(tmp_path / "sub-k2_ses-3_ecephys.nwb", subject="", session=""), conditions="trials:texture"
+    )
+    assert (guessed["subject"].values[0], guessed["session"].values[0]) == ("k2", "3")
+    assert "no subject_id; the subject 'k2' was taken from the file name" in "".join(guessed.attrs["notes"])
+
+
+def test_files_without_units_are_skipped_in_a_folder_and_refused_alone(tmp_path):
+    write_nwb(tmp_path / "a.nwb", session="1")
+    alone = write_nwb(tmp_path / "sub" / "b.nwb", session="2", units=False)
+    dataset = open_recordings(tmp_path, conditions="trials:texture")
+    assert "b.nwb has no units table" in "".join(dataset.attrs["notes"])
+    with pytest.raises(DataError, match=r"b\.nwb has no units table .*\(it holds interval tables trials, pokes\)"):
+        open_recordings(alone, conditions="trials:texture")
+
+
+def test_a_copy_under_another_session_name_is_recognised(tmp_path):
+    write_nwb(tmp_path / "a.nwb", session="1", identifier="same")
+    write_nwb(tmp_path / "b.nwb", session="2", identifier="same")
+    with pytest.raises(DataError, match=r"are the same session \(equal identifier: same\)"):
+        open_recordings(tmp_path, conditions="trials:texture")
+
+
+def test_synthetic_files_are_recognised_by_keyword_or_description(tmp_path):
+    for number, options in enumerate(({"keywords": ["synthetic"]}, {"description": "SYNTHETIC session"}, {})):
+        path = write_nwb(tmp_path / f"{number}.nwb", **options)
+        assert open_recordings(path, conditions="trials:texture").attrs["synthetic"] is (number < 2)
+
+
+def test_nwb_1_is_refused(tmp_path):
+    with h5py.File(tmp_path / "old.nwb", "w") as file:
+        file["nwb_version"] = "NWB-1.0.6"
+    with pytest.raises(DataError, match=r"is NWB NWB-1\.0\.6; brainbench reads NWB 2\.x"):
+        open_recordings(tmp_path / "old.nwb")
+
+
+def test_raw_voltage_is_not_read(tmp_path):
+    path = write_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "a") as file:
+        # 20 GB on paper, a hole on disk: reading it would not fit the memory of any test machine.
+        plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plist.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+        plist.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+        space = h5py.h5s.create_simple((160_000_000, 64))
+        h5py.h5d.create(file["acquisition"].id, b"voltage", h5py.h5t.NATIVE_INT16, space, plist)
+    assert path.stat().st_size > 20e9
+    assert open_recordings(path, conditions="trials:texture").sizes["trial"] == 6
+    assert inspect(path).sessions[0].units.spikes == 120
+
+
+def test_a_table_name_that_occurs_twice_carries_its_module(tmp_path):
+    path = write_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "a") as file:
+        file.copy("processing/behavior/pokes", "intervals/pokes")
+        session = read_nwb(file, path)
+        assert set(session.tables) == {"trials", "pokes", "behavior/pokes"}
+
+
+@pytest.mark.shared
+def test_human_units_go_through_to_an_rdm(reference):
+    dataset = open_recordings(reference / "nwb" / HUMAN, conditions="encoding_table:stimCategory")
+    assert dataset.attrs["vocabulary"] == ["0", "1", "2"]
+    assert (dataset.sizes["trial"], dataset.sizes["unit"]) == (90, 35)
+    ((block,),) = blocks(dataset).values()
+    means = np.stack([block.responses[block.labels == index, 0].mean(axis=0) for index in range(3)])
+    distances = 1 - np.corrcoef(means)[np.triu_indices(3, 1)]
+    assert np.all((distances > 0) & (distances < 1))
+
+
+@pytest.mark.shared
+@pytest.mark.filterwarnings("ignore")
+def test_human_counts_equal_those_of_pynwb(reference):
+    """pynwb reads independently of us; it warns of what else is odd in this file."""
+    pynwb = pytest.importorskip("pynwb")
+    path = reference / "nwb" / HUMAN
+    dataset = open_recordings(path, conditions="recognition_table:boundary_type", window="fixcross_time..+2")
+    with pynwb.NWBHDF5IO(path, "r") as io:
+        file = io.read()
+        table = file.intervals["recognition_table"].to_dataframe().reset_index(drop=True)
+        spikes = [file.units["spike_times"][index] for index in range(len(file.units))]
+    order = np.argsort(table["start_time"].to_numpy(), kind="stable")
+    begin = table["fixcross_time"].to_numpy()[order]
+    expected = [[np.sum((times >= low) & (times < low + 2)) for times in spikes] for low in begin]
+    np.testing.assert_array_equal(dataset["counts"].values[:, 0], expected)
+    np.testing.assert_array_equal(dataset["stimulus"].values.astype(int), table["boundary_type"].to_numpy()[order])
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("name", "series"), INTRACELLULAR.items())
+def test_intracellular_files_are_refused_in_one_sentence_and_inspected(reference, name, series):
+    path = reference / "nwb" / name
+    with pytest.raises(
+        DataError, match=rf"has no units table: it holds \d+ intracellular series \({series}\)"
+    ) as error:
+        open_recordings(path, conditions="trials:stimulus")
+    assert "\n" not in str(error.value)
+    report = inspect(path)
+    assert series in str(report)
+    assert report.sessions[0].units is None
+    assert report.proposals == ()
+
+
+@pytest.mark.shared
+def test_a_probe_export_without_trials_says_what_it_lacks(reference):
+    path = reference / "nwb" / "pynapple_A8604-211122.nwb"
+    report = inspect(path)
+    assert (report.sessions[0].units.units, report.sessions[0].units.spikes) == (3, 21_354)
+    assert report.sessions[0].subject == path.stem
+    with pytest.raises(DataError, match=r"no interval table with a column that could label trials .*'epochs'"):
+        open_recordings(path)
+    with pytest.raises(UsageError, match="Unknown table 'trials'"):
+        open_recordings(path, conditions="trials:stimulus")
+
+
+def test_sessions_are_built_from_arrays_with_ids():
+    session = make_session("m", "1", [np.zeros(2)], {"t": {"start_time": [0.0]}}, unit_columns={"id": [99]})
+    assert session.units.ids().tolist() == [99]

@@ -1,0 +1,236 @@
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from brainbench.datasets import Selection, Session, make_session, open_recordings, write_recordings
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.types import check_recordings
+
+from .fakes import make_simple_session
+
+
+def write(path, made=None, **options):
+    return write_recordings(path, made or make_simple_session(**options))
+
+
+def shuffled(session: Session, random: np.random.Generator) -> Session:
+    """The same session with rows of the tables and units in another order."""
+    units = dict(session.units.data)
+    spikes = np.split(units["spike_times"], units["spike_times_index"][:-1])
+    order = random.permutation(len(spikes))
+    moved = {name: units[name][order] for name in units if not name.startswith("spike_times")}
+    moved["spike_times"] = np.concatenate([spikes[index] for index in order])
+    moved["spike_times_index"] = np.cumsum([len(spikes[index]) for index in order])
+    table = session.tables["trials"]
+    rows = random.permutation(len(table))
+    tables = {"trials": type(table)("trials", {name: values[rows] for name, values in table.data.items()})}
+    return Session(session.subject, session.session, type(table)("units", moved), tables)
+
+
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**16))
+def test_order_of_trials_units_sessions_and_files_changes_nothing(tmp_path_factory, seed):
+    random = np.random.default_rng(seed)
+    folder = tmp_path_factory.mktemp("order")
+    sessions = [make_simple_session(subject=name, seed=index) for index, name in enumerate(("m10", "m9", "m2"))]
+    plain = write_recordings(folder / "plain.h5", sessions)
+    names = random.permutation(3)
+    for name, session in zip(names, sessions, strict=True):
+        write_recordings(folder / "mixed" / f"{name}.h5", shuffled(session, random))
+    one = open_recordings(plain, conditions="trials:stimulus", bin=0.3)
+    two = open_recordings(folder / "mixed", conditions="trials:stimulus", bin=0.3)
+    xr.testing.assert_identical(one.drop_attrs(), two.drop_attrs())
+    assert one.attrs["content_hash"] == two.attrs["content_hash"]
+    assert list(dict.fromkeys(one["subject"].values)) == ["m2", "m9", "m10"]
+
+
+def test_what_another_session_did_not_record_is_missing(tmp_path):
+    write(tmp_path / "a.h5", session="1")
+    write(tmp_path / "b.h5", session="2", seed=1)
+    dataset = check_recordings(open_recordings(tmp_path, conditions="trials:stimulus"))
+    same = dataset["session"].values[:, None] == dataset["unit_session"].values[None]
+    np.testing.assert_array_equal(np.isfinite(dataset["counts"].values[:, 0]), same)
+
+
+def test_trials_outside_the_recorded_span_are_excluded_not_read_as_silence(tmp_path):
+    start = 1.0 + 2.0 * np.arange(12)
+    spikes = np.linspace(5.0, 15.5, 400)
+    table = {"start_time": start, "stop_time": start + 1, "stimulus": np.resize(["a", "b"], 12)}
+    dataset = open_recordings(
+        write(tmp_path / "a.h5", make_session("m", "1", [spikes], {"trials": table})), conditions="trials:stimulus"
+    )
+    assert dataset["window_start"].values.tolist() == [5.0, 7.0, 9.0, 11.0, 13.0]
+    assert dataset.attrs["removed"]["trials: outside the recorded span"] == 7
+    assert "recorded span taken from first to last spike, 5.000–15.500 s" in "".join(dataset.attrs["notes"])
+
+
+def test_a_unit_lost_before_the_end_is_missing_from_then_on(tmp_path):
+    session = make_simple_session(observed=[[[0, 100]], [[0, 10.5]], [[0, 4.0], [4.0, 9.0], [12.0, 100.0]]])
+    dataset = open_recordings(write(tmp_path / "a.h5", session), conditions="trials:stimulus")
+    recorded = np.isfinite(dataset["counts"].values[:, 0])
+    start = dataset["window_start"].values
+    assert recorded[:, 0].all()
+    np.testing.assert_array_equal(recorded[:, 1], start + 1 <= 10.5)
+    np.testing.assert_array_equal(recorded[:, 2], (start + 1 <= 9.0) | (start >= 12.0))
+
+
+def test_trials_that_overlap_invalid_times_are_removed(tmp_path):
+    session = make_simple_session(tables={"invalid_times": {"start_time": [3.5], "stop_time": [5.2]}})
+    dataset = open_recordings(write(tmp_path / "a.h5", session), conditions="trials:stimulus")
+    assert dataset.attrs["removed"]["trials: overlap with invalid_times"] == 2
+
+
+def test_a_missing_label_removes_the_trial_and_is_counted(tmp_path):
+    stimulus = np.resize(np.array(["a", "b"]), 12)
+    stimulus[3] = ""
+    path = write(tmp_path / "a.h5", columns={"stimulus": stimulus})
+    dataset = open_recordings(path, conditions="trials:stimulus")
+    assert dataset.attrs["removed"]["trials: no value of stimulus"] == 1
+    assert dataset.sizes["trial"] == 11
+
+
+def test_a_subject_without_a_stimulus_is_kept_and_named(tmp_path):
+    write(tmp_path / "a.h5", subject="m1")
+    write(tmp_path / "b.h5", subject="m2", columns={"stimulus": np.resize(np.array(["a", "b"]), 12)})
+    dataset = open_recordings(tmp_path, conditions="trials:stimulus")
+    assert dataset.attrs["vocabulary"] == ["a", "b", "c"]
+    assert dataset.attrs["missing"] == {"m2": ["c"]}
+
+
+def test_units_with_no_spikes_are_removed_and_counted_or_kept_on_request(tmp_path):
+    session = make_simple_session()
+    silent = dict(session.units.data)
+    silent["id"] = np.arange(4)
+    silent["spike_times_index"] = np.append(silent["spike_times_index"], len(silent["spike_times"]))
+    session = Session("m", "1", type(session.units)("units", silent), session.tables)
+    path = write(tmp_path / "a.h5", session)
+    dataset = open_recordings(path, conditions="trials:stimulus")
+    assert (dataset.sizes["unit"], dataset.attrs["removed"]["units: no spikes"]) == (3, 1)
+    kept = open_recordings(path, conditions="trials:stimulus", select="none")
+    assert np.all(kept["counts"].values[:, 0, 3] == 0)
+
+
+def test_units_are_chosen_by_layer_depth_and_number_of_spikes(tmp_path):
+    columns = {"layer": ["2/3", "4", "4"], "depth": [100.0, 400.0, 500.0], "inhibitory": [False, True, False]}
+    path = write(tmp_path / "a.h5", unit_columns=columns)
+    chosen = open_recordings(path, conditions="trials:stimulus", select="units.layer=4; units.inhibitory=false")
+    assert chosen["depth"].values.tolist() == [500.0]
+    assert chosen.attrs["removed"]["units: layer=4"] == 1
+    with pytest.raises(DataError, match=r"No unit remains of .*units: fewer than 9999 spikes removed 3"):
+        open_recordings(path, conditions="trials:stimulus", select="min_spikes=9999")
+
+
+def test_one_subject_can_be_chosen_and_an_unknown_one_is_named(tmp_path):
+    write(tmp_path / "a.h5", subject="m1")
+    write(tmp_path / "b.h5", subject="m2", seed=1)
+    dataset = open_recordings(tmp_path, conditions="trials:stimulus", select=Selection(subjects=("m2",)))
+    assert set(dataset["subject"].values) == {"m2"}
+    with pytest.raises(UsageError, match="Unknown subject 'm3'; did you mean 'm"):
+        open_recordings(tmp_path, conditions="trials:stimulus", select=Selection(subjects=("m3",)))
+
+
+def test_without_conditions_the_message_proposes_some(tmp_path):
+    with pytest.raises(UsageError, match=r"pass conditions TABLE:COLUMN, such as 'trials:stimulus'"):
+        open_recordings(write(tmp_path / "a.h5"))
+
+
+def test_unknown_tables_and_columns_suggest_the_nearest(tmp_path):
+    path = write(tmp_path / "a.h5")
+    with pytest.raises(UsageError, match="Unknown table 'trails'; did you mean 'trials'"):
+        open_recordings(path, conditions="trails:stimulus")
+    with pytest.raises(UsageError, match="Unknown column 'stimuls'; did you mean 'stimulus'"):
+        open_recordings(path, conditions="trials:stimuls")
+
+
+def test_one_condition_only_is_refused(tmp_path):
+    path = write(tmp_path / "a.h5", columns={"stimulus": ["a"] * 12})
+    with pytest.raises(DataError, match=r"have the one condition 'a' .* needs at least two"):
+        open_recordings(path, conditions="trials:stimulus")
+
+
+def test_no_trial_left_tells_which_rules_removed_them(tmp_path):
+    with pytest.raises(DataError, match=r"No trial remains of .*trials: stimulus=z removed 12"):
+        open_recordings(write(tmp_path / "a.h5"), conditions="trials:stimulus", select="stimulus=z")
+
+
+def test_unsorted_spikes_are_sorted_and_said(tmp_path):
+    session = make_simple_session()
+    units = dict(session.units.data)
+    units["spike_times"] = units["spike_times"].copy()
+    units["spike_times"][:480] = units["spike_times"][:480][::-1]
+    mixed = Session("mouse", "1", type(session.units)("units", units), session.tables)
+    plain = open_recordings(write(tmp_path / "a.h5", session), conditions="trials:stimulus")
+    dataset = open_recordings(write(tmp_path / "b.h5", mixed), conditions="trials:stimulus")
+    xr.testing.assert_identical(plain.drop_attrs(), dataset.drop_attrs())
+    assert "spike times of 1 units were not in order and have been sorted" in "".join(dataset.attrs["notes"])
+
+
+def test_spike_times_that_are_not_finite_are_refused(tmp_path):
+    path = write(tmp_path / "a.h5", unit_columns={"id": [7, 8, 9]})
+    with h5py.File(path, "a") as file:
+        file["sessions/mouse-1/units/spike_times"][500] = np.nan
+    with pytest.raises(DataError, match=r"1 spike times of table 'units' .* are not finite \(first in unit 8\)"):
+        open_recordings(path, conditions="trials:stimulus")
+
+
+def test_an_inconsistent_ragged_index_is_refused(tmp_path):
+    path = write(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        file["sessions/mouse-1/units/spike_times_index"][-1] = 7
+    with pytest.raises(DataError, match=r"ragged index spike_times_index .* is inconsistent"):
+        open_recordings(path, conditions="trials:stimulus")
+
+
+def test_the_same_session_twice_is_refused(tmp_path):
+    write(tmp_path / "a.h5")
+    (tmp_path / "copy.h5").write_bytes((tmp_path / "a.h5").read_bytes())
+    with pytest.raises(DataError, match=r"are the same session \(equal subject and session: mouse / 1\)"):
+        open_recordings(tmp_path, conditions="trials:stimulus")
+
+
+def test_missing_files_and_empty_searches_are_named(tmp_path):
+    write(tmp_path / "session.h5")
+    with pytest.raises(DataFileNotFoundError, match=r"There is no file .*sesion.h5'; did you mean 'session.h5'"):
+        open_recordings(tmp_path / "sesion.h5", conditions="trials:stimulus")
+    with pytest.raises(DataFileNotFoundError, match=r"matches no file"):
+        open_recordings(str(tmp_path / "*.nwb"), conditions="trials:stimulus")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataFileNotFoundError, match="holds no recordings"):
+        open_recordings(tmp_path / "empty", conditions="trials:stimulus")
+
+
+def test_damaged_files_are_refused_with_the_reason(tmp_path):
+    whole = write(tmp_path / "a.h5").read_bytes()
+    cases = {
+        "cut.h5": (whole[: len(whole) // 2], "is truncated"),
+        "text.nwb": (b"subject,trial\n", "is not an HDF5 file; brainbench reads NWB 2.x"),
+        "empty.nwb": (b"", r"is not an HDF5 file \(it is empty\)"),
+        "lfs.nwb": (b"version https://git-lfs.github.com/spec/v1\n", "pointer that git-lfs"),
+    }
+    for name, (content, message) in cases.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError, match=message):
+            open_recordings(tmp_path / name, conditions="trials:stimulus")
+
+
+def test_foreign_hdf5_is_refused_with_what_it_holds(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["voltage"] = np.zeros(3)
+    with pytest.raises(DataError, match="neither NWB nor the brainbench-recordings layout: it holds voltage"):
+        open_recordings(tmp_path / "a.h5", conditions="trials:stimulus")
+
+
+def test_globs_lists_and_recipes_name_sources(tmp_path):
+    paths = [write(tmp_path / f"m{index}.h5", subject=f"m{index}", seed=index) for index in range(3)]
+    by_glob = open_recordings(str(tmp_path / "m[01].h5"), conditions="trials:stimulus")
+    by_list = open_recordings(paths[:2], conditions="trials:stimulus")
+    xr.testing.assert_identical(by_glob.drop_attrs(), by_list.drop_attrs())
+    with pytest.raises(UsageError, match="Unknown recordings recipe 'rodgrs'; did you mean 'rodgers'"):
+        open_recordings(f"rodgrs:{tmp_path}")
+    with pytest.raises(UsageError, match="no file; write rodgers:PATH"):
+        open_recordings("rodgers:")
+    with pytest.raises(UsageError, match="demo recordings are made from simulated stimuli"):
+        open_recordings("demo")

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brainbench.datasets.sessions import Table, as_labels, decode, make_session, natural_key, natural_order
+from brainbench.errors import DataError, UsageError
+
+
+def test_numbers_become_the_text_a_person_would_write():
+    assert as_labels(np.array([1, 2], dtype=np.uint8)).tolist() == ["1", "2"]
+    assert as_labels(np.array([1.0, 0.25, np.nan])).tolist() == ["1", "0.25", ""]
+    assert as_labels(np.array([True, False])).tolist() == ["true", "false"]
+    assert as_labels(np.array([" a ", ""])).tolist() == ["a", ""]
+
+
+def test_bytes_fixed_text_and_objects_decode_alike():
+    expected = ["far", "größer"]
+    encoded = [item.encode() for item in expected]
+    for values in (np.array(encoded), np.array(encoded, dtype=object), np.array(expected, dtype=object)):
+        assert decode(values).tolist() == expected
+
+
+def test_natural_order_reads_numbers_in_text():
+    labels = ["10", "9", "-1", "b10", "b2", "a"]
+    assert [labels[index] for index in natural_order(labels)] == ["-1", "9", "10", "a", "b2", "b10"]
+
+
+@given(st.lists(st.text(), unique=True), st.randoms())
+def test_natural_order_does_not_depend_on_appearance(labels, random):
+    shuffled = labels.copy()
+    random.shuffle(shuffled)
+    keys = [[natural_key(items[index]) for index in natural_order(items)] for items in (labels, shuffled)]
+    assert keys[0] == keys[1] == sorted(map(natural_key, labels))
+
+
+def test_a_column_of_another_length_is_refused():
+    table = Table("trials", {"id": np.arange(3), "stimulus": np.array(["a", "b"])}, "file.nwb")
+    with pytest.raises(DataError, match=r"Column 'stimulus' of table 'trials' of file.nwb has 2 values for 3 rows"):
+        table.column("stimulus")
+
+
+def test_a_list_column_cannot_be_a_label():
+    table = Table("trials", {"tags": np.array(["a", "b", "c"]), "tags_index": np.array([1, 3])}, "f")
+    assert len(table) == 2
+    with pytest.raises(DataError, match="holds a list per row"):
+        table.column("tags")
+
+
+@pytest.mark.parametrize(
+    ("ends", "reason"), [([2, 1, 5], "decreasing"), ([1, 2, 4], "the last at 4 of 5"), ([5], "1 ends for 3 rows")]
+)
+def test_an_inconsistent_ragged_index_is_refused(ends, reason):
+    table = Table("units", {"id": np.arange(3), "x": np.zeros(5), "x_index": np.array(ends)}, "f.nwb")
+    with pytest.raises(DataError, match=reason):
+        table.ends("x")
+
+
+def test_an_unknown_column_suggests_the_nearest():
+    table = Table("trials", {"start_time": np.zeros(1), "stimulus": np.array(["a"])}, "f.nwb")
+    with pytest.raises(UsageError, match="did you mean 'stimulus'"):
+        table.column("stimulis")
+
+
+def test_make_session_refuses_columns_of_different_length():
+    with pytest.raises(DataError, match="'stimulus' of table 'trials' of 1 has 1 of 2 rows"):
+        make_session("m", "1", [np.zeros(1)], {"trials": {"start_time": [0.0, 1.0], "stimulus": ["a"]}})
+    with pytest.raises(UsageError, match="start_time"):
+        make_session("m", "1", [np.zeros(1)], {"trials": {"stimulus": ["a"]}})
