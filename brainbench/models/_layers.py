@@ -66,6 +66,8 @@ def initialise(
     layer: nn.Conv2d | nn.Linear, *, gain: float, bias: float | None, method: Mapping[str, Any] | None
 ) -> None:
     """Draw a layer's weight and set its bias (None: uniform within 1/√fan_in, as PyTorch does)."""
+    if layer.weight.is_meta:  # nothing to fill, and PyTorch imports its compiler (1 s) to find that out
+        return
     fan_in = layer.weight[0].numel()
     if method is None:
         bound = gain * math.sqrt(3.0 / fan_in)

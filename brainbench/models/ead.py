@@ -133,6 +133,12 @@ class EAD(nn.Module):
             found["decoder"] = self.decoder(features)
         return {name: found[name] for name in self.layers if name in wanted}
 
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of matrix products and convolutions in the first time step of one stimulus."""
+        attender = self.attender.multiply_adds() if self.attender is not None else 0
+        decoder = sum(module.weight.numel() for module in self.decoder.modules() if isinstance(module, nn.Linear))
+        return self.encoder.multiply_adds() + attender + decoder
+
     def init_state(
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> EADState:

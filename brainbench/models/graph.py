@@ -160,6 +160,17 @@ class TemporalGraph(nn.Module):
             node.grid = inputs[name][1:]
         self.spec, self._shapes, self._open_grid = spec, outputs, False
 
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of matrix products and convolutions in one step of one stimulus."""
+        total = 0
+        for name, node in self._items():
+            places = math.prod(self._memory_grid(name))
+            if isinstance(node.operation, (Conv2d, Linear)):
+                total += node.operation.weight.numel() * places
+            if node.memory is not None:
+                total += sum(m.weight.numel() for m in node.memory.modules() if isinstance(m, Conv2d)) * places
+        return total
+
     def init_state(
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> GraphState:

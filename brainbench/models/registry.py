@@ -57,7 +57,7 @@ class ModelDescription:
     parameters: int
     multiply_adds: int | None
     """Multiply-adds of a time step, counted on the first one (attention to earlier steps adds under 0.2 % to
-    the 22nd of ``+gpt``); None for a model that does not state its input shape."""
+    the 22nd of ``+gpt``); None for a model without a method ``multiply_adds``."""
     layers: tuple[str, ...]
     """Layers that can be extracted by name."""
 
@@ -169,22 +169,9 @@ def describe_model(name: str) -> ModelDescription:
         record.citation,
         record.licence,
         parameters=sum(parameter.numel() for parameter in model.parameters()),
-        multiply_adds=_multiply_adds(model),
+        multiply_adds=count() if callable(count := getattr(model, "multiply_adds", None)) else None,
         layers=tuple(getattr(model, "layers", ())),
     )
-
-
-def _multiply_adds(model: nn.Module) -> int | None:
-    """Count multiply-adds of matrix products, convolutions and attention in one time step."""
-    import torch
-    from torch.utils.flop_counter import FlopCounterMode
-
-    spec = getattr(model, "spec", None)
-    if spec is None:
-        return None
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        model(torch.empty(1, 1, *spec.input_shape, device="meta"))
-    return counter.get_total_flops() // 2
 
 
 def _load_weights(model: nn.Module, path: Path, name: str) -> None:

@@ -109,14 +109,24 @@ class GPTAttender(nn.Module):
         self.blocks = nn.ModuleList(GPTBlock(width, heads, dropout, blocks) for _ in range(blocks))
         self.norm = nn.LayerNorm(width)
         self.lm_head = Linear(width, width, use_bias=False)
-        nn.init.normal_(self.action, std=_TOKEN_STD)
-        nn.init.normal_(self.positions, std=_TOKEN_STD)
+        for tokens in (self.action, self.positions):
+            if not tokens.is_meta:
+                nn.init.normal_(tokens, std=_TOKEN_STD)
         self.layers = (*(f"block{index}" for index in range(1, blocks + 1)), "lm_head")
 
     @property
     def max_steps(self) -> int:
         """Longest sweep that fits the context."""
         return self.context // 2
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of the first step: two tokens through the blocks, one through the head.
+
+        Every earlier token adds 4 × width per block to the attention of a later step.
+        """
+        linear = sum(module.weight.numel() for module in self.modules() if isinstance(module, Linear))
+        attention = len(self.blocks) * 2 * 2 * 2 * self.features
+        return 2 * linear - self.lm_head.weight.numel() + attention
 
     def init_state(
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
