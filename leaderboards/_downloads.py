@@ -14,7 +14,7 @@ from brainbench.types import Score
 from leaderboards.ranking import Board
 
 _COLUMNS = (
-    "recordings", "recordings_hash", "stimuli_hash", "estimator", "metric", "synthetic",
+    "recordings", "recordings_hash", "stimuli_hash", "time", "estimator", "metric", "synthetic",
     "row", "rank_first", "rank_last", "name", "value", "low", "high", "level", "status", "reasons",
     "p", "p_smallest", "r", "reliability", "ceiling_lower", "ceiling_upper",
     "layer", "best_layer", "best_layer_value", "animals",
@@ -38,6 +38,7 @@ def boards_csv(boards: Iterable[Board]) -> str:
             "recordings": board.recordings,
             "recordings_hash": board.recordings_hash,
             "stimuli_hash": board.stimuli_hash,
+            "time": board.time,
             "estimator": board.estimator,
             "metric": board.metric,
             "synthetic": board.synthetic,

@@ -9,6 +9,7 @@ from dataclasses import fields
 from typing import Any
 
 from brainbench.types import Interval, ModelCard, ResultRecord, Score
+from leaderboards import _origin
 
 STATUS = {
     "ok": "The recordings are reliable enough to trust this number.",
@@ -107,14 +108,14 @@ def comparisons(record: ResultRecord) -> list[str]:
 def methods(record: ResultRecord) -> str:
     """Return a paragraph for a paper's methods section, made only of what the record states."""
     score = record.score
-    provenance = score.provenance
-    recordings = str(provenance.get("recordings") or "the recordings")
     text = (
-        f"The model {score.name} was compared with {recordings} ({plural(len(score.subjects), 'animal')}, "
-        f"{plural(len(score.stimuli), 'stimulus', 'stimuli')}) by representational similarity analysis"
+        f"The model {score.name} was compared with {_origin.recordings_name(score)} "
+        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) by representational similarity analysis"
     )
     text += f" ({score.metric})" if score.metric else ""
     text += f", with noise correction by the estimator '{score.estimator}'."
+    if _origin.time_rule(score):
+        text += f" Time axis: {_origin.time_rule(score)}."
     if score.layer_rule:
         text += f" Layer: {score.layer_rule}."
     if score.interval:
@@ -123,7 +124,7 @@ def methods(record: ResultRecord) -> str:
         text += f" Significance: {score.p_method}."
     if score.ceiling and score.ceiling.method:
         text += f" Noise ceiling: {score.ceiling.method}."
-    version = provenance.get("version")
+    version = score.provenance.get("version")
     text += f" Computed with brainbench {version}." if version else ""
     if record.synthetic:
         text += " The recordings are synthetic: the result says nothing about brains."
@@ -151,16 +152,19 @@ def card_rows(card: ModelCard) -> list[tuple[str, str]]:
 
 def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the provenance as label and text, without the command, which the page shows by itself."""
-    return [
-        (key.replace("_", " "), _inline(value))
-        for key, value in sorted(provenance.items())
-        if key != "command" and value is not None
-    ]
+    rows = []
+    for key, value in sorted(provenance.items()):
+        # Groups of facts get a row for each; short lists, such as the packages' versions, stay together.
+        if isinstance(value, Mapping) and key not in ("packages", "pairs"):
+            rows += [(f"{key}: {name}", item) for name, item in value.items()]
+        elif key != "command":
+            rows.append((key, value))
+    return [(key.replace("_", " "), _inline(item)) for key, item in rows if item not in (None, "", {}, [])]
 
 
 def _inline(value: Any) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_inline(item)}" for key, item in value.items())
+        return ", ".join(f"{key}: {_inline(item)}" for key, item in value.items())
     if isinstance(value, (list, tuple)):
         return ", ".join(_inline(item) for item in value)
     return value if isinstance(value, str) else json.dumps(value)

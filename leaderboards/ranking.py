@@ -1,11 +1,12 @@
 """What may be compared with what, and which ranks the intervals leave open.
 
 Scores are comparable only within a **board**: same recordings, same stimuli, same estimator, same
-metric. Within a board only scores of status ``ok`` that carry an interval are ranked. Two models
-whose intervals overlap are not told apart, so every model has a range of ranks: from one more than
-the number of models whose interval lies wholly above its own, to the number of ranked models less
-those whose interval lies wholly below. The rule is conservative (the models share the animals, so
-a paired comparison could separate more of them) and needs nothing that a record does not hold.
+metric, same use of the time axis. Within a board only scores of status ``ok`` that carry an
+interval are ranked. Two models whose intervals overlap are not told apart, so every model has a
+range of ranks: from one more than the number of models whose interval lies wholly above its own, to
+the number of ranked models less those whose interval lies wholly below. The rule is conservative
+(the models share the animals, so a paired comparison could separate more of them) and needs nothing
+that a record does not hold.
 """
 
 from __future__ import annotations
@@ -15,15 +16,11 @@ from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 from brainbench.types import Interval, ResultRecord, Score
+from leaderboards import _origin
 from leaderboards.store import record_name
-
-HASH_KEYS = ("recordings_hash", "stimuli_hash")
-"""Keys of ``Score.provenance`` that hold the content hashes which boards are made by."""
-
-NAME_KEYS = ("recordings", "stimuli")
-"""Keys of ``Score.provenance`` that hold the readable names beside those hashes."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +69,11 @@ class Board:
     recordings_hash: str | None
     stimuli: str
     stimuli_hash: str | None
+    """None when the features were computed elsewhere, from stimuli that the record cannot name."""
+    conditions: tuple[str, ...]
+    """Labels that were compared, in the order of the RDMs."""
+    time: str
+    """How the time axis entered the RDMs; empty when not stated."""
     estimator: str
     metric: str
     synthetic: bool
@@ -80,17 +82,17 @@ class Board:
 
     @property
     def comparable(self) -> bool:
-        """False when a content hash is missing, so that nobody can know what was compared."""
-        return self.recordings_hash is not None and self.stimuli_hash is not None
+        """False when the hash of the recordings is missing, so that nobody can know what was compared."""
+        return self.recordings_hash is not None
 
 
 def rank(records: Iterable[ResultRecord]) -> list[Board]:
     """Sort records into boards and rank each board; the largest board comes first."""
-    groups: dict[tuple[str | None, ...], list[ResultRecord]] = defaultdict(list)
+    groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
     for record in records:
         score = record.score
-        hashes = tuple(_text(score, key) for key in HASH_KEYS)
-        groups[(*hashes, score.estimator, score.metric)].append(record)
+        brain, shown = _origin.recordings_hash(score), _origin.stimuli_hash(score)
+        groups[brain, shown, score.stimuli, _origin.time_rule(score), score.estimator, score.metric].append(record)
     boards = [_board(key, group) for key, group in groups.items()]
     return sorted(boards, key=lambda board: (-len(board.rows), board.recordings, board.estimator, board.metric))
 
@@ -110,11 +112,10 @@ def rank_ranges(intervals: list[Interval]) -> list[tuple[int, int]]:
     ]
 
 
-def _board(key: tuple[str | None, ...], records: list[ResultRecord]) -> Board:
-    recordings_hash, stimuli_hash, estimator, metric = key
+def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
+    recordings_hash, stimuli_hash, conditions, time, estimator, metric = key
     repeats = Counter(_model(record) for record in records)
-    comparable = recordings_hash is not None and stimuli_hash is not None
-    reasons = [_unranked(record, comparable) for record in records]
+    reasons = [_unranked(record, recordings_hash is not None) for record in records]
     ranked = [record for record, reason in zip(records, reasons, strict=True) if not reason]
     ranges = iter(rank_ranges([record.score.interval for record in ranked if record.score.interval]))
     rows = []
@@ -125,12 +126,14 @@ def _board(key: tuple[str | None, ...], records: list[ResultRecord]) -> Board:
         rows.append(RankedRecord(record, record_name(record), first, last, reason, notes))
     rows.sort(key=_order)
     return Board(
-        recordings=_common(records, NAME_KEYS[0]) or "unnamed recordings",
+        recordings=_most_common(_origin.recordings_name(record.score) for record in records),
         recordings_hash=recordings_hash,
-        stimuli=_common(records, NAME_KEYS[1]) or "unnamed stimuli",
+        stimuli=_most_common(_origin.stimuli_name(record.score) for record in records),
         stimuli_hash=stimuli_hash,
-        estimator=estimator or "",
-        metric=metric or "",
+        conditions=conditions,
+        time=time,
+        estimator=estimator,
+        metric=metric,
         synthetic=any(record.synthetic for record in records),
         rows=tuple(rows),
         baselines=tuple(_baselines([row.record for row in rows])),
@@ -143,7 +146,7 @@ def _unranked(record: ResultRecord, comparable: bool) -> str:
         return score.status
     if score.interval is None or not (math.isfinite(score.interval.low) and math.isfinite(score.interval.high)):
         return "no interval"
-    return "" if comparable else "recordings or stimuli not identified"
+    return "" if comparable else "recordings not identified"
 
 
 def _order(row: RankedRecord) -> tuple[int, float, str]:
@@ -182,11 +185,5 @@ def _baselines(records: list[ResultRecord]) -> list[Baseline]:
     return baselines
 
 
-def _text(score: Score, key: str) -> str | None:
-    value = score.provenance.get(key)
-    return str(value) if value else None
-
-
-def _common(records: list[ResultRecord], key: str) -> str | None:
-    names = Counter(name for record in records if (name := _text(record.score, key)))
-    return names.most_common(1)[0][0] if names else None
+def _most_common(names: Iterable[str]) -> str:
+    return Counter(names).most_common(1)[0][0]

@@ -19,7 +19,7 @@ from typing import Any
 from brainbench.errors import DataError
 from brainbench.files import write_text
 from brainbench.types import Interval, LayerScore, ResultRecord, Score
-from leaderboards import _words
+from leaderboards import _origin, _words
 from leaderboards._downloads import boards_csv, link, records_zip
 from leaderboards._figures import Axis, Mark, axis_of, rdm_picture, score_axis
 from leaderboards._page import render
@@ -114,7 +114,7 @@ def write_report(record: ResultRecord, path: str | os.PathLike[str]) -> Path:
         "report.html.j2",
         title=f"{score.name}: brainbench score",
         record=record,
-        recordings=str(score.provenance.get("recordings") or ""),
+        recordings=_origin.recordings_name(score),
         axis=axis,
         raw_axis=raw_axis,
         band=_band(record.animal_to_animal),
@@ -128,7 +128,7 @@ def write_report(record: ResultRecord, path: str | os.PathLike[str]) -> Path:
         layer_reference=score.value if score.status != "undefined" and score.layers else None,
         animals=[(subject, axis.mark(subject.value)) for subject in score.subjects],
         methods=_words.methods(record),
-        command=str(score.provenance.get("command") or ""),
+        command=_origin.command(score),
         card=_words.card_rows(record.card) if record.card else [],
         provenance=_words.provenance_rows(score.provenance),
         file_name=record_name(record),
@@ -246,7 +246,7 @@ def _model_view(row: RankedRecord, axis: Axis) -> dict[str, Any]:
         "model_rdm": rdm_picture(score.model_rdm, score.stimuli),
         "brain_rdm": rdm_picture(score.brain_rdm, score.stimuli),
         "facts": facts,
-        "command": str(score.provenance.get("command") or ""),
+        "command": _origin.command(score),
     }
 
 

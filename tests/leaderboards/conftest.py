@@ -49,10 +49,9 @@ def make_score(name: str = "zhuang", value: float = 0.523, *, status: str = "ok"
             "time": "2026-11-21T07:50:00+00:00",
             "machine": "Linux x86_64",
             "packages": {"numpy": "2.3.1"},
-            "recordings": "demo",
-            "recordings_hash": "9f3c2a7be1d04455",
-            "stimuli": "rodgers",
-            "stimuli_hash": "77aa10c3de29b6f1",
+            "recordings": {"source": "/data/here/demo", "content_hash": "9f3c2a7be1d04455", "removed": {"spoil": 12}},
+            "stimuli": {"description": "rodgers, mouse", "content_hash": "77aa10c3de29b6f1"},
+            "settings": {"time": "mean", "seed": 0},
             "command": f"brainbench score {name}",
         },
     }

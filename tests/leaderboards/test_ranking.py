@@ -67,10 +67,17 @@ def test_only_trustworthy_scores_are_ranked(make_record):
     ]
 
 
-@pytest.mark.parametrize("key", ["recordings_hash", "stimuli_hash"])
-def test_other_recordings_or_stimuli_make_another_board(make_record, key):
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"recordings": {"source": "demo", "content_hash": "other"}},
+        {"stimuli": {"description": "rodgers", "content_hash": "other"}},
+        {"settings": {"time": "concatenate"}},
+    ],
+)
+def test_other_recordings_stimuli_or_time_rule_make_another_board(make_record, change):
     here, there = make_record("a"), make_record("b")
-    there = replace(there, score=replace(there.score, provenance={**there.score.provenance, key: "other"}))
+    there = replace(there, score=replace(there.score, provenance={**there.score.provenance, **change}))
     assert [len(board.rows) for board in rank([here, there])] == [1, 1]
 
 
@@ -82,7 +89,37 @@ def test_other_estimators_and_metrics_make_other_boards(make_record):
 def test_records_that_do_not_say_what_they_used_are_listed_without_a_rank(make_record):
     (board,) = rank([make_record("a", provenance={}), make_record("b", provenance={})])
     assert not board.comparable
-    assert {row.unranked_because for row in board.rows} == {"recordings or stimuli not identified"}
+    assert {row.unranked_because for row in board.rows} == {"recordings not identified"}
+
+
+def test_features_computed_elsewhere_are_ranked_among_themselves_when_their_labels_agree(make_record):
+    here = make_record("simulated")
+    elsewhere = [make_record(name, value) for name, value in (("a", 0.2), ("b", 0.8))]
+    for i, record in enumerate(elsewhere):
+        known = {key: value for key, value in record.score.provenance.items() if key != "stimuli"}
+        elsewhere[i] = replace(record, score=replace(record.score, provenance=known))
+    boards = rank([here, *elsewhere])
+    assert [[(row.record.score.name, row.rank) for row in board.rows] for board in boards] == [
+        [("b", "1"), ("a", "2")],
+        [("simulated", "1")],
+    ]
+    renamed = make_record("c", stimuli=tuple("uvwxyz"), provenance=elsewhere[0].score.provenance)
+    assert len(rank([*elsewhere, renamed])) == 2
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("/home/me/.cache/brainbench/demo", "demo"),
+        ("C:\\data\\rodgers\\", "rodgers"),
+        (["a/1.nwb", "a/2.nwb", "a/3.nwb", "a/4.nwb"], "1.nwb, 2.nwb, 3.nwb and 1 more"),
+        (None, "unnamed recordings"),
+        ({"x": 1}, "{'x': 1}"),
+    ],
+)
+def test_boards_are_named_after_the_recordings_without_private_folders(make_record, source, name):
+    (board,) = rank([make_record(provenance={"recordings": {"source": source}})])
+    assert board.recordings == name
 
 
 def test_baselines_appear_once_and_disagreement_is_said(make_record, make_score):

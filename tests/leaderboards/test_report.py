@@ -104,7 +104,17 @@ def test_page_shows_every_number_of_the_result(page):
 
 def test_report_shows_animals_methods_provenance_and_command(make_record, tmp_path):
     page = report(make_record("zhuang-ln"), tmp_path)
-    for text in ("mouse-a", "0.551", "0.77", "mouse-b", "unreliable", "402", "numpy 2.3.1", "9f3c2a7be1d04455"):
+    for text in (
+        "mouse-a",
+        "0.551",
+        "0.77",
+        "mouse-b",
+        "unreliable",
+        "402",
+        "numpy: 2.3.1",
+        "spoil: 12",
+        "9f3c2a7be1d04455",
+    ):
         assert text in page.text
     assert "brainbench score zhuang-ln" in page.text
     assert "was compared with demo (2 animals, 6 stimuli) by representational similarity analysis" in page.text

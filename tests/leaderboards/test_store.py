@@ -40,10 +40,10 @@ def test_values_that_do_not_exist_come_back_as_nan(make_record, tmp_path):
 
 def test_numbers_from_numpy_are_stored_exactly(make_record, tmp_path):
     value = np.float64(1) / 3
-    record = make_record(value=value, provenance={"seed": np.int64(4), "stimuli": Path("a")})
+    record = make_record(value=value, provenance={"seed": np.int64(4), "file": Path("a")})
     back = read_record(write_record(record, tmp_path))
     assert back.score.value == float(value)
-    assert back.score.provenance == {"seed": 4, "stimuli": "a"}
+    assert back.score.provenance == {"seed": 4, "file": "a"}
 
 
 def test_writing_twice_keeps_the_first_file(make_record, tmp_path):
@@ -88,7 +88,7 @@ def test_names_that_share_a_slug_do_not_share_a_file(make_record, tmp_path):
         (lambda text: text.replace('"schema": 1', '"schema": "x"'), "schema is 'x'; expected 1"),
         (lambda text: text.replace('"status": "ok"', '"status": "fine"'), "expected one of 'ok'"),
         (lambda text: "[" * 100_000, "is nested too deeply"),
-        (lambda text: text.replace('"numpy": "2.3.1"', '"x":' + "[" * 400 + "]" * 400), "is nested too deeply"),
+        (lambda text: text.replace('"numpy": "2.3.1"', '"numpy":' + "[" * 400 + "]" * 400), "is nested too deeply"),
         (lambda text: "[1, 2]", "is not a result record: the record is [1, 2]; expected an object"),
         (lambda text: text.replace('"value": 0.523', '"value": null'), "the status is 'ok' but the value is nan"),
         (lambda text: text.replace('"convex-far",', ""), "model_rdm has 15 pairs but 5 stimuli make 10"),
