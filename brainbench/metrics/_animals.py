@@ -75,7 +75,7 @@ def gather(subjects: Sequence[SubjectRDM], *, estimator: str, comparison: str, p
     reliable = bool(scored) and all(corrections[i].status == "ok" for i in scored)
     if scored and not reliable:
         reasons += [f"{names[i]}: {corrections[i].reason}" for i in scored if corrections[i].status != "ok"]
-    reasons += [f"{subject.subject}: {note}" for subject in ordered for note in subject.notes]
+    reasons += [f"{ordered[i].subject}: {note}" for i in usable for note in ordered[i].notes]
     return Animals(ordered, corrections, usable, scored, reliable, tuple(reasons))
 
 

@@ -2,7 +2,9 @@
 
 A noisy RDM can correlate with the best model by no more than the square root of its reliability
 (Spearman 1904), so r is divided by that. Reliability comes from split halves, lengthened to all
-trials by Spearman and Brown's formula.
+trials by Spearman and Brown's formula, which assumes that the noise variance halves as the trials
+double. The noise of a distance can fall up to twice as fast where single units are very noisy; then
+the corrected value errs upwards, by at most 15 % at a reliability of .5, 5 % at .8 and 3 % at .9.
 """
 
 from __future__ import annotations

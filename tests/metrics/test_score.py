@@ -1,0 +1,320 @@
+"""The score of a model: what is in it, what makes it unreliable or undefined, and its independence of order."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from brainbench.errors import UsageError
+from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm, score_rdms, subject_rdm
+from brainbench.metrics._animals import t_interval
+from brainbench.metrics._pairs import permuted_pairs
+from brainbench.types import Score
+from tests.metrics.fakes import STIMULI, make_block, make_latent, make_rdm, make_subject
+
+
+def _make_animals(latent, count=6, noise=2.0, seed=100, splits=60):
+    return [
+        subject_rdm(f"m{i}", [make_block(latent, seed=seed + i, noise=noise)], len(latent), splits=splits)
+        for i in range(count)
+    ]
+
+
+def _make_layers(latent, count=4, seed=50):
+    rng = np.random.default_rng(seed)
+    return {f"conv{i}": rdm(np.c_[latent * i, rng.normal(size=(len(latent), 6))]) for i in range(count)}
+
+
+def _score(layers, subjects, **options):
+    return score_rdms(layers, subjects, name="model", stimuli=STIMULI, **options)
+
+
+def test_the_score_is_the_mean_over_animals_of_the_held_out_corrected_comparison():
+    latent = make_latent(1)
+    layers, animals = _make_layers(latent), _make_animals(latent)
+    score = _score(layers, animals)
+    r = compare(np.stack(list(layers.values()))[:, None], np.stack([animal.rdm for animal in animals]))
+    values = []
+    for index, animal in enumerate(animals):
+        chosen = int(np.argmax(np.delete(r, index, axis=1).mean(axis=1)))
+        values.append(noise_corrected(r[chosen, index], animal.split_half_r).value)
+        assert score.subjects[index].layer == f"conv{chosen}"
+        assert score.subjects[index].value == pytest.approx(values[-1])
+        assert (score.subjects[index].units, score.subjects[index].trials) == (20, 48)
+    assert score.status == "ok"
+    assert score.value == pytest.approx(np.mean(values))
+    assert score.reliability == pytest.approx(np.mean([animal.reliability for animal in animals]))
+    low, high = stats.t.interval(0.95, 5, loc=np.mean(values), scale=stats.sem(values))
+    assert (score.interval.low, score.interval.high) == pytest.approx((low, high))
+    assert score.interval.method == "t over 6 animals"
+    lower, upper = noise_ceiling(np.stack([animal.rdm for animal in animals]))
+    assert (score.ceiling.lower, score.ceiling.upper) == pytest.approx((lower, upper))
+    assert score.layer_rule == "chosen on the other animals, evaluated on the animal held out"
+    assert score.p == score.p_smallest == pytest.approx(1 / 720)
+    assert score.metric == "RSA: correlation RDM, pearson comparison"
+    np.testing.assert_allclose(score.model_rdm, layers[score.layer])
+    np.testing.assert_allclose(score.brain_rdm, np.mean([animal.rdm for animal in animals], axis=0))
+
+
+def test_the_optimistic_maximum_stands_beside_the_score():
+    rng = np.random.default_rng(2)
+    animals = [make_subject(f"m{i}", make_rdm(rng), seed=i) for i in range(5)]
+    score = _score({f"l{i}": make_rdm(rng) for i in range(30)}, animals)
+    assert score.best_layer_value == max(layer.value for layer in score.layers)
+    assert score.best_layer_value > score.value + 0.05
+    assert [layer.layer for layer in score.layers] == [f"l{i}" for i in range(30)]
+
+
+def test_one_layer_needs_no_choice():
+    latent = make_latent(3)
+    animals = _make_animals(latent)
+    layer = _make_layers(latent)["conv3"]
+    score = _score({"only": layer}, animals)
+    assert score.layer_rule == "only layer"
+    assert score.value == pytest.approx(score.best_layer_value)
+    assert score.r == pytest.approx(np.mean([float(compare(layer, animal.rdm)) for animal in animals]))
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["default", "thesis", "thesis-input"]), st.sampled_from([1, 3]))
+def test_the_order_of_animals_sessions_trials_units_and_stimuli_is_irrelevant(seed, estimator, animals):
+    rng = np.random.default_rng(seed)
+    latent = make_latent(seed)
+    layers = _make_layers(latent, 3)
+    blocks = [[make_block(latent, seed=seed % 89 + 10 * i + j, repeats=4) for j in range(2)] for i in range(animals)]
+    order = rng.permutation(6)
+    pairs = permuted_pairs(order[None])[0]
+
+    def shuffled(block):
+        rows, columns = rng.permutation(len(block.labels)), rng.permutation(block.responses.shape[1])
+        labels = np.argsort(order)[block.labels][rows]
+        return type(block)(block.responses[np.ix_(rows, columns)], labels, [block.keys[row] for row in rows])
+
+    first = [subject_rdm(f"m{i}", blocks[i], 6, splits=20) for i in range(animals)]
+    second = [
+        subject_rdm(f"m{i}", [shuffled(block) for block in blocks[i][::-1]], 6, splits=20)
+        for i in rng.permutation(animals)
+    ]
+    expected = _score(layers, first, estimator=estimator)
+    found = score_rdms(
+        {name: layer[pairs] for name, layer in layers.items()},
+        second,
+        name="model",
+        stimuli=[STIMULI[k] for k in order],
+        estimator=estimator,
+    )
+    for field in ("value", "r", "reliability", "p", "best_layer_value"):
+        np.testing.assert_allclose(getattr(found, field), getattr(expected, field), atol=1e-12, err_msg=field)
+    np.testing.assert_allclose(found.brain_rdm, np.array(expected.brain_rdm)[pairs], atol=1e-12)
+    assert (found.layer, found.status) == (expected.layer, expected.status)
+    assert [subject.subject for subject in found.subjects] == [subject.subject for subject in expected.subjects]
+
+
+def test_many_stimuli_use_random_permutations_that_do_not_depend_on_their_order():
+    latent = make_latent(4, stimuli=10)
+    names = [f"s{k}" for k in range(10)]
+    animals, layers = _make_animals(latent, 3, noise=6.0), {"a": make_rdm(np.random.default_rng(0), 10)}
+    order = np.random.default_rng(1).permutation(10)
+    pairs = permuted_pairs(order[None])[0]
+    moved = [dataclasses.replace(animal, rdm=animal.rdm[pairs], halves=animal.halves[..., pairs]) for animal in animals]
+    expected = score_rdms(layers, animals, name="x", stimuli=names)
+    found = score_rdms({"a": layers["a"][pairs]}, moved, name="x", stimuli=[names[k] for k in order])
+    assert found.p == expected.p
+    assert "10,000 random orders" in found.p_method
+
+
+def test_unreliable_animals_do_not_vote_and_are_named():
+    latent = make_latent(5)
+    layers, good = _make_layers(latent), _make_animals(latent, 4)
+    rng = np.random.default_rng(0)
+    noisy = make_subject("z", make_rdm(rng), reliability=0.3)
+    score, without = _score(layers, [*good, noisy]), _score(layers, good)
+    assert score.value == pytest.approx(without.value, abs=1e-15)
+    assert score.p == without.p
+    assert score.status == "ok"
+    assert "z left out: reliability 0.30 is below 0.5, where no noise correction is trustworthy" in score.reasons
+    last = score.subjects[-1]
+    assert (last.subject, last.status) == ("z", "unreliable")
+    assert math.isfinite(last.value)
+
+
+def test_when_no_animal_is_reliable_the_value_is_reported_as_unreliable():
+    rng = np.random.default_rng(6)
+    animals = [make_subject(f"m{i}", make_rdm(rng), reliability=0.3, seed=i) for i in range(3)]
+    score = _score({"a": make_rdm(rng), "b": make_rdm(rng)}, animals)
+    assert score.status == "unreliable"
+    assert score.reasons[0] == "no animal's RDM is reliable"
+    assert math.isfinite(score.value)
+
+
+def test_animals_without_a_stimulus_are_left_out_in_words():
+    latent = make_latent(7)
+    lacking = subject_rdm("a0", [make_block(latent, gap=(2,))], 6, stimuli=STIMULI)
+    score = _score(_make_layers(latent), [lacking, *_make_animals(latent, 3)])
+    assert score.status == "ok"
+    assert "a0 left out: no trials of 'convex-far'" in score.reasons
+    assert score.subjects[0].status == "undefined"
+    alone = _score(_make_layers(latent), [lacking])
+    assert alone.status == "undefined"
+    assert alone.reasons == ("no animal has a usable RDM", "a0 left out: no trials of 'convex-far'")
+    assert math.isnan(alone.value)
+    assert alone.p_smallest == pytest.approx(1 / 720)
+
+
+def test_a_broken_layer_is_never_chosen_and_broken_models_are_undefined():
+    latent = make_latent(8)
+    layers, animals = _make_layers(latent), _make_animals(latent, 4)
+    broken = {"nan": np.full(15, np.nan), **layers, "flat": np.full(15, 0.3)}
+    score = _score(broken, animals)
+    assert score.value == pytest.approx(_score(layers, animals).value, abs=1e-15)
+    assert {layer.layer for layer in score.layers if layer.status == "undefined"} == {"nan", "flat"}
+    assert any("never chosen: nan, flat" in reason for reason in score.reasons)
+    nothing = _score({"nan": np.full(15, np.nan), "flat": np.full(15, 0.3)}, animals)
+    assert nothing.status == "undefined"
+    assert nothing.reasons[0] == "activations of every layer are constant or NaN"
+    assert nothing.summary().startswith("model: undefined (activations of every layer")
+    assert nothing.reliability > 0.5
+
+
+def test_one_animal_chooses_on_one_half_and_is_scored_on_the_other():
+    latent = make_latent(9)
+    (animal,) = _make_animals(latent, 1)
+    layers = _make_layers(latent)
+    score = _score(layers, [animal])
+    stack = np.stack(list(layers.values()))
+    held = []
+    for first, second in animal.halves:
+        for choose, evaluate in ((first, second), (second, first)):
+            best = int(np.argmax(compare(stack, choose)))
+            held.append(float(compare(stack[best], evaluate)))
+    assert score.value == pytest.approx(np.mean(held) / math.sqrt(animal.split_half_r.mean()))
+    assert score.layer_rule.startswith("chosen on one half of the only reliable animal's trials")
+    assert score.interval is None
+    assert score.ceiling is None
+    assert "one animal: no confidence interval, since nothing is known about other animals" in score.reasons
+    assert score.p_smallest == pytest.approx(1 / 720)
+    assert score.p <= 3 / 720
+    assert "not a confidence interval" in score.reliability_interval.method
+
+
+def test_few_animals_say_that_coverage_is_not_verified():
+    latent = make_latent(10)
+    score = _score(_make_layers(latent), _make_animals(latent, 3))
+    assert score.interval.method == "t over 3 animals; coverage not verified below 5 animals"
+    assert "interval from 3 animals: coverage not verified below 5" in score.reasons
+
+
+@pytest.mark.parametrize("estimator", ["thesis", "thesis-input"])
+def test_the_published_estimators_take_the_maximum_over_layers_and_say_so(estimator):
+    latent = make_latent(11)
+    layers, animals = _make_layers(latent), _make_animals(latent, 4)
+    score = _score(layers, animals, estimator=estimator)
+    by_layer = [
+        np.mean(
+            [
+                noise_corrected(float(compare(layer, animal.rdm)), animal.split_half_r, estimator=estimator).value
+                for animal in animals
+            ]
+        )
+        for layer in layers.values()
+    ]
+    assert score.value == pytest.approx(max(by_layer), rel=1e-12)
+    assert score.value == score.best_layer_value
+    assert any(reason.startswith("optimistic") for reason in score.reasons)
+    assert score.estimator == estimator
+
+
+def test_three_stimuli_have_a_value_but_no_p_and_two_have_nothing():
+    latent = make_latent(12, stimuli=3)
+    animals = _make_animals(latent, 3, noise=0.5)
+    score = score_rdms(_make_layers(latent), animals, name="x", stimuli=["a", "b", "c"])
+    assert score.status == "unreliable"
+    assert math.isfinite(score.value)
+    assert math.isnan(score.p)
+    assert score.p_smallest == pytest.approx(1 / 6)
+    assert "3 stimuli allow no p below 0.167; at least 4 are needed" in score.reasons
+    latent = make_latent(12, stimuli=2)
+    two = score_rdms({"a": [0.4]}, _make_animals(latent, 2), name="x", stimuli=["a", "b"])
+    assert (two.status, two.p_smallest) == ("undefined", 1.0)
+    assert two.reasons[0].startswith("2 stimuli have one pair")
+
+
+@pytest.mark.parametrize("method", ["spearman", "cosine", "tau-a", "whitened-pearson"])
+def test_other_comparisons_use_their_own_split_halves(method):
+    latent = make_latent(13)
+    animals = _make_animals(latent, 3)
+    score = _score(_make_layers(latent), animals, compare=method)
+    halves = animals[0].halves
+    r = compare(halves[:, 0], halves[:, 1], method=method)
+    assert score.subjects[0].reliability == pytest.approx(2 * r.mean() / (1 + r.mean()))
+    assert score.metric.endswith(f"{method} comparison")
+
+
+def test_a_score_survives_json():
+    latent = make_latent(14)
+    score = _score(_make_layers(latent), _make_animals(latent, 2))
+    assert Score.from_json(score.to_json()) == score
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layer_rdms": {}}, "no layers"),
+        ({"layer_rdms": {"a": np.ones(10)}}, r"layer 'a' has shape \(10,\); 6 stimuli have 15 pairs"),
+        ({"subjects": []}, "no animals"),
+        ({"estimator": "defualt"}, "did you mean 'default'"),
+        ({"compare": "pearsn"}, "did you mean 'pearson'"),
+        ({"stimuli": ["a"] * 6}, "names repeat"),
+    ],
+)
+def test_misuse_is_told_in_a_sentence(change, message):
+    latent = make_latent(15)
+    arguments = {"layer_rdms": _make_layers(latent), "subjects": _make_animals(latent, 2), "stimuli": STIMULI}
+    with pytest.raises(UsageError, match=message):
+        score_rdms(name="x", **{**arguments, **change})
+
+
+def test_an_animal_given_twice_or_with_other_stimuli_is_refused():
+    latent = make_latent(16)
+    (animal,) = _make_animals(latent, 1)
+    with pytest.raises(UsageError, match="Subject 'm0' appears twice"):
+        _score(_make_layers(latent), [animal, animal])
+    with pytest.raises(UsageError, match="'m0' has an RDM of 5 stimuli; 6 are scored"):
+        _score(_make_layers(latent), _make_animals(make_latent(16, stimuli=5), 1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("animals", [5, 11])
+def test_the_interval_covers_the_mean_of_all_animals(animals):
+    latent = make_latent(17)
+    layer = rdm(latent + 0.3 * make_latent(18))
+    everyone = [
+        subject_rdm(f"m{i}", [make_block(latent, seed=i, units=40, repeats=15, noise=4.0)], 6, splits=100)
+        for i in range(1500)
+    ]
+    values = np.array(
+        [noise_corrected(float(compare(layer, animal.rdm)), animal.split_half_r).value for animal in everyone]
+    )
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(2000):
+        interval = t_interval(rng.choice(values, animals, replace=False))
+        covered += interval.low <= values.mean() <= interval.high
+    assert 0.93 <= covered / 2000 <= 0.97
+
+
+@pytest.mark.slow
+def test_a_whole_score_takes_less_than_three_seconds():
+    latent = make_latent(19)
+    blocks = [[make_block(latent, seed=i, units=91, repeats=60)] for i in range(11)]
+    start = time.perf_counter()
+    animals = [subject_rdm(f"m{i}", block, 6) for i, block in enumerate(blocks)]
+    _score(_make_layers(latent, 12), animals)
+    assert time.perf_counter() - start < 3
