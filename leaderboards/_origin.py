@@ -29,8 +29,8 @@ def recordings_hash(score: Score) -> str | None:
 
 
 def stimuli_name(score: Score) -> str:
-    """Return what the record says about its stimuli."""
-    return _text(_part(score, "stimuli", "description")) or "not stated"
+    """Return what the record says about its stimuli; empty if nothing."""
+    return _text(_part(score, "stimuli", "description")) or ""
 
 
 def stimuli_hash(score: Score) -> str | None:

@@ -110,7 +110,8 @@ def methods(record: ResultRecord) -> str:
     score = record.score
     text = (
         f"The model {score.name} was compared with {_origin.recordings_name(score)} "
-        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) by representational similarity analysis"
+        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
+        "by representational similarity analysis"
     )
     text += f" ({score.metric})" if score.metric else ""
     text += f", with noise correction by the estimator '{score.estimator}'."

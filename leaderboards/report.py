@@ -178,16 +178,18 @@ def build_leaderboard(
 def _board_view(board: Board) -> dict[str, Any]:
     scores = [row.record.score for row in board.rows] + [baseline.score for baseline in board.baselines]
     axis = score_axis(scores)
+    layer_axis = axis_of(layer.value for row in board.rows for layer in row.record.score.layers)
     animals = next((baseline.score for baseline in board.baselines if baseline.kind == "animals"), None)
     return {
         "board": board,
         "size": _words.plural(len(board.rows), "result"),
         "axis": axis,
+        "layer_axis": layer_axis,
         "band": _band(animals),
         "ceiling": next((score.ceiling for score in scores if score.ceiling), None),
         "rows": _board_rows(board, axis),
         "brain_rdm": next((picture for s in scores if (picture := rdm_picture(s.brain_rdm, s.stimuli))), None),
-        "models": [_model_view(row, axis) for row in board.rows],
+        "models": [_model_view(row, layer_axis) for row in board.rows],
     }
 
 
@@ -253,7 +255,7 @@ def _model_view(row: RankedRecord, axis: Axis) -> dict[str, Any]:
 def _layer_rows(score: Score, axis: Axis) -> list[_LayerRow]:
     rows = []
     for layer in score.layers:
-        notes = ["chosen on held-out animals"] if layer.layer == score.layer else []
+        notes = ["chosen on held-out data"] if layer.layer == score.layer else []
         best = layer.layer == score.best_layer
         notes += ["optimistic maximum, not a result"] if best else []
         kind = "chosen" if layer.layer == score.layer else "best" if best else "layer"

@@ -321,3 +321,19 @@ def test_nothing_hostile_runs_in_a_browser(make_record, tmp_path):
     )  # fmt: skip
     assert "<title>calm</title>" in done.stdout
     assert '<th scope="col" class="n" data-sort="ascending"><button' in done.stdout  # our own script did run
+
+
+def test_a_trusted_score_keeps_its_caveats(make_record, tmp_path):
+    record = make_record(reasons=("one animal: no confidence interval",), interval=None)
+    for page in (report(record, tmp_path), board([record], tmp_path)):
+        assert "one animal: no confidence interval" in page.text
+    assert "not ranked: no interval" in board([record], tmp_path).text
+
+
+def test_values_beyond_the_axis_are_arrows_and_keep_their_number(make_record, tmp_path):
+    page = board([make_record("far", 7.25, status="unreliable"), make_record("near", 0.4)], tmp_path)
+    assert "7.250" in page.text
+    uses = [use["href"] for use in page.all("use") if use.get("class") == "arrow"]
+    assert set(uses) == {"#right"}
+    ticks = [text for tag, text in page.texts if tag == "text"]
+    assert max(float(tick.replace("−", "-")) for tick in ticks) == 1.5
