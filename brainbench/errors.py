@@ -36,13 +36,20 @@ class MissingDependencyError(BrainbenchError, ImportError):
 def nearest(name: str, options: Iterable[str]) -> str | None:
     """Return the option closest in spelling to ``name``, or None when nothing is close.
 
+    Of dotted options the last part counts too.
+
     >>> nearest("zhuan", ["zhuang", "resnet18"])
     'zhuang'
+    >>> nearest("fc7", ["encoder.conv1", "encoder.fc7"])
+    'encoder.fc7'
     """
     choices = list(options)
     lowered = {choice.lower(): choice for choice in reversed(choices)}
-    hits = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
-    return lowered[hits[0]] if hits else None
+    last_parts = {choice.lower().rpartition(".")[2]: choice for choice in reversed(choices)}
+    for candidates in (lowered, last_parts):
+        if hits := difflib.get_close_matches(name.lower(), candidates, n=1, cutoff=0.5):
+            return candidates[hits[0]]
+    return None
 
 
 def listing(options: Iterable[str], *, limit: int = 12) -> str:

@@ -15,7 +15,7 @@ from torch import nn
 
 from brainbench.errors import UsageError, unknown_name
 from brainbench.models.attenders.gpt import GPTAttender, GPTState
-from brainbench.models.decoders import CLASSES, linear_decoder
+from brainbench.models.decoders import linear_decoder
 from brainbench.models.graph import GraphState, TemporalGraph
 from brainbench.models.normaliser import Normaliser
 from brainbench.types import CHANNELS
@@ -65,7 +65,7 @@ class EAD(nn.Module):
     Args:
         encoder: A graph whose output is [B, T, F].
         attender: Maps [B, T, F] to [B, T, W]; None passes the features on.
-        decoder: Maps features to outputs; None is the linear decoder.
+        decoder: Maps features to outputs, ending in a linear layer; None is the linear decoder to 117 classes.
         normaliser: None is :meth:`Normaliser.physical`.
 
     ``layers`` lists what :meth:`activations` can return, from stimulus to output.
@@ -78,14 +78,13 @@ class EAD(nn.Module):
         decoder: nn.Module | None = None,
         *,
         normaliser: Normaliser | None = None,
-        classes: int = CLASSES,
     ) -> None:
         super().__init__()
         (features,) = encoder.spec.shapes()[1][encoder.spec.output]
         self.normaliser = normaliser or Normaliser.physical(SUB_STEPS)
         self.encoder = encoder
         self.attender = attender
-        self.decoder = decoder or linear_decoder(attender.features if attender is not None else features, classes)
+        self.decoder = decoder or linear_decoder(attender.features if attender is not None else features)
         self.spec = ModelSpec(
             input_shape=encoder.input_shape,
             channels=tuple(f"{sub_step}.{name}" for sub_step in range(SUB_STEPS) for name in CHANNELS),
@@ -97,7 +96,7 @@ class EAD(nn.Module):
             receptive_field=None,
             latency=encoder.spec.first_response()[encoder.spec.output],
             max_steps=attender.max_steps if attender is not None else None,
-            outputs=classes,
+            outputs=_outputs(self.decoder),
         )
         attended = [f"attender.{name}" for name in attender.layers] if attender is not None else []
         self.layers: tuple[str, ...] = (*(f"encoder.{name}" for name in encoder.layers), *attended, "decoder")
@@ -172,6 +171,13 @@ class EAD(nn.Module):
 
     def _expected(self, *leading: str) -> str:
         return f"[{', '.join((*leading, *map(str, self.spec.input_shape)))}]"
+
+
+def _outputs(decoder: nn.Module) -> int:
+    linear = [module for module in decoder.modules() if isinstance(module, nn.Linear)]
+    if not linear:
+        raise UsageError(f"A decoder must end in a linear layer; received {type(decoder).__name__} without any.")
+    return linear[-1].out_features
 
 
 def _named(

@@ -152,7 +152,9 @@ def _uneven():
     """Two grids, feedback across them, a pool and a node that reads the stimulus and feedback."""
     return GraphSpec(
         nodes=(
-            Node("low", Convolution(3, (3, 3), padding="same"), Memory("time-decay", tau=0.5), pool=Pool("max", (2, 2))),
+            Node(
+                "low", Convolution(3, (3, 3), padding="same"), Memory("time-decay", tau=0.5), pool=Pool("max", (2, 2))
+            ),
             Node("high", Convolution(4, (2, 2), (1, 1), "valid", activation="ELU"), activation=None),
             Node("out", Dense(5, activation="Tanh"), activation=None),
         ),

@@ -1,0 +1,178 @@
+import logging
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
+
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.models import registry
+from brainbench.models.registry import describe_model, find_model, list_models, load_model, register_model
+
+SMALL = "zhuang-ugrnn-small"
+
+
+@pytest.fixture
+def _clean(monkeypatch):
+    """Keep what a test registers out of the registry of the others."""
+    list_models()
+    monkeypatch.setattr(registry, "_records", dict(registry._records))
+
+
+def test_names_follow_the_grammar_and_patterns_select_them():
+    names = list_models()
+    assert names[0] == "zhuang"
+    assert len(names) == len(set(names)) == 36
+    assert list_models("zhuang-intersection-ln*") == [
+        "zhuang-intersection-ln",
+        "zhuang-intersection-ln+gpt",
+        "zhuang-intersection-ln-small",
+        "zhuang-intersection-ln-small+gpt",
+    ]
+    assert list_models("resnet*") == []
+
+
+def test_listing_models_imports_no_framework():
+    code = "import sys, brainbench; brainbench.list_models(); print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("zhuang-intersecton-ln", "Unknown model 'zhuang-intersecton-ln'; did you mean 'zhuang-intersection-ln'?"),
+        ("Zhuang-LSTM", "did you mean 'zhuang-lstm'"),
+        ("zhuang.supervized", r"did you mean 'supervised'\? Allowed: 'supervised', 'simclr', 'simsiam', 'ae'"),
+        ("models/mine.py:make", "looks like a path, not a model's name; .* path/to/file.py:make_model"),
+        ("mine.py", "looks like a path"),
+        ("zhuang+gpt.simclr", r"train them with: brainbench train zhuang\+gpt --objective simclr; or load"),
+    ],
+)
+def test_a_name_without_a_model_is_answered_in_one_sentence(name, message):
+    with pytest.raises(UsageError, match=message):
+        load_model(name)
+
+
+def test_equal_seeds_give_equal_weights_and_disturb_nobody():
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    first = load_model(SMALL, seed=3).state_dict()
+    assert torch.equal(torch.rand(3), expected)
+    torch.rand(100)
+    second, third = load_model(SMALL, seed=3).state_dict(), load_model(SMALL, seed=4).state_dict()
+    assert all(torch.equal(value, second[name]) for name, value in first.items())
+    assert any(not torch.equal(value, third[name]) for name, value in first.items())
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True, "0"])
+def test_a_seed_is_a_whole_number(seed):
+    with pytest.raises(UsageError, match="seed must be a whole number"):
+        load_model(SMALL, seed=seed)
+
+
+def test_a_loaded_model_is_ready_for_evaluation():
+    assert not any(module.training for module in load_model(SMALL).modules())
+
+
+def test_weights_are_loaded_under_a_tag_only(tmp_path):
+    from safetensors.torch import save_file
+
+    file = tmp_path / "weights.safetensors"
+    source = load_model(SMALL, seed=9).state_dict()
+    save_file(source, file)
+    loaded = load_model(f"{SMALL}.supervised", pretrained=file).state_dict()
+    assert all(torch.equal(value, loaded[name]) for name, value in source.items())
+    with pytest.raises(UsageError, match=f"Without a tag '{SMALL}' is the untrained model"):
+        load_model(SMALL, pretrained=file)
+    with pytest.raises(DataError, match="do not fit the model 'zhuang-gru-small.simclr'"):
+        load_model("zhuang-gru-small.simclr", pretrained=file)
+    with pytest.raises(DataFileNotFoundError, match="no file of weights"):
+        load_model(f"{SMALL}.ae", pretrained=tmp_path / "none.safetensors")
+    file.write_bytes(b"nothing")
+    with pytest.raises(DataError, match="not a readable safetensors file"):
+        load_model(f"{SMALL}.ae", pretrained=file)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"), [("zhuang-intersection-ln", 37_988_821), ("zhuang-intersection-ln+gpt", 63_767_509)]
+)
+def test_a_description_states_the_published_size(name, parameters):
+    described = describe_model(name)
+    assert described.parameters == parameters
+    assert described.licence == "MIT"
+    assert "NeurIPS" in described.citation
+    assert described.layers[-1] == "decoder"
+
+
+@pytest.mark.parametrize("name", ["zhuang-small", "zhuang-gru-ln-small", "zhuang-lstm-small+gpt"])
+def test_multiply_adds_equal_pytorchs_count(name):
+    model = load_model(name)
+    # PyTorch does not count its fused attention on the CPU; a multiply-add is two FLOPs.
+    with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        model(torch.zeros(1, 1, 30, 5, 7))
+    assert describe_model(name).multiply_adds == counter.get_total_flops() // 2
+
+
+def test_the_full_gated_network_costs_what_was_published():
+    assert describe_model("zhuang-intersection-ln").multiply_adds == pytest.approx(0.46e9, rel=0.01)
+
+
+@pytest.mark.usefixtures("_clean")
+def test_a_registered_function_becomes_a_model():
+    @register_model("tiny+linear", family="linear", licence="MIT")
+    def tiny():
+        return nn.Sequential(nn.Flatten(2), nn.Linear(1050, 3))
+
+    assert list_models("tiny*") == ["tiny+linear"]
+    assert load_model("tiny+linear")(torch.zeros(1, 2, 30, 5, 7)).shape == (1, 2, 3)
+    described = describe_model("tiny+linear")
+    assert (described.parameters, described.multiply_adds, described.layers) == (3153, None, ())
+    with pytest.raises(UsageError, match="'tiny\\+linear' is already registered"):
+        register_model("tiny+linear", family="linear")(tiny)
+
+
+@pytest.mark.usefixtures("_clean")
+def test_our_names_are_taken_from_the_start():
+    with pytest.raises(UsageError, match="'zhuang' is already registered"):
+        register_model("zhuang", family="mine")(nn.Identity)
+
+
+@pytest.mark.parametrize("name", ["Zhuang", "a.b", "a b", "a--b", "", "a/b", "+a"])
+def test_a_name_outside_the_grammar_is_refused(name):
+    with pytest.raises(UsageError, match="lower-case letters and digits joined by"):
+        register_model(name, family="x")
+
+
+def test_a_record_cannot_be_changed_from_outside():
+    record = find_model("zhuang")
+    assert record is not find_model("zhuang")
+    assert record == find_model("zhuang")
+    with pytest.raises(AttributeError):
+        record.family = "mine"
+
+
+@pytest.mark.usefixtures("_clean")
+def test_models_of_other_packages_arrive_and_broken_ones_are_announced(tmp_path, monkeypatch, caplog):
+    package = tmp_path / "elsewhere.py"
+    package.write_text(
+        "from torch import nn\n"
+        "from brainbench.models.registry import register_model\n"
+        "@register_model('elsewhere', family='theirs')\n"
+        "def make():\n    return nn.Identity()\n"
+    )
+    info = tmp_path / "elsewhere-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[brainbench.models]\nmine = elsewhere\nbroken = elsewhere:absent\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "_records", {})
+    monkeypatch.setattr(registry, "_sources", set())
+    with caplog.at_level(logging.WARNING):
+        names = list_models()
+    assert "elsewhere" in names
+    assert "zhuang" in names
+    assert "entry point 'broken' (elsewhere:absent) could not be loaded" in caplog.text
