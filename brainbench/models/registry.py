@@ -161,7 +161,8 @@ def describe_model(name: str) -> ModelDescription:
 
     record = find_model(name)
     with torch.device("meta"):
-        model = record.build().eval()
+        model = record.build()
+    count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
     return ModelDescription(
         record.name,
         record.family,
@@ -169,7 +170,7 @@ def describe_model(name: str) -> ModelDescription:
         record.citation,
         record.licence,
         parameters=sum(parameter.numel() for parameter in model.parameters()),
-        multiply_adds=count() if callable(count := getattr(model, "multiply_adds", None)) else None,
+        multiply_adds=count() if count is not None else None,
         layers=tuple(getattr(model, "layers", ())),
     )
 

@@ -71,7 +71,7 @@ def test_a_full_context_is_announced():
     state = attender.init_state(1)
     for _ in range(5):
         _, state = attender.step(torch.zeros(1, 12), state)
-    with pytest.raises(UsageError, match="received step 6. Shorten the sweep or start again from init_state"):
+    with pytest.raises(UsageError, match=r"received step 6\. Shorten the sweep or start again from init_state"):
         attender.step(torch.zeros(1, 12), state)
 
 

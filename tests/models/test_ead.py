@@ -65,7 +65,7 @@ def test_a_choice_of_layers_equals_the_whole(layers):
 
 
 def test_an_unknown_layer_names_the_nearest():
-    with pytest.raises(UsageError, match="did you mean 'encoder.conv3'"):
+    with pytest.raises(UsageError, match=r"did you mean 'encoder\.conv3'"):
         _network().activations(_sweep(), ["conv3"])
 
 

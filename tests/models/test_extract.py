@@ -55,7 +55,7 @@ def test_every_layer_of_ours_comes_with_its_time_steps(stimuli):
 def test_layers_can_be_chosen_and_unknown_ones_name_the_nearest(stimuli):
     model = load_model("zhuang-small")
     assert list(extract(model, stimuli, layers=["decoder", "encoder.fc7"])) == ["encoder.fc7", "decoder"]
-    with pytest.raises(UsageError, match="Unknown layer 'fc7'; did you mean 'encoder.fc7'"):
+    with pytest.raises(UsageError, match=r"Unknown layer 'fc7'; did you mean 'encoder\.fc7'"):
         extract(model, stimuli, layers=["fc7"])
 
 
@@ -158,7 +158,7 @@ def test_submodules_can_be_asked_for_by_name(stimuli):
     assert list(extract(model, stimuli)) == ["0", "1.0", "1.1", "output"]
     chosen = extract(model, stimuli, layers=["1"])
     np.testing.assert_array_equal(chosen["1"], extract(model, stimuli)["1.1"])
-    with pytest.raises(UsageError, match="Unknown layer '1.2'; did you mean '1"):
+    with pytest.raises(UsageError, match=r"Unknown layer '1\.2'; did you mean '1"):
         extract(model, stimuli, layers=["1.2"])
 
 

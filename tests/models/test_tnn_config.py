@@ -142,7 +142,7 @@ def test_a_file_is_read_and_a_bad_one_named(tmp_path):
     good.write_text(json.dumps(_config()))
     bad.write_text("{")
     assert read_graph(good) == read_graph(_config())
-    with pytest.raises(DataError, match="bad.json' is not valid JSON"):
+    with pytest.raises(DataError, match=r"bad\.json' is not valid JSON"):
         read_graph(bad)
     with pytest.raises(DataError, match="There is no file"):
         read_graph(tmp_path / "none.json")
