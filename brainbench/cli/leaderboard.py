@@ -22,11 +22,19 @@ def build(
     as_json: JsonOption = False,
 ) -> None:
     """Write one self-contained HTML page from result records."""
+    from brainbench.errors import DataFileNotFoundError
     from leaderboards.report import build_leaderboard
 
     from leaderboards.store import read_records
 
-    stored = read_records(records or [Path("brainbench-results")])
+    sources = records or [Path("brainbench-results")]
+    for source in sources:
+        if not source.exists():
+            raise DataFileNotFoundError(
+                f"There is no file or folder {str(source)!r} to read result records from; "
+                "make one first, for example with: brainbench score zhuang-intersection-ln"
+            )
+    stored = read_records(sources)
     page = build_leaderboard(stored, out, title=title)
     good = [item for item in stored if not item.problem]
     bad = [{"path": item.path, "problem": item.problem} for item in stored if item.problem]

@@ -1,0 +1,162 @@
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from brainbench.datasets import make_session, write_recordings
+from brainbench.models.features import write_features
+
+LABELS = ("a", "b", "c", "d")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, str]:
+    """A recording of two animals, features and arrays for its four conditions."""
+    rng = np.random.default_rng(0)
+    for animal in "xy":
+        order = np.repeat(np.arange(4), 10)
+        starts = 1.0 + np.arange(len(order))
+        rates = rng.gamma(2.0, 8.0, size=(4, 12))
+        spikes = [
+            np.sort(
+                np.concatenate(
+                    [s + rng.uniform(0, 0.5, rng.poisson(rates[k, u])) for s, k in zip(starts, order, strict=True)]
+                )
+            )
+            for u in range(12)
+        ]
+        table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [LABELS[k] for k in order]}
+        session = make_session(animal, "1", spikes, {"trials": table}, observed=[np.array([[0.0, 60.0]])] * 12)
+        write_recordings(tmp_path / "data" / f"{animal}.h5", session)
+    features = write_features(tmp_path / "features.h5", LABELS, {"fc": rng.normal(size=(4, 6))})
+    with h5py.File(tmp_path / "arrays.h5", "w") as file:
+        file["stimuli"] = rng.normal(size=(4, 3, 2, 2, 2)).astype(np.float32)
+        file["labels"] = np.array(LABELS, dtype=h5py.string_dtype())
+    (tmp_path / "mine.py").write_text(
+        "from torch import nn\n\n\nclass Mine(nn.Module):\n"
+        "    def __init__(self):\n        super().__init__()\n        self.gru = nn.GRU(8, 6, batch_first=True)\n\n"
+        "    def forward(self, x):\n        return self.gru(x.flatten(2))[0][:, -1]\n"
+    )
+    return {
+        "recordings": str(tmp_path / "data"),
+        "features": str(features),
+        "arrays": str(tmp_path / "arrays.h5"),
+        "model": f"{tmp_path / 'mine.py'}:Mine",
+        "out": str(tmp_path / "out"),
+    }
+
+
+def _score(run, files: dict[str, str], model: str, *more: str):
+    return run(
+        "score",
+        model,
+        "--recordings",
+        files["recordings"],
+        "--conditions",
+        "trials:texture",
+        "--out",
+        files["out"],
+        *more,
+    )
+
+
+def test_score_prints_the_statistics_and_writes_record_and_report(run, files):
+    result = _score(run, files, files["features"])
+    assert result.status == 0, result.err
+    for word in ("score", "status", "reliability", "permutation p", "noise ceiling", "animal to animal"):
+        assert word in result.out
+    record = next(Path(files["out"]).glob("*.json"))
+    report = record.with_suffix(".html")
+    assert str(record) in result.out
+    assert str(report) in result.out
+    assert "<html" in report.read_text().lower()
+
+
+def test_json_is_one_document_on_stdout(run, files):
+    result = _score(run, files, files["features"], "--json")
+    data = json.loads(result.out)
+    assert Path(data["record_path"]).is_file()
+    assert json.loads(Path(data["record_path"]).read_text()) == data["record"]
+    assert data["record"]["score"]["stimuli"] == list(LABELS)
+
+
+def test_a_users_file_is_scored_on_a_users_arrays(run, files):
+    result = _score(run, files, files["model"], "--stimuli", files["arrays"], "--json")
+    assert result.status == 0, result.err
+    record = json.loads(result.out)["record"]
+    assert {item["layer"] for item in record["score"]["layers"]} == {"gru", "output"}
+    assert set(record["baselines"]) == {"raw input", "random features"}
+
+
+def test_labels_are_matched_by_a_file(run, files, tmp_path):
+    other = write_features(
+        tmp_path / "o.h5", ["w", "b", "c", "d"], {"fc": np.random.default_rng(1).normal(size=(4, 6))}
+    )
+    result = _score(run, files, str(other))
+    assert result.status == 2
+    assert "without a stimulus: 'a'" in result.err
+    match = tmp_path / "match.csv"
+    match.write_text("a,w\n")
+    assert _score(run, files, str(other), "--match", str(match)).status == 0
+
+
+def test_the_leaderboard_is_built_from_records(run, files, tmp_path):
+    _score(run, files, files["features"])
+    page = tmp_path / "board.html"
+    broken = Path(files["out"]) / "broken.json"
+    broken.write_text("{")
+    result = run("leaderboard", "build", files["out"], "--out", str(page), "--json")
+    data = json.loads(result.out)
+    assert data["records"] == 1
+    assert len(data["problems"]) == 1
+    assert "features" in page.read_text()
+
+
+def test_the_leaderboard_of_no_records_says_how_to_get_some(run, tmp_path):
+    result = run("leaderboard", "build", str(tmp_path / "none"), "--out", str(tmp_path / "page.html"))
+    assert result.status == 2
+    assert not (tmp_path / "page.html").exists()
+    assert "brainbench score" in result.err
+
+
+def test_recordings_rdm_shows_reliability(run, files):
+    result = run("recordings", "rdm", files["recordings"], "--conditions", "trials:texture", "--json")
+    data = json.loads(result.out)
+    assert data["labels"] == list(LABELS)
+    assert [item["subject"] for item in data["animals"]] == ["x", "y"]
+    assert all(len(item["rdm"]) == 6 and item["units"] == 12 for item in data["animals"])
+
+
+def test_recordings_inspect_proposes_conditions(run, files):
+    result = run("recordings", "inspect", str(Path(files["recordings"]) / "x.h5"))
+    assert result.status == 0
+    assert "trials:texture" in result.out
+
+
+def test_models_are_listed_and_described(run):
+    names = [item["name"] for item in json.loads(run("models", "list", "zhuang-intersection*", "--json").out)]
+    assert "zhuang-intersection-ln" in names
+    shown = json.loads(run("models", "show", "zhuang-intersection-ln", "--json").out)
+    assert shown["parameters"] == 37_988_821
+    assert "37,988,821" in run("models", "show", "zhuang-intersection-ln").out
+
+
+def test_stimuli_are_listed(run):
+    assert "rodgers" in run("stimuli", "list").out
+
+
+def test_doctor_says_what_each_missing_part_would_enable(run, monkeypatch):
+    from brainbench.cli import doctor
+
+    found = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "pynwb" else found(name))
+    result = run("doctor")
+    assert result.status == 0
+    line = next(line for line in result.out.splitlines() if line.startswith("pynwb"))
+    assert "not installed" in line
+    assert "brainbench[nwb]" in line
+    data = json.loads(run("doctor", "--json").out)
+    assert data["optional"]["pynwb"]["version"] is None
+    assert data["required"]["torch"]

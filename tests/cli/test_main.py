@@ -1,0 +1,73 @@
+import json
+import subprocess
+import sys
+
+import pytest
+
+import brainbench
+
+HEAVY = {"torch", "xarray", "h5py", "mujoco", "scipy", "trimesh", "pandas", "matplotlib", "plotly"}
+COMMANDS = ["score", "models", "recordings", "stimuli", "leaderboard", "doctor"]
+
+
+def _modules_after(statement: str) -> set[str]:
+    code = f"{statement}\nimport sys, json\nprint(json.dumps([name for name in sys.modules if '.' not in name]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+@pytest.mark.parametrize("statement", ["import brainbench", "import brainbench.cli", "import leaderboards"])
+def test_importing_loads_nothing_heavy(statement: str):
+    assert not _modules_after(statement) & HEAVY
+
+
+def test_the_public_names_resolve():
+    for name in brainbench.__all__:
+        assert getattr(brainbench, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'scoer'"):
+        _ = brainbench.scoer
+
+
+def test_help_lists_the_commands(run):
+    result = run("--help")
+    assert result.status == 0
+    for command in COMMANDS:
+        assert command in result.out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(run, command: str):
+    result = run(command, "--help")
+    assert result.status == 0
+    assert "Usage" in result.out
+
+
+def test_version_is_the_package_version(run):
+    assert run("--version").out.strip() == brainbench.__version__
+
+
+def test_a_wrong_option_is_a_usage_error(run):
+    assert run("score", "zhuang", "--nonsense").status == 2
+
+
+def test_a_wrong_name_ends_with_status_two_and_one_line_on_stderr(run):
+    result = run("models", "show", "zhuagn")
+    assert result.status == 2
+    assert result.out == ""
+    assert "did you mean 'zhuang'" in result.err
+    assert "Traceback" not in result.err
+
+
+def test_unusable_data_ends_with_status_one(run, tmp_path):
+    (tmp_path / "a.nwb").write_text("this is not HDF5")
+    result = run("recordings", "inspect", str(tmp_path / "a.nwb"))
+    assert result.status == 1
+    assert "not an HDF5 file" in result.err
+
+
+def test_shell_completion_can_be_shown():
+    code = "from brainbench.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--show-completion", "bash"], capture_output=True, text=True, check=False
+    )
+    assert "complete" in done.stdout.lower() + done.stderr.lower()
