@@ -122,8 +122,8 @@ def draw_spikes(
     first = np.floor((behaviour.onset + LATENCY - low) / frame).astype(int)
     total = int((high - low) / frame)
     expected = np.broadcast_to(rest, (total, units)).copy()
-    shared = random.gamma(25.0, 1 / 25.0, len(first))
-    own = random.gamma(14.0, 1 / 14.0, (len(first), units))
+    shared = random.gamma(40.0, 1 / 40.0, len(first))
+    own = random.gamma(9.0, 1 / 9.0, (len(first), units))
     fraction = (behaviour.onset + LATENCY - low) / frame - first
     for trial, stimulus in enumerate(behaviour.stimulus):
         begin, end = first[trial], first[trial] + frames + 1

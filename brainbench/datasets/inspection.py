@@ -143,13 +143,13 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
         with open_file(file_path) as file:
             if hdf5.is_ours(file) and hdf5.read_kind(file, file_path) == "counts":
                 return _counted(hdf5.read_counts(file, file_path), file_path)
-            sessions = read_file(file, file_path)
-            for session in sessions:
+            for session in read_file(file, file_path):
                 found = detect_recipe(session)
                 recipes[found.name if found else None] = None
                 formats[session.format] = None
-                summaries.append(_summary(session))
-            proposals += propose(sessions)
+                own = propose([session])
+                summaries.append(_summary(session, bool(own)))
+                proposals += own
     return Inspection(
         path=os.fspath(path),
         format=", ".join(formats),
@@ -214,7 +214,7 @@ def _is_time(column: ColumnSummary) -> bool:
     return column.name in ("start_time", "stop_time") or column.name.endswith(("_time", "_times"))
 
 
-def _summary(session: Session) -> SessionSummary:
+def _summary(session: Session, usable: bool) -> SessionSummary:
     units = _units(session)
     tables = tuple(_table(table) for table in session.tables.values())
     missing = [no_units(session)] if units is None else []
@@ -222,7 +222,7 @@ def _summary(session: Session) -> SessionSummary:
     missing += [f"table {table.name}: {table.problem}" for table in tables if table.problem]
     if not session.tables:
         missing.append("no interval tables: nothing says when which stimulus was presented")
-    elif not propose([session]):
+    elif not usable:
         missing.append("no column of the interval tables has 2 to 60 values with at least two trials each")
     return SessionSummary(
         subject=session.subject,
@@ -275,12 +275,15 @@ def _columns(table: Table) -> Iterator[ColumnSummary]:
         except DataError:
             yield ColumnSummary(name, "other", 0)
             continue
-        counts = Counter(item for item in as_labels(values).tolist() if item)
-        labels = list(counts)
+        unique, number = np.unique(values, return_counts=True)
+        labels = as_labels(unique).tolist()
+        present = [index for index, label in enumerate(labels) if label]
         kind = _kind(values)
-        shown = [labels[index] for index in natural_order(labels)[:_EXAMPLES]]
+        if kind == "text":
+            present = [present[index] for index in natural_order(labels[index] for index in present)]
+        shown = [labels[index] for index in present[:_EXAMPLES]]
         examples = tuple(f"{float(item):.6g}" for item in shown) if kind == "number" else tuple(shown)
-        yield ColumnSummary(name, kind, len(counts), examples, min(counts.values(), default=0))
+        yield ColumnSummary(name, kind, len(present), examples, int(min(number[present], default=0)))
 
 
 def _kind(values: np.ndarray) -> str:
