@@ -20,7 +20,7 @@ MARGIN = 4.0
 """Percent of the cell kept free on each side, so that marks at the ends are not cut."""
 
 LIMITS = (-1.0, 1.5)
-"""Farthest an axis reaches; what lies beyond is drawn as an arrow at the edge (its number stands beside it)."""
+"""Farthest an axis reaches; an arrow at its end tells that something lies beyond."""
 
 # Nine equidistant colours of viridis (van der Walt & Smith 2015), perceptually uniform and safe for
 # colour-blind readers.
@@ -36,11 +36,9 @@ class Mark:
     low: float | None
     high: float | None
     points: tuple[float, ...]
-    beyond: str
-    """``left`` or ``right`` when the value lies off the axis, else empty."""
-    low_open: bool
-    high_open: bool
-    """True when the interval goes on beyond the axis."""
+    more_left: bool
+    """True when the value, the interval or a point lies beyond the left end of the axis."""
+    more_right: bool
 
 
 @dataclass(frozen=True)
@@ -56,19 +54,23 @@ class Axis:
         inside = min(max(value, self.low), self.high)
         return round(MARGIN + (100 - 2 * MARGIN) * (inside - self.low) / (self.high - self.low), 2)
 
-    def mark(self, value: float, interval: Interval | None = None, points: Iterable[float] = ()) -> Mark:
+    def mark(self, value: float, interval: Interval | None = None, points: Sequence[float] = ()) -> Mark:
         """Place a value with its interval and the single observations behind it; NaN is not drawn."""
-        drawn = math.isfinite(value)
-        span = interval if interval and math.isfinite(interval.low) and math.isfinite(interval.high) else None
+        span = (interval.low, interval.high) if interval and known(interval) else None
+        seen = [item for item in (value, *(span or ()), *points) if math.isfinite(item)]
         return Mark(
-            x=self.at(value) if drawn else None,
-            low=self.at(span.low) if span else None,
-            high=self.at(span.high) if span else None,
+            x=self.at(value) if self.low <= value <= self.high else None,
+            low=self.at(span[0]) if span else None,
+            high=self.at(span[1]) if span else None,
             points=tuple(self.at(point) for point in points if self.low <= point <= self.high),
-            beyond="" if not drawn or self.low <= value <= self.high else "left" if value < self.low else "right",
-            low_open=bool(span and span.low < self.low),
-            high_open=bool(span and span.high > self.high),
+            more_left=any(item < self.low for item in seen),
+            more_right=any(item > self.high for item in seen),
         )
+
+
+def known(interval: Interval | None) -> bool:
+    """Tell whether there is an interval and both its ends are numbers."""
+    return interval is not None and math.isfinite(interval.low) and math.isfinite(interval.high)
 
 
 def axis_of(values: Iterable[float]) -> Axis:
@@ -77,7 +79,7 @@ def axis_of(values: Iterable[float]) -> Axis:
     low = max(min([0.0, *finite]), LIMITS[0])
     high = min(max([1.0, *finite]), LIMITS[1])
     step = 0.5 if high - low > 1.6 else 0.25
-    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    first, last = math.floor(low / step), math.ceil(high / step)
     return Axis(first * step, last * step, tuple(step * i for i in range(first, last + 1)))
 
 
@@ -86,7 +88,7 @@ def score_axis(scores: Iterable[Score]) -> Axis:
     values: list[float] = []
     for score in scores:
         values.append(score.value)
-        if score.status == "ok" and score.interval:
+        if score.status == "ok" and score.interval and known(score.interval):
             values += [score.interval.low, score.interval.high]
     return axis_of(values)
 
@@ -126,7 +128,7 @@ def rdm_picture(pairs: Sequence[float], labels: Sequence[str]) -> RdmPicture | N
         f"{labels[alike[0]]} and {labels[alike[1]]}, most different {labels[apart[0]]} and {labels[apart[1]]}."
     )
     if len(finite) < len(pairs):
-        description += f" {len(pairs) - len(finite)} pairs are undefined."
+        description += f" Undefined pairs: {len(pairs) - len(finite)}."
     return RdmPicture(_png(cells), tuple(labels), low, high, description)
 
 

@@ -49,6 +49,7 @@ def _environment() -> Environment:
         environment.filters[helper.__name__] = helper
     environment.globals |= {
         "STATUS": _words.STATUS,
+        "MARGIN": _figures.MARGIN,
         "SYNTHETIC": _words.SYNTHETIC,
         "p_sentence": _words.p_sentence,
         "colour_stops": _figures.colour_stops(),

@@ -10,6 +10,7 @@ from typing import Any
 
 from brainbench.types import Interval, ModelCard, ResultRecord, Score
 from leaderboards import _origin
+from leaderboards._figures import known
 
 STATUS = {
     "ok": "The recordings are reliable enough to trust this number.",
@@ -90,12 +91,13 @@ def comparisons(record: ResultRecord) -> list[str]:
     others = list(record.baselines.items())
     if record.animal_to_animal is not None:
         others.append(("animal-to-animal", record.animal_to_animal))
-    if score.status != "ok" or score.interval is None:
+    if score.status != "ok" or score.interval is None or not known(score.interval):
         return []
     sentences = []
     for name, other in others:
-        if other.status != "ok" or other.interval is None:
-            sentences.append(f"Cannot be compared with {name}, which is {other.status}.")
+        if other.status != "ok" or other.interval is None or not known(other.interval):
+            reason = "has no interval" if other.status == "ok" else f"is {other.status}"
+            sentences.append(f"Cannot be compared with {name}, which {reason}.")
         elif score.interval.low > other.interval.high:
             sentences.append(f"Above {name} ({number(other.value)}): the intervals do not overlap.")
         elif score.interval.high < other.interval.low:

@@ -20,6 +20,7 @@ from typing import Any
 
 from brainbench.types import Interval, ResultRecord, Score
 from leaderboards import _origin
+from leaderboards._figures import known
 from leaderboards.store import record_name
 
 
@@ -144,7 +145,7 @@ def _unranked(record: ResultRecord, comparable: bool) -> str:
     score = record.score
     if score.status != "ok":
         return score.status
-    if score.interval is None or not (math.isfinite(score.interval.low) and math.isfinite(score.interval.high)):
+    if not known(score.interval):
         return "no interval"
     return "" if comparable else "recordings not identified"
 

@@ -337,3 +337,17 @@ def test_values_beyond_the_axis_are_arrows_and_keep_their_number(make_record, tm
     assert set(uses) == {"#right"}
     ticks = [text for tag, text in page.texts if tag == "text"]
     assert max(float(tick.replace("−", "-")) for tick in ticks) == 1.5
+
+
+def test_numbers_that_do_not_exist_are_never_drawn(make_record, make_score, tmp_path):
+    from dataclasses import replace
+
+    from brainbench.types import Ceiling, Interval
+
+    nothing = Interval(float("nan"), float("nan"))
+    record = make_record(interval=nothing, ceiling=Ceiling(float("nan"), float("nan")), r=float("nan"))
+    record = replace(record, animal_to_animal=make_score("animal-to-animal", 0.5, interval=nothing))
+    for page in (report(record, tmp_path), board([record], tmp_path)):
+        values = [value for tag, attributes in page.elements if tag != "a" for value in attributes.values()]
+        assert not [value for value in values if re.search(r"\bnan\b", value)]
+    assert "Not told apart" not in report(record, tmp_path).text
