@@ -24,7 +24,6 @@ def build(
     """Write one self-contained HTML page from result records."""
     from brainbench.errors import DataFileNotFoundError
     from leaderboards.report import build_leaderboard
-
     from leaderboards.store import read_records
 
     sources = records or [Path("brainbench-results")]

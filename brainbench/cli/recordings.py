@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from brainbench.cli._shared import JsonOption, emit, table
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from brainbench.metrics import SubjectRDM
+
+_LARGEST_SHOWN = 12
+"""RDMs of more conditions are only written as JSON."""
 
 app = typer.Typer(no_args_is_help=True, help="Inspect neural recordings and their reliability.")
 
@@ -54,10 +63,33 @@ def rdm(
         ],
     }
     rows = [
-        [item.subject, str(item.units), str(item.trials), f"{item.reliability:.3f}", item.problem or ""]
-        for item in animals
+        [item.subject, str(item.units), str(item.trials), f"{item.reliability:.3f}", _verdict(item)] for item in animals
     ]
     text = table(
-        f"{len(labels)} conditions: {', '.join(labels)}", ["animal", "units", "trials", "reliability", ""], rows
+        f"{brain.dataset.attrs['conditions']}, {brain.dataset.attrs['window']}; RDM: correlation distance",
+        ["animal", "units", "trials", "reliability", ""],
+        rows,
+        right=(1, 2, 3),
     )
+    if len(labels) <= _LARGEST_SHOWN:
+        for item in animals:
+            text += "\n\n" + _matrix(f"RDM of {item.subject}", labels, item.rdm)
     emit(data, text, as_json=as_json)
+
+
+def _verdict(animal: SubjectRDM) -> str:
+    from brainbench.metrics import RELIABILITY_GATE
+
+    if animal.problem:
+        return f"undefined: {animal.problem}"
+    if not animal.reliability >= RELIABILITY_GATE:
+        return f"unreliable: below {RELIABILITY_GATE}, where no correction for noise can be trusted"
+    return "ok"
+
+
+def _matrix(title: str, labels: tuple[str, ...], rdm: NDArray[np.float64]) -> str:
+    """Show an upper triangle [P] as a square of numbers."""
+    from scipy.spatial.distance import squareform
+
+    rows = [[label, *(f"{value:.3f}" for value in line)] for label, line in zip(labels, squareform(rdm), strict=True)]
+    return table(title, ["", *labels], rows, right=tuple(range(1, len(labels) + 1)))

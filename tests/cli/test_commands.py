@@ -160,3 +160,27 @@ def test_doctor_says_what_each_missing_part_would_enable(run, monkeypatch):
     data = json.loads(run("doctor", "--json").out)
     assert data["optional"]["pynwb"]["version"] is None
     assert data["required"]["torch"]
+
+
+@pytest.mark.shared
+def test_a_real_recording_goes_through_to_rdm_and_reliability(run, reference):
+    path = str(reference / "nwb" / "pynapple_sub-4_ses-4_ecephys+image.nwb")
+    inspected = run("recordings", "inspect", path)
+    assert "encoding_table:stimCategory" in inspected.out
+    result = run("recordings", "rdm", path, "--conditions", "encoding_table:stimCategory", "--json")
+    data = json.loads(result.out)
+    assert data["labels"] == ["0", "1", "2"]
+    assert data["animals"][0]["units"] == 35
+    assert data["animals"][0]["trials"] == 90
+    assert -1 <= data["animals"][0]["reliability"] <= 1
+    shown = run("recordings", "rdm", path, "--conditions", "encoding_table:stimCategory").out
+    assert "unreliable: below 0.5" in shown
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("kind", ["LantyerEtAl2018_170328_AB_277_ST50_C", "FergusonEtAl2015_PYR5_rebound"])
+def test_intracellular_files_are_refused_in_one_sentence(run, reference, kind: str):
+    result = run("recordings", "rdm", str(reference / "nwb" / f"{kind}.nwb"))
+    assert result.status == 1
+    assert "has no units table" in result.err
+    assert len(result.err.strip().splitlines()) == 1
