@@ -28,15 +28,28 @@ def correlation_distances(patterns: NDArray, *, missing: bool = False) -> Floats
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         if missing and not np.isfinite(patterns).all():
             return _correlation_of_present(patterns)
-        mean, largest = _row_mean(patterns)
+        units = patterns.shape[-1]
+        mean = sum((part.sum(axis=-1) for part in _slices(patterns)), start=np.float64(0)) / units
         gram = np.zeros((*patterns.shape[:-1], patterns.shape[-2]))
+        rest = np.zeros(patterns.shape[:-1])
         for part in _slices(patterns):
-            centred = part - mean
+            centred = part - mean[..., None]
+            rest += centred.sum(axis=-1)
             gram += centred @ np.swapaxes(centred, -1, -2)
+        # The mean of a large offset is rounded; what it missed is a second mean.
+        gram -= rest[..., :, None] * rest[..., None, :] / units
+        return correlation_from_gram(gram, units * (_ROUNDING * np.abs(mean)) ** 2)
+
+
+def correlation_from_gram(gram: Floats, floor: Floats) -> Floats:
+    """Return 1 − Pearson correlation [..., P] from products of centred patterns [..., K, K].
+
+    Patterns whose square is not above ``floor`` [..., K] are constant and have NaN pairs.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
         squares = np.einsum("...ii->...i", gram)
-        constant = squares <= patterns.shape[-1] * (_ROUNDING * largest) ** 2
-        length = np.sqrt(np.where(constant, np.nan, squares))
-        return upper(1.0 - gram / length[..., :, None] / length[..., None, :])
+        length = np.sqrt(np.where(squares > floor, squares, np.nan))
+        return 1.0 - upper(gram) / upper(length[..., :, None] * length[..., None, :])
 
 
 def product_distances(left: NDArray, right: NDArray, *, missing: bool = False) -> Floats:
@@ -63,27 +76,21 @@ def product_distances(left: NDArray, right: NDArray, *, missing: bool = False) -
             a = a - a.mean(axis=-2, keepdims=True)
             b = b - b.mean(axis=-2, keepdims=True)
             gram += a @ np.swapaxes(b, -1, -2)
-        own = np.einsum("...ii->...i", gram)
-        total = own[..., :, None] + own[..., None, :] - gram - np.swapaxes(gram, -1, -2)
-        return upper(total) / units
+        return products_from_gram(gram, units)
+
+
+def products_from_gram(gram: Floats, units: int) -> Floats:
+    """Return (g_ii + g_jj − g_ij − g_ji) / U as [..., P] from products g_ij = a_i·b_j [..., K, K]."""
+    own = np.einsum("...ii->...i", gram)
+    total = own[..., :, None] + own[..., None, :] - gram - np.swapaxes(gram, -1, -2)
+    return upper(total) / units
 
 
 def _slices(patterns: NDArray) -> Iterator[Floats]:
     rows = max(1, int(np.prod(patterns.shape[:-1])))
     step = max(1, _SLICE_ELEMENTS // rows)
     for start in range(0, patterns.shape[-1], step):
-        yield patterns[..., start : start + step].astype(np.float64)
-
-
-def _row_mean(patterns: NDArray) -> tuple[Floats, Floats]:
-    """Return the mean over units [..., K, 1], correct to the last digit, and the largest size [..., K]."""
-    units = patterns.shape[-1]
-    mean = sum((part.sum(axis=-1, keepdims=True) for part in _slices(patterns)), start=np.float64(0)) / units
-    rest = sum(((part - mean).sum(axis=-1, keepdims=True) for part in _slices(patterns)), start=np.float64(0))
-    largest = np.zeros(patterns.shape[:-1])
-    for part in _slices(patterns):
-        largest = np.maximum(largest, np.abs(part).max(axis=-1))
-    return mean + rest / units, largest
+        yield patterns[..., start : start + step].astype(np.float64, copy=False)
 
 
 def _unit_mean(patterns: NDArray, present: NDArray[np.bool_]) -> Floats:

@@ -63,17 +63,27 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     """
     if len(codes) != len(responses):
         raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+    member = np.zeros((count, len(codes)))
+    member[codes, np.arange(len(codes))] = 1.0
+    numbers = np.bincount(codes, minlength=count)[:, None].astype(np.float64)
+    if np.isfinite(responses).all():
+        # Sums about a value from within the data keep the digits that a large offset would cost.
+        shift = float(responses.flat[0]) if responses.size else 0.0
+        totals = member @ (responses.astype(np.float64, copy=False) - shift)
+    else:
+        check_finite(responses)
+        present = ~np.isnan(responses)
+        shift = float(responses[present][0]) if present.any() else 0.0
+        totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
+        numbers = member @ present.astype(np.float64)
+    return np.where(numbers > 0, totals / np.where(numbers > 0, numbers, 1.0), np.nan) + shift
+
+
+def check_finite(responses: NDArray) -> None:
+    """Raise DataError if a response is infinite; NaN means missing."""
     infinite = int(np.isinf(responses).sum())
     if infinite:
         raise DataError(f"{infinite} responses are infinite; a missing response is NaN, everything else is finite.")
-    member = np.zeros((count, len(codes)))
-    member[codes, np.arange(len(codes))] = 1.0
-    present = ~np.isnan(responses)
-    # Sums about a value from within the data keep the digits that a large offset would cost.
-    shift = float(responses[present][0]) if present.any() else 0.0
-    totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
-    counts = member @ present.astype(np.float64)
-    return np.where(counts > 0, totals / np.where(counts > 0, counts, 1.0), np.nan) + shift
 
 
 def listed(names: Sequence[str], chosen: NDArray[np.bool_]) -> str:

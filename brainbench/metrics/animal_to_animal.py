@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from brainbench.errors import UsageError
-from brainbench.metrics._animals import ceiling_of, gather, interval_reasons, mean_rdm, mean_reliability, t_interval
+from brainbench.metrics._animals import (
+    Animals,
+    ceiling_of,
+    gather,
+    interval_reasons,
+    mean_rdm,
+    mean_reliability,
+    t_interval,
+)
 from brainbench.metrics._pairs import Floats, permuted_pairs, stimulus_count
 from brainbench.metrics.compare import check_comparison
 from brainbench.metrics.compare import compare as compare_rdms
@@ -16,7 +25,7 @@ from brainbench.metrics.inference import RANDOM_PERMUTATIONS, SMALLEST_STIMULI, 
 from brainbench.metrics.noise import RELIABILITY_GATE, Corrected, noise_corrected
 from brainbench.metrics.score import metric_name
 from brainbench.metrics.subject import SubjectRDM
-from brainbench.types import Score, Status, SubjectScore
+from brainbench.types import Interval, Score, Status, SubjectScore
 
 _CHUNK_ELEMENTS = 1 << 22
 
@@ -57,36 +66,25 @@ def score_animals(
     if len(labels) != count:
         raise UsageError(f"The animals' RDMs have {count} stimuli; received {len(labels)} names.")
     animals = gather(subjects, estimator=estimator, comparison=compare, pairs=len(subjects[0].rdm))
-    scored = animals.scored if count > 2 and len(animals.scored) > 1 else ()
-    pairs = [_against_others(index, scored, animals.subjects, estimator, compare) for index in scored]
-    results = dict(zip(scored, pairs, strict=True))
-    found = [result for result in pairs if result.status != "undefined"]
-    values = np.array([result.value for result in found])
+    compared = animals.scored if count > 2 and len(animals.scored) > 1 else ()
+    results = {index: _against_others(index, compared, animals.subjects, estimator, compare) for index in compared}
+    found = [index for index in compared if results[index].status != "undefined"]
+    values = np.array([results[index].value for index in found])
+    p = math.nan
+    if count >= SMALLEST_STIMULI and found and len(found) == len(compared):
+        p = _permutation_p(animals.rdms(found), np.array([_factor(results[i]) for i in found]), compare, seed)
+    smallest = smallest_p_of_animals(count, max(2, len(compared)))
+    status, reasons = _verdict(animals, results, found, count, smallest)
     reliability, reliability_interval = mean_reliability(animals)
-    status: Status = "undefined"
-    reasons: tuple[str, ...] = ("fewer than two animals have a usable RDM",) if count > 2 else ("RDMs need 3 stimuli",)
-    p, smallest = math.nan, smallest_p_of_animals(count, max(2, len(scored)))
-    if found:
-        trusted = animals.reliable and count >= SMALLEST_STIMULI and all(result.status == "ok" for result in found)
-        status = "ok" if trusted else "unreliable"
-        reasons = tuple(f"{animals.subjects[i].subject}: {results[i].reason}" for i in scored if results[i].reason)
-        reasons += interval_reasons(len(found))
-        if count < SMALLEST_STIMULI:
-            reasons += (f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed",)
-        elif len(found) == len(scored):
-            factors = np.array([_factor(result) for result in found])
-            p = _permutation_p(animals.rdms(scored), factors, compare, seed)
-    elif scored:
-        reasons = tuple(f"{animals.subjects[i].subject}: {results[i].reason}" for i in scored)
     return Score(
         name=name,
         value=float(values.mean()) if found else math.nan,
         status=status,
-        reasons=reasons + animals.reasons,
-        r=float(np.mean([result.r for result in found])) if found else math.nan,
+        reasons=reasons,
+        r=float(np.mean([results[index].r for index in found])) if found else math.nan,
         reliability=reliability,
         reliability_interval=reliability_interval,
-        interval=t_interval(values),
+        interval=_interval(values),
         p=p,
         p_method=f"one-sided, every animal's labels permuted {RANDOM_PERMUTATIONS:,} times, (b+1)/(n+1)",
         p_smallest=smallest,
@@ -98,7 +96,7 @@ def score_animals(
                 value=results[index].value if index in results else math.nan,
                 r=results[index].r if index in results else math.nan,
                 reliability=animals.corrections[index].reliability,
-                status=results[index].status if index in results else animals.status(index),
+                status=results[index].status if index in results else "undefined",
                 units=subject.units,
                 trials=subject.trials,
             )
@@ -110,6 +108,35 @@ def score_animals(
         brain_rdm=mean_rdm(animals),
         provenance={"seed": seed, "reliability_gate": RELIABILITY_GATE},
     )
+
+
+def _verdict(
+    animals: Animals, results: dict[int, Corrected], found: list[int], count: int, smallest: float
+) -> tuple[Status, tuple[str, ...]]:
+    """Return the status of the agreement and its reasons, the gravest first."""
+    told = tuple(f"{animals.subjects[i].subject}: {results[i].reason}" for i in results if results[i].reason)
+    if not found:
+        if count < 3:
+            told = (f"{count} stimuli have one pair, and RDMs of one pair cannot be compared; at least 3 are needed",)
+        elif not results:
+            told = ("fewer than two animals have a usable RDM",)
+        return "undefined", told + animals.reasons
+    if count < SMALLEST_STIMULI:
+        told = (f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed", *told)
+    elif len(found) < len(results):
+        told = ("no p: the agreement of some animals is undefined", *told)
+    if len(found) == 2:
+        told += ("two animals make one comparison: no confidence interval",)
+    else:
+        told += interval_reasons(len(found))
+    trusted = animals.reliable and count >= SMALLEST_STIMULI and all(results[i].status == "ok" for i in results)
+    return "ok" if trusted else "unreliable", told + animals.reasons
+
+
+def _interval(values: Floats) -> Interval | None:
+    """Return the t interval over animals; the two values of two animals are one and the same."""
+    found = t_interval(values) if len(values) > 2 else None
+    return found and replace(found, method=f"{found.method}; approximate, since animals meet one another")
 
 
 def _against_others(

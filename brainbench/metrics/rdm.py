@@ -88,15 +88,15 @@ def rdm_problem(responses: ArrayLike, labels: ArrayLike | None = None) -> str | 
     else:
         codes, names = stimulus_codes(labels)
         patterns = stimulus_means(matrix, codes, len(names))
-        empty = ~np.isfinite(patterns).any(axis=1)
+        empty = np.asarray(~np.isfinite(patterns).any(axis=1))
         if empty.any():
             return f"no trials of stimulus {listed(names, empty)}"
-    broken = ~np.isfinite(patterns).all(axis=1)
+    broken = np.asarray(~np.isfinite(patterns).all(axis=1))
     if labels is None and broken.any():
         return f"activations that are not finite for stimulus {listed(names, broken)}"
     with np.errstate(invalid="ignore"):
         spread = np.nanmax(patterns, axis=1) - np.nanmin(patterns, axis=1)
-        constant = spread <= 8 * np.finfo(np.float64).eps * np.nanmax(np.abs(patterns), axis=1)
+        constant = np.asarray(spread <= 8 * np.finfo(np.float64).eps * np.nanmax(np.abs(patterns), axis=1))
     if constant.any():
         return f"a constant response across units to stimulus {listed(names, constant)}"
     return None
@@ -147,29 +147,34 @@ def _crossnobis(given: _Trials) -> Floats:
         raise UsageError(f"method='crossnobis' compares at least 2 folds; received {len(names)}.")
     units = given.patterns.shape[1]
     weight = None if given.precision is None else _precision_matrix(given.precision, units)
-    means = []
-    for name in names:
-        chosen = folds == name
-        mean = stimulus_means(given.trials[chosen], given.codes[chosen], len(given.patterns))
-        means.append(mean - given.patterns.mean(axis=0) if np.isfinite(given.patterns).all() else mean)
-    weighted = means if weight is None else [mean @ weight for mean in means]
-    total = np.zeros(len(given.patterns) * (len(given.patterns) - 1) // 2)
-    count = np.zeros_like(total)
+    count = len(given.patterns)
+    cells = np.searchsorted(names, folds) * count + given.codes
+    means = stimulus_means(given.trials, cells, len(names) * count).reshape(len(names), count, units)
+    if np.isfinite(given.patterns).all():
+        means = means - given.patterns.mean(axis=0)
+    weighted = means if weight is None else means @ weight
+    total = np.zeros(count * (count - 1) // 2)
+    found = np.zeros_like(total)
     for first in range(len(names)):
         for second in range(first + 1, len(names)):
             distance = product_distances(means[first], weighted[second], missing=True)
-            found = np.isfinite(distance)
-            total += np.where(found, distance, 0.0)
-            count += found
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+            known = np.isfinite(distance)
+            total += np.where(known, distance, 0.0)
+            found += known
+    return np.where(found > 0, total / np.maximum(found, 1), np.nan)
 
 
 def _poisson(given: _Trials) -> Floats:
     low = float(np.nanmin(given.patterns, initial=np.inf))
     if low < 0:
         raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
-    rates = (given.patterns + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
+    rates = poisson_rates(given.patterns)
     return product_distances(rates, np.log(rates), missing=given.missing)
+
+
+def poisson_rates(rates: NDArray) -> Floats:
+    """Return rates under the gamma prior, which are never zero."""
+    return (rates + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
 
 
 def _precision_matrix(precision: ArrayLike, units: int) -> Floats:

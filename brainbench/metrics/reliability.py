@@ -17,16 +17,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brainbench.errors import DataError, UsageError, unknown_name
-from brainbench.metrics._distances import correlation_distances, product_distances
-from brainbench.metrics._hashing import Hashes, content_hashes, draws, key_hashes
-from brainbench.metrics._labels import listed, response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics._halves import SUBJECT_METHODS, Session, distances, half_rdms
+from brainbench.metrics._hashing import Hashes, content_hashes, key_hashes
+from brainbench.metrics._labels import check_finite, listed, response_matrix, stimulus_codes, stimulus_means
 from brainbench.metrics._pairs import Floats, Ints
 from brainbench.metrics.compare import check_comparison, compare
 from brainbench.metrics.noise import spearman_brown
-from brainbench.metrics.rdm import POISSON_PRIOR_MEAN, POISSON_PRIOR_WEIGHT
 from brainbench.types import Interval
 
 SPLITS = 1000
@@ -72,13 +71,6 @@ class SplitHalf:
     """What was left out."""
 
 
-@dataclass(frozen=True)
-class _Session:
-    responses: Floats
-    codes: Ints
-    hashes: Hashes
-
-
 def split_half(
     blocks: Sequence[TrialBlock],
     n_stimuli: int,
@@ -107,11 +99,11 @@ def split_half(
         UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
         DataError: infinite responses, or negative ones for ``poisson``.
     """
-    if method not in _SUBJECT_METHODS:
+    if method not in SUBJECT_METHODS:
         raise unknown_name(
             "RDM method of an animal",
             method,
-            _SUBJECT_METHODS,
+            SUBJECT_METHODS,
             hint="Other methods of rdm() need folds or a precision.",
         )
     check_comparison(comparison)
@@ -130,17 +122,16 @@ def split_half(
     if method == "poisson" and any((session.responses < 0).any() for session in sessions):
         raise DataError("method='poisson' needs rates or counts, which are never negative; some responses are.")
     means = [stimulus_means(session.responses, session.codes, n_stimuli) for session in sessions]
-    full = _distances(np.concatenate(means, axis=1), method)
-    # Distances do not feel a common shift, the half means lose digits to it.
-    shift = 0.0 if method == "poisson" else float(np.nanmean(np.concatenate([mean.ravel() for mean in means])))
-    sessions = [_Session(s.responses - shift, s.codes, s.hashes) for s in sessions]
+    full = distances(np.concatenate(means, axis=1), method)
+    if method != "poisson":
+        sessions = _shifted(sessions, means, by_unit=method == "sqeuclidean")
     kept = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
     halves = np.empty((kept, 2, pairs))
     r = np.empty(splits)
-    step = max(1, _CHUNK_BYTES // (8 * n_stimuli * units))
+    step = max(1, _CHUNK_BYTES // (8 * pairs))
     for start in range(0, splits, step):
         index = np.arange(start, min(start + step, splits))
-        first, second = (_distances(half, method) for half in _half_means(sessions, n_stimuli, index, seed))
+        first, second = half_rdms(sessions, n_stimuli, method, index, seed)
         r[index] = compare(first, second, method=comparison)
         stored = index[index < kept]
         halves[stored, 0], halves[stored, 1] = first[: len(stored)], second[: len(stored)]
@@ -160,9 +151,9 @@ def split_half(
 
 def _usable(
     blocks: Sequence[TrialBlock], count: int, names: list[str]
-) -> tuple[list[_Session], str | None, tuple[str, ...]]:
+) -> tuple[list[Session], str | None, tuple[str, ...]]:
     """Check the sessions, leave out what cannot be split and say what."""
-    sessions: list[_Session] = []
+    sessions: list[Session] = []
     lacking: list[str] = []
     total = np.zeros(count, dtype=np.int64)
     dropped = 0
@@ -171,8 +162,7 @@ def _usable(
         codes, _ = stimulus_codes(block.labels, count)
         if len(codes) != len(responses):
             raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
-        if np.isinf(responses).any():
-            raise DataError("Some responses are infinite; a missing response is NaN, everything else is finite.")
+        check_finite(responses)
         recorded = np.isfinite(responses).any(axis=1)
         hashes = _hashes(block, responses, codes)[recorded]
         responses, codes = responses[recorded], codes[recorded]
@@ -187,7 +177,7 @@ def _usable(
         splittable = (member @ np.isfinite(responses) >= 2).all(axis=0)
         dropped += int((~splittable).sum())
         if splittable.any():
-            sessions.append(_Session(responses[:, splittable], codes, hashes))
+            sessions.append(Session(responses[:, splittable], codes, hashes))
         else:
             lacking.append("no unit recorded in 2 trials of every stimulus")
     notes = [f"{len(lacking)} of {len(blocks)} sessions left out: {'; '.join(sorted(set(lacking)))}"] if lacking else []
@@ -211,47 +201,14 @@ def _hashes(block: TrialBlock, responses: Floats, codes: Ints) -> Hashes:
     return key_hashes(block.keys)
 
 
-def _half_means(sessions: list[_Session], count: int, index: Ints, seed: int) -> tuple[Floats, Floats]:
-    """Return the mean patterns [S, K, U] of both halves for the splits ``index``."""
-    units = sum(session.responses.shape[1] for session in sessions)
-    first, second = np.empty((len(index), count, units)), np.empty((len(index), count, units))
-    offset = 0
-    for session in sessions:
-        columns = slice(offset, offset + session.responses.shape[1])
-        offset = columns.stop
-        present = np.isfinite(session.responses)
-        filled = np.where(present, session.responses, 0.0)
-        for stimulus in range(count):
-            rows = np.flatnonzero(session.codes == stimulus)
-            member = _members(draws(session.hashes[rows], index, seed))
-            for target, weight in ((first, member), (second, 1.0 - member)):
-                number: NDArray = weight.sum(axis=1, keepdims=True)
-                if not present[rows].all():
-                    number = weight @ present[rows].astype(np.float64)
-                    number[number == 0] = np.nan
-                target[:, stimulus, columns] = weight @ filled[rows] / number
-    return first, second
+def _shifted(sessions: list[Session], means: list[Floats], *, by_unit: bool) -> list[Session]:
+    """Take away what distances do not feel but half means would lose digits to.
 
-
-def _members(random: Hashes) -> Floats:
-    """Return 1 for the trials [S, n] of the first half: the lower half of the random numbers."""
-    count = random.shape[1]
-    order = np.argsort(random, axis=1, kind="stable")
-    # The lowest number's parity is the coin that gives the odd trial to either half.
-    coin = np.take_along_axis(random, order[:, :1], axis=1) & np.uint64(1)
-    size = count // 2 + (count % 2) * coin.astype(np.int64)
-    member = np.zeros(random.shape)
-    np.put_along_axis(member, order, (np.arange(count) < size).astype(np.float64), axis=1)
-    return member
-
-
-def _distances(patterns: Floats, method: str) -> Floats:
-    if method == "correlation":
-        return correlation_distances(patterns, missing=True)
-    if method == "sqeuclidean":
-        return product_distances(patterns, patterns, missing=True)
-    rates = (patterns + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
-    return product_distances(rates, np.log(rates), missing=True)
-
-
-_SUBJECT_METHODS = ("correlation", "sqeuclidean", "poisson")
+    Correlation distance does not feel one number taken from all units, squared distance not even one
+    per unit.
+    """
+    if by_unit:
+        shifts = [np.nanmean(mean, axis=0) for mean in means]
+    else:
+        shifts = [np.nanmean(np.concatenate([mean.ravel() for mean in means]))] * len(sessions)
+    return [Session(s.responses - shift, s.codes, s.hashes) for s, shift in zip(sessions, shifts, strict=True)]

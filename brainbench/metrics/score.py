@@ -79,7 +79,7 @@ def score_rdms(
     check_comparison(compare)
     names, rdms = _layers(layer_rdms, stimuli)
     animals = gather(subjects, estimator=estimator, comparison=compare, pairs=rdms.shape[1])
-    defined = [index for index, rdm in enumerate(rdms) if not is_flat(rdm)]
+    defined = np.flatnonzero(~is_flat(rdms)).tolist()
     choice = None
     if animals.scored and defined and len(stimuli) > 2:
         choice = _choose(rdms[defined], animals, estimator, compare, seed)
@@ -142,7 +142,7 @@ def _layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> tupl
     return tuple(map(str, layer_rdms)), np.stack(rdms)
 
 
-def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, seed: int) -> _Choice:
+def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, seed: int) -> _Choice | None:
     """Choose layers by the estimator's rule, with a test that repeats the choice."""
     brain, factors = animals.rdms(animals.scored), animals.factors(animals.scored)
     r = compare_all(rdms, brain, method=comparison)
@@ -167,13 +167,18 @@ def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, see
     return _Choice(picked, picked * factors, tuple(chosen.tolist()), most_chosen(chosen), rule, test)
 
 
-def _choose_on_halves(rdms: Floats, subject: SubjectRDM, comparison: str, seed: int) -> _Choice:
-    splits = len(subject.halves)
-    r = compare_all(rdms, subject.halves.reshape(2 * splits, -1), method=comparison).reshape(len(rdms), splits, 2)
+def _choose_on_halves(rdms: Floats, subject: SubjectRDM, comparison: str, seed: int) -> _Choice | None:
+    # A half in which a stimulus met silent units has no RDM; such splits say nothing.
+    halves = subject.halves[~is_flat(subject.halves).any(axis=1)]
+    splits = len(halves)
+    if not splits:
+        return None
+    r = compare_all(rdms, halves.reshape(2 * splits, -1), method=comparison).reshape(len(rdms), splits, 2)
     chosen, held = choose_on_halves(r[..., 0], r[..., 1])
     # What is evaluated is the RDM of one half, whose reliability is the raw split-half correlation.
-    factor = 1 / math.sqrt(float(np.mean(subject.split_half_by(comparison))))
-    some = subject.halves[:_HALVES_IN_PERMUTATIONS]
+    agreement = subject.split_half_by(comparison)
+    factor = 1 / math.sqrt(float(agreement[np.isfinite(agreement)].mean()))
+    some = halves[:_HALVES_IN_PERMUTATIONS]
 
     def statistic(x: Floats) -> Floats:
         pair = x.reshape(*x.shape[:-1], len(some), 2)
@@ -199,8 +204,10 @@ def _verdict(
             reason = f"{stimuli} stimuli have one pair, and RDMs of one pair cannot be compared; at least 3 are needed"
         elif not defined:
             reason = "activations of every layer are constant or NaN"
-        else:
+        elif not animals.scored:
             reason = "no animal has a usable RDM"
+        else:
+            reason = "halves of the only reliable animal's trials have no RDM, so no layer can be chosen"
         return "undefined", (reason, *animals.reasons)
     reasons = list(choice.test.reason and [choice.test.reason])
     if not animals.reliable:

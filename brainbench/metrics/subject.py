@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.metrics._pairs import Floats
 from brainbench.metrics.compare import compare
@@ -96,6 +97,6 @@ def subject_rdm(
     )
 
 
-def is_flat(rdm: Floats) -> bool:
-    """Whether an RDM has missing pairs or no difference between pairs, so nothing can be compared with it."""
-    return bool(np.isnan(compare(rdm, rdm, method="pearson")) or not np.isfinite(rdm).all())
+def is_flat(rdms: Floats) -> NDArray[np.bool_]:
+    """Whether RDMs [..., P] have missing pairs or no differences between pairs: nothing compares with them."""
+    return np.isnan(compare(rdms, rdms, method="pearson")) | ~np.isfinite(rdms).all(axis=-1)

@@ -81,6 +81,13 @@ def test_one_animal_is_undefined_in_words():
     assert math.isnan(score.value)
 
 
+def test_two_animals_make_one_comparison_and_have_no_interval():
+    score = score_animals(_make_animals(2))
+    assert score.subjects[0].value == pytest.approx(score.subjects[1].value, abs=1e-12)
+    assert score.interval is None
+    assert "two animals make one comparison: no confidence interval" in score.reasons
+
+
 def test_unreliable_animals_are_left_out_and_named():
     animals = _make_animals(3)
     noisy = make_subject("z", make_rdm(np.random.default_rng(0)), reliability=0.2)

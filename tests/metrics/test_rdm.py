@@ -260,3 +260,10 @@ def test_a_covariance_of_too_few_trials_names_the_way_out():
         noise_precision(trials[:6], labels[:6])
     with pytest.raises(UsageError, match="did you mean 'diag'"):
         noise_precision(trials, labels, method="diagg")
+
+
+def test_a_single_unit_has_distances_but_no_correlations():
+    responses = np.array([[1.0], [2.0], [4.0]])
+    assert np.isnan(rdm(responses)).all()
+    assert rdm_problem(responses) == "a constant response across units to stimulus '0', '1', '2'"
+    np.testing.assert_array_equal(rdm(responses, method="sqeuclidean"), [1.0, 9.0, 4.0])

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.errors import DataError, UsageError
-from brainbench.metrics import TrialBlock, compare, rdm, spearman_brown, split_half
+from brainbench.metrics import TrialBlock, _halves, compare, rdm, spearman_brown, split_half
+from brainbench.metrics._halves import members
 from brainbench.metrics._hashing import content_hashes, draws, key_hashes
 from brainbench.metrics._pairs import permuted_pairs
-from brainbench.metrics.reliability import _members
 from tests.metrics.fakes import STIMULI, make_block, make_latent
 
 
@@ -45,7 +45,7 @@ def test_the_mean_over_random_splits_is_the_mean_over_all_splits():
 
 def test_halves_are_fair_disjoint_and_nearly_equal():
     random = draws(key_hashes([str(i) for i in range(7)]), np.arange(4000), seed=3)
-    member = _members(random)
+    member = members(random)
     sizes = member.sum(axis=1)
     assert set(sizes) == {3.0, 4.0}
     assert abs((sizes == 4).mean() - 0.5) < 0.04
@@ -131,6 +131,17 @@ def test_spearman_brown_predicts_the_agreement_with_an_independent_repetition():
         agreement.append(float(compare(found[0].rdm, found[1].rdm)))
         predicted.append(np.mean([part.reliability for part in found]))
     assert np.mean(predicted) == pytest.approx(np.mean(agreement), abs=0.06)
+
+
+@pytest.mark.parametrize("method", ["correlation", "sqeuclidean"])
+@pytest.mark.parametrize("offset", [0.0, 30.0, 1e8])
+def test_products_of_trials_and_half_means_give_the_same_halves(method, offset, monkeypatch):
+    blocks = [make_block(make_latent(9), seed=i, units=15 + i, repeats=3 + i, noise=2.0) for i in range(3)]
+    blocks = [TrialBlock(block.responses + offset, block.labels, block.keys) for block in blocks]
+    by_products = split_half(blocks, 6, method=method, splits=40)
+    monkeypatch.setattr(_halves, "_from_products", lambda *_: None)
+    by_means = split_half(blocks, 6, method=method, splits=40)
+    np.testing.assert_allclose(by_products.halves, by_means.halves, rtol=1e-11 if offset < 1e6 else 1e-6)
 
 
 def test_missing_entries_are_left_out_of_the_means_of_both_halves():

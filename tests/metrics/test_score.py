@@ -204,6 +204,21 @@ def test_one_animal_chooses_on_one_half_and_is_scored_on_the_other():
     assert "not a confidence interval" in score.reliability_interval.method
 
 
+def test_splits_whose_halves_have_no_rdm_do_not_choose():
+    latent = make_latent(9)
+    (animal,) = _make_animals(latent, 1)
+    halves = animal.halves.copy()
+    halves[::3, 0] = np.nan
+    layers = _make_layers(latent)
+    kept = dataclasses.replace(animal, halves=np.delete(animal.halves, np.s_[::3], axis=0))
+    found = _score(layers, [dataclasses.replace(animal, halves=halves)])
+    assert found.value == pytest.approx(_score(layers, [kept]).value, abs=1e-15)
+    halves[:] = np.nan
+    nothing = _score(layers, [dataclasses.replace(animal, halves=halves)])
+    assert nothing.status == "undefined"
+    assert "no layer can be chosen" in nothing.reasons[0]
+
+
 def test_few_animals_say_that_coverage_is_not_verified():
     latent = make_latent(10)
     score = _score(_make_layers(latent), _make_animals(latent, 3))

@@ -1,0 +1,162 @@
+"""RDMs of random halves of an animal's trials, many splits at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from brainbench.metrics._distances import (
+    correlation_distances,
+    correlation_from_gram,
+    product_distances,
+    products_from_gram,
+)
+from brainbench.metrics._hashing import Hashes, draws
+from brainbench.metrics._pairs import Floats, Ints
+from brainbench.metrics.rdm import poisson_rates
+
+_CHUNK_BYTES = 1 << 24
+
+_COMMON = 1e-3
+"""Products of trials lose digits when less than this share of a pattern's square is left after taking
+away its mean over units; then half means are formed instead."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """Trials of one session that can be split, sorted by stimulus."""
+
+    responses: Floats
+    """[R, F]; NaN is missing."""
+    codes: Ints
+    """[R], ascending."""
+    hashes: Hashes
+    """[R]"""
+    complete: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        order = np.argsort(self.codes, kind="stable")
+        for name in ("responses", "codes", "hashes"):
+            object.__setattr__(self, name, getattr(self, name)[order])
+        object.__setattr__(self, "complete", bool(np.isfinite(self.responses).all()))
+
+    def group(self, stimulus: int) -> slice:
+        """Return the rows of a stimulus."""
+        first, last = np.searchsorted(self.codes, [stimulus, stimulus + 1])
+        return slice(int(first), int(last))
+
+
+def distances(patterns: Floats, method: str) -> Floats:
+    """Return RDMs [..., P] of patterns [..., K, F] that may lack entries (NaN)."""
+    return SUBJECT_METHODS[method](patterns)
+
+
+def half_rdms(sessions: list[Session], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
+    """Return the RDMs [S, P] of both halves of the splits ``index`` [S].
+
+    Where trials are few against units, products of trials serve all splits (the RDM of any half is
+    a sum of them); else half means are formed. Both give the same distances.
+    """
+    units = sum(session.responses.shape[1] for session in sessions)
+    trials = max(len(session.codes) for session in sessions)
+    by_products = method != "poisson" and trials <= 4 * units and all(session.complete for session in sessions)
+    widest = trials if by_products else count * units
+    step = max(1, _CHUNK_BYTES // (8 * max(widest, count * count)))
+    products = [session.responses @ session.responses.T for session in sessions] if by_products else []
+    parts = []
+    for start in range(0, len(index), step):
+        chosen = index[start : start + step]
+        members = [_session_members(session, count, chosen, seed) for session in sessions]
+        pair = _from_products(sessions, products, members, count, method) if by_products else None
+        if pair is None:
+            first, second = _half_means(sessions, members, count)
+            pair = distances(first, method), distances(second, method)
+        parts.append(pair)
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def members(random: Hashes) -> Floats:
+    """Return 1 for the trials [S, n] of the first half: the lower half of the random numbers."""
+    count = random.shape[1]
+    order = np.argsort(random, axis=1, kind="stable")
+    # The lowest number's parity is the coin that gives the odd trial to either half.
+    coin = np.take_along_axis(random, order[:, :1], axis=1) & np.uint64(1)
+    size = count // 2 + (count % 2) * coin.astype(np.int64)
+    member = np.zeros(random.shape)
+    np.put_along_axis(member, order, (np.arange(count) < size).astype(np.float64), axis=1)
+    return member
+
+
+def _session_members(session: Session, count: int, index: Ints, seed: int) -> Floats:
+    """Return 1 for the trials [S, R] in the first half of their stimulus."""
+    random = draws(session.hashes, index, seed)
+    return np.concatenate([members(random[:, session.group(stimulus)]) for stimulus in range(count)], axis=1)
+
+
+def _half_means(sessions: list[Session], chosen: list[Floats], count: int) -> tuple[Floats, Floats]:
+    """Return the mean patterns [S, K, F] of both halves."""
+    units = sum(session.responses.shape[1] for session in sessions)
+    first, second = (np.empty((len(chosen[0]), count, units)) for _ in range(2))
+    offset = 0
+    for session, member in zip(sessions, chosen, strict=True):
+        columns = slice(offset, offset + session.responses.shape[1])
+        offset = columns.stop
+        filled = session.responses if session.complete else np.nan_to_num(session.responses)
+        for stimulus in range(count):
+            rows = session.group(stimulus)
+            for target, weight in ((first, member[:, rows]), (second, 1.0 - member[:, rows])):
+                number = weight.sum(axis=1, keepdims=True)
+                if not session.complete:
+                    number = weight @ np.isfinite(session.responses[rows]).astype(np.float64)
+                    number[number == 0] = np.nan
+                target[:, stimulus, columns] = weight @ filled[rows] / number
+    return first, second
+
+
+def _from_products(
+    sessions: list[Session], products: list[Floats], chosen: list[Floats], count: int, method: str
+) -> tuple[Floats, Floats] | None:
+    """Return both halves' RDMs from products of trials, or None where that would lose digits."""
+    splits = len(chosen[0])
+    units = sum(session.responses.shape[1] for session in sessions)
+    grams, sums = np.zeros((2, splits, count, count)), np.zeros((2, splits, count))
+    for session, product, member in zip(sessions, products, chosen, strict=True):
+        group = np.zeros((len(session.codes), count))
+        group[np.arange(len(session.codes)), session.codes] = 1.0
+        for half, weight in enumerate((member, 1.0 - member)):
+            number = weight @ group
+            share = weight / number[:, session.codes]
+            sums[half] += (share * session.responses.sum(axis=1)) @ group
+            for stimulus in range(count):
+                rows = session.group(stimulus)
+                grams[half][:, stimulus] += ((share[:, rows] @ product[rows]) * share) @ group
+    if method == "sqeuclidean":
+        return products_from_gram(grams[0], units), products_from_gram(grams[1], units)
+    common = sums[..., :, None] * sums[..., None, :] / units
+    centred = grams - common
+    if (np.einsum("...ii->...i", centred) <= _COMMON * np.einsum("...ii->...i", grams)).any():
+        return None
+    floor = np.zeros((splits, count))
+    return correlation_from_gram(centred[0], floor), correlation_from_gram(centred[1], floor)
+
+
+def _correlation(patterns: Floats) -> Floats:
+    return correlation_distances(patterns, missing=True)
+
+
+def _sqeuclidean(patterns: Floats) -> Floats:
+    return product_distances(patterns, patterns, missing=True)
+
+
+def _poisson(patterns: Floats) -> Floats:
+    rates = poisson_rates(patterns)
+    return product_distances(rates, np.log(rates), missing=True)
+
+
+SUBJECT_METHODS: dict[str, Callable[[Floats], Floats]] = {
+    "correlation": _correlation,
+    "sqeuclidean": _sqeuclidean,
+    "poisson": _poisson,
+}
