@@ -66,7 +66,7 @@ def extract(session: Session, plan: Plan) -> Part:
         UsageError: a table or column does not exist (the nearest is named).
         DataError: the session's units or tables cannot be used.
     """
-    if session.units is None or SPIKES not in session.units:
+    if session.units is None or not has_units(session):
         raise DataError(no_units(session))
     tally = Tally()
     table = session.table(plan.conditions.table)
@@ -113,6 +113,11 @@ def extract(session: Session, plan: Plan) -> Part:
         units=len(session.units),
         synthetic=session.synthetic,
     )
+
+
+def has_units(session: Session) -> bool:
+    """Tell whether a session has at least one unit with spike times."""
+    return session.units is not None and SPIKES in session.units and len(session.units) > 0
 
 
 def no_units(session: Session) -> str:
@@ -191,9 +196,10 @@ def count(
         bounds = np.minimum(edges[:, :1] + bin * np.arange(number + 1), edges[:, 1:])
         bounds[:, -1] = edges[:, 1]
     duration = np.diff(bounds, axis=1)
-    counts = np.empty((*duration.shape, len(spikes)), dtype=np.float32)
+    found = np.empty((len(spikes), *duration.shape), dtype=np.float32)
     for index, times in enumerate(spikes):
-        counts[:, :, index] = np.diff(np.searchsorted(times, bounds, side="left"), axis=1)
+        found[index] = np.diff(np.searchsorted(times, bounds, side="left"), axis=1)
+    counts = np.ascontiguousarray(found.transpose(1, 2, 0))
     counts[duration <= 1e-9] = np.nan
     counts[np.broadcast_to(~covered[:, None, :], counts.shape)] = np.nan
     return counts, np.where(duration > 1e-9, duration, 0.0)

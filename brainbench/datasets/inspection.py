@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from brainbench.datasets import hdf5
-from brainbench.datasets._extract import no_units, read_spikes
+from brainbench.datasets._extract import has_units, no_units, read_spikes
 from brainbench.datasets.recipes import detect_recipe
 from brainbench.datasets.sessions import SPIKES, Session, Table, as_labels, natural_order
 from brainbench.datasets.sources import find_files, open_file, read_file
@@ -239,7 +239,7 @@ def _summary(session: Session, usable: bool) -> SessionSummary:
 
 def _units(session: Session) -> UnitsSummary | None:
     table = session.units
-    if table is None or SPIKES not in table:
+    if table is None or not has_units(session):
         return None
     try:
         spikes = read_spikes(table, [])
@@ -276,14 +276,12 @@ def _columns(table: Table) -> Iterator[ColumnSummary]:
             yield ColumnSummary(name, "other", 0)
             continue
         unique, number = np.unique(values, return_counts=True)
-        labels = as_labels(unique).tolist()
-        present = [index for index, label in enumerate(labels) if label]
-        kind = _kind(values)
-        if kind == "text":
-            present = [present[index] for index in natural_order(labels[index] for index in present)]
-        shown = [labels[index] for index in present[:_EXAMPLES]]
-        examples = tuple(f"{float(item):.6g}" for item in shown) if kind == "number" else tuple(shown)
-        yield ColumnSummary(name, kind, len(present), examples, int(min(number[present], default=0)))
+        present = np.char.strip(unique) != "" if values.dtype.kind == "U" else np.isfinite(unique)
+        unique, number, kind = unique[present], number[present], _kind(values)
+        shown = unique[natural_order(unique)] if kind == "text" else unique
+        labels = as_labels(shown[:_EXAMPLES]).tolist()
+        examples = tuple(f"{float(item):.6g}" for item in labels) if kind == "number" else tuple(labels)
+        yield ColumnSummary(name, kind, len(unique), examples, int(min(number, default=0)))
 
 
 def _kind(values: np.ndarray) -> str:

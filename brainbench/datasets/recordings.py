@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.datasets import hdf5
-from brainbench.datasets._extract import UNIT_COLUMNS, Part, Plan, extract, no_units
+from brainbench.datasets._extract import UNIT_COLUMNS, Part, Plan, extract, has_units, no_units
 from brainbench.datasets.conditions import Conditions, natural_vocabulary
 from brainbench.datasets.recipes import Recipe, detect_recipe, get_recipe, resolve_selection, split_source
 from brainbench.datasets.selection import DEFAULT, Selection
-from brainbench.datasets.sessions import SPIKES, Session, natural_key
+from brainbench.datasets.sessions import Session, natural_key
 from brainbench.datasets.sources import find_files, open_file, read_file
 from brainbench.datasets.window import WHOLE, Window, resolve_window
 from brainbench.errors import DataError, UsageError, listing, unknown_name
@@ -108,7 +108,7 @@ class _Reader:
         """Read the sessions of one file."""
         with open_file(path) as file:
             for session in read_file(file, path):
-                if session.units is None or SPIKES not in session.units:
+                if not has_units(session):
                     self.skipped.append(no_units(session))
                     continue
                 self._once(session)
@@ -241,7 +241,6 @@ def _join(reader: _Reader, plan: Plan, source: str) -> xr.Dataset:
     dataset = xr.Dataset(
         {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}, coordinates
     )
-    names = ("stimulus", "subject", "session", "trial_id", "unit_subject", "unit_session", "unit_id")
     dataset.attrs = {
         "vocabulary": list(vocabulary),
         "conditions": str(plan.conditions),
@@ -255,9 +254,15 @@ def _join(reader: _Reader, plan: Plan, source: str) -> xr.Dataset:
         "notes": [*reader.notes, *(note for part in parts for note in part.tally.notes)],
         "source": source,
         "synthetic": any(part.synthetic for part in parts),
-        "content_hash": content_hash(counts, duration, [dataset[name].values.tolist() for name in names], vocabulary),
+        "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
     }
     return dataset
+
+
+def _content(part: Part) -> tuple[Any, ...]:
+    """What makes the data: all else (window, selection, file names) only says how they came about."""
+    names = (part.subject, part.session, part.labels, part.trial_ids, part.unit_ids)
+    return part.counts, part.duration, names
 
 
 def _about(part: Part) -> dict[str, Any]:

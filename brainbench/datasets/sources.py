@@ -16,13 +16,15 @@ from brainbench.errors import DataError, DataFileNotFoundError, UsageError, near
 if TYPE_CHECKING:
     import h5py
 
-SUFFIXES = (".nwb", ".h5", ".hdf5")
+SUFFIXES = ((".nwb",), (".h5", ".hdf5"))
+"""Endings searched for in a folder, in this order; other tools also leave ``.h5`` files beside NWB."""
 
 
 def find_files(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
     """Return the recording files a source names, sorted and without repetition.
 
-    A folder is searched at every depth for ``.nwb``, ``.h5`` and ``.hdf5``; hidden files are skipped.
+    A folder is searched at every depth for ``.nwb`` and, if it has none, for ``.h5`` and ``.hdf5``;
+    hidden files are skipped.
 
     Raises:
         DataFileNotFoundError: a path does not exist, or a folder or glob holds no recording file.
@@ -37,10 +39,11 @@ def _expand(source: str) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        found = [item for item in path.rglob("*") if item.suffix.lower() in SUFFIXES and _visible(item, path)]
-        if not found:
-            raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).")
-        return found
+        visible = [item for item in path.rglob("*") if _visible(item, path)]
+        for endings in SUFFIXES:
+            if found := [item for item in visible if item.suffix.lower() in endings]:
+                return found
+        raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).")
     if glob.has_magic(source):
         found = [
             Path(item)
@@ -73,6 +76,8 @@ def open_file(path: Path) -> Iterator[h5py.File]:
     """
     import h5py
 
+    if not os.access(path, os.R_OK):
+        raise DataError(f"{path} may not be read by this user; change its permissions.")
     if not h5py.is_hdf5(path):
         raise DataError(
             f"{path} is not an HDF5 file{_why_not(path)}; brainbench reads NWB 2.x and its own HDF5 layout."
@@ -84,6 +89,8 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         if isinstance(error, DataError):
             raise
         reason = str(error).strip().splitlines()[0]
+        if "unable to lock" in reason:
+            raise DataError(f"{path} is open for writing in another program ({reason}); close it there.") from error
         if "truncated" in reason:
             raise DataError(
                 f"{path} is truncated: the file is shorter than its HDF5 header says; copy it again."

@@ -10,6 +10,7 @@ from brainbench.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.types import check_recordings
 
 from .fakes import make_simple_session
+from .test_nwb import write_nwb
 
 
 def write(path, made=None, **options):
@@ -111,6 +112,16 @@ def test_units_with_no_spikes_are_removed_and_counted_or_kept_on_request(tmp_pat
     assert (dataset.sizes["unit"], dataset.attrs["removed"]["units: no spikes"]) == (3, 1)
     kept = open_recordings(path, conditions="trials:stimulus", select="none")
     assert np.all(kept["counts"].values[:, 0, 3] == 0)
+
+
+def test_a_session_of_silent_units_has_no_recorded_span(tmp_path):
+    table = {"start_time": np.arange(4.0), "stop_time": np.arange(4.0) + 1, "stimulus": ["a", "b", "a", "b"]}
+    path = write(tmp_path / "a.h5", make_session("m", "1", [np.zeros(0)] * 2, {"trials": table}))
+    with pytest.raises(DataError, match=r"No trial remains of .*units: no spikes removed 2"):
+        open_recordings(path, conditions="trials:stimulus")
+    path = write(tmp_path / "b.h5", make_session("m", "1", [], {"trials": table}))
+    with pytest.raises(DataError, match="no units table with spike_times"):
+        open_recordings(path, conditions="trials:stimulus")
 
 
 def test_units_are_chosen_by_layer_depth_and_number_of_spikes(tmp_path):
@@ -221,6 +232,13 @@ def test_foreign_hdf5_is_refused_with_what_it_holds(tmp_path):
         file["voltage"] = np.zeros(3)
     with pytest.raises(DataError, match="neither NWB nor the brainbench-recordings layout: it holds voltage"):
         open_recordings(tmp_path / "a.h5", conditions="trials:stimulus")
+
+
+def test_a_folder_with_nwb_files_leaves_other_hdf5_files_alone(tmp_path):
+    write_nwb(tmp_path / "a.nwb")
+    write_nwb(tmp_path / ".hidden.nwb")
+    (tmp_path / "pose.h5").write_bytes(b"of another tool")
+    assert open_recordings(tmp_path, conditions="trials:texture").attrs["source"].endswith("a.nwb")
 
 
 def test_globs_lists_and_recipes_name_sources(tmp_path):
