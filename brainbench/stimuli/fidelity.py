@@ -27,7 +27,7 @@ class Fidelity:
     """Links per whisker; the smallest number when ``links_per_mm`` is given."""
     links_per_mm: float | None = None
     """Links per millimetre of arc length, so that long whiskers get more; None for ``links`` on every whisker."""
-    time_step: float = 2e-4
+    time_step: float = 1e-4
     """Time step [s]."""
 
     def __post_init__(self) -> None:
@@ -81,9 +81,9 @@ MOST_LINKS = 100
 """Links per whisker that are allowed; cost grows with the cube, and error is far below 0.1 % before."""
 
 _PRESETS = {
-    "fast": {"links": 6, "time_step": 5e-4},
-    "balanced": {"links": 10, "time_step": 2e-4},
-    "accurate": {"links": 20, "time_step": 1e-4},
+    "fast": {"links": 6, "time_step": 2e-4},
+    "balanced": {"links": 10, "time_step": 1e-4},
+    "accurate": {"links": 20, "time_step": 5e-5},
 }
 
 

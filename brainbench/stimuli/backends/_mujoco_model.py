@@ -40,6 +40,18 @@ SLOTS = 6
 SLOT_WIDTH = 8
 """Numbers per reported contact: found, force [3] (normal first), distance, position [3]."""
 
+CONTACT_TIME = 1.0
+"""Time constant of a contact in steps. Faster ones push a light tip clear of the obstacle within a step, and
+it falls back deeper in the next; slower ones let it sink in."""
+CONTACT_IMPEDANCE = 0.99
+"""MuJoCo's constraint impedance: a resting contact yields by about a hundredth of the whisker's own bending
+in one step, which vanishes with the step."""
+FRICTION_STIFFNESS = 0.02
+"""Stiffness of sticking against that of the normal contact. MuJoCo's convex friction cone makes a sliding
+contact rise by about μ times the slip of one step; at 1 a whisker that sweeps an object at metres per second
+hops (moments several times too large at steps of .1 ms), at .02 it slides, and Coulomb's law is
+approached from below as the step shrinks."""
+
 _NOTHING = {"mass": "1e-12", "diaginertia": "1e-14 1e-14 1e-14"}
 
 
@@ -86,17 +98,18 @@ def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: N
     position = position * MILLI
     root = ElementTree.Element("mujoco")
     _add(root, "compiler", angle="radian")
-    # The stopping tolerance is zero because the solver's cost is an energy, minute in these units; Newton's
-    # method stops by itself after two or three steps. The exact diagonal makes contacts as stiff as stated:
-    # the approximation ignores that the implicit springs stiffen the whisker, and contacts then leak.
+    # The solver's cost is an energy, minute in these units, so its usual tolerance would stop at once. The
+    # exact diagonal makes contacts as stiff as stated: the approximate one ignores that the implicit springs
+    # stiffen the whisker, and whiskers then leak through pegs.
     option = _add(
         root,
         "option",
         timestep=step,
         integrator="discrete",
         solver="Newton",
-        tolerance=0.0,
+        tolerance=1e-14,
         cone="elliptic",
+        impratio=FRICTION_STIFFNESS,
         gravity=np.divide(job.gravity, MILLI),
     )
     _add(option, "flag", autoreset="disable", refsafe="disable", diagexact="enable")
@@ -209,7 +222,6 @@ def _add_obstacles(
             drives += _add_obstacle_joints(body, position, quaternion, step)
         friction = whisker_friction if obstacle.friction is None else obstacle.friction
         for index, part in enumerate(obstacle.parts):
-            # A contact this much faster than the step closes within it, and is still stable in this integrator.
             _add(
                 body,
                 "geom",
@@ -220,8 +232,8 @@ def _add_obstacles(
                 priority=1,
                 friction=(friction, 0, 0),
                 condim=3 if friction > 0 else 1,
-                solref=(0.2 * step, 1),
-                solimp=(0.99, 0.99, 1e-3),
+                solref=(CONTACT_TIME * step, 1),
+                solimp=(CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 1e-3),
             )
     return drives
 

@@ -7,6 +7,7 @@ own small model; native threads run the jobs.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import time
@@ -24,7 +25,7 @@ from brainbench.stimuli.backends.protocol import Trace
 from brainbench.stimuli.chain import build_chain
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -63,7 +64,7 @@ class MujocoBackend:
             raise UsageError(f"workers must be at least 1; received {workers}.")
         _warn_overdamped(jobs, fidelity)
         traces: list[Trace | None] = [None] * len(jobs)
-        with ThreadPoolExecutor(max_workers=workers or _processors()) as pool:
+        with _quiet(), ThreadPoolExecutor(max_workers=workers or _processors()) as pool:
             futures = {pool.submit(_simulate, job, fidelity, record_shape): i for i, job in enumerate(jobs)}
             try:
                 for done, future in enumerate(as_completed(futures), start=1):
@@ -75,6 +76,18 @@ class MujocoBackend:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
         return [trace for trace in traces if trace is not None]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Send MuJoCo's warnings to our log; by itself it prints them and writes MUJOCO_LOG.TXT where the user works."""
+    mujoco = engine()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: logger.debug("MuJoCo: %s", message))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _processors() -> int:
