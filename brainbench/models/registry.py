@@ -95,7 +95,8 @@ def register_model(
         raise UsageError(f"A model name is lower-case letters and digits joined by '-' or '+'; received {name!r}.")
 
     def decorate(build: Factory) -> Factory:
-        if name in _known():
+        _load_builtin()
+        if name in _records:
             owner = _records[name].build
             raise UsageError(f"A model named {name!r} is already registered by {owner!r}; choose another name.")
         _records[name] = ModelRecord(name, build, family, description, citation, licence)
@@ -159,9 +160,15 @@ def describe_model(name: str) -> ModelDescription:
     """
     import torch
 
+    from brainbench.models._seeding import seeded
+
     record = find_model(name)
-    with torch.device("meta"):
-        model = record.build()
+    with seeded(0):
+        try:
+            with torch.device("meta"):
+                model = record.build()
+        except (RuntimeError, NotImplementedError):  # a model that computes with values while it is built
+            model = record.build()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
     return ModelDescription(
         record.name,
@@ -208,13 +215,19 @@ def _split(name: str) -> tuple[str, str | None]:
 
 def _known() -> dict[str, ModelRecord]:
     """Return the registry, filled on first use."""
+    _load_builtin()
+    if "entry points" not in _sources:
+        _sources.add("entry points")
+        _load_entry_points()
+    return _records
+
+
+def _load_builtin() -> None:
     if "builtin" not in _sources:
         _sources.add("builtin")
         from brainbench.models import zoo
 
         zoo.register()
-        _load_entry_points()
-    return _records
 
 
 def _load_entry_points() -> None:

@@ -1,3 +1,4 @@
+import importlib
 import logging
 import subprocess
 import sys
@@ -136,6 +137,15 @@ def test_a_registered_function_becomes_a_model():
 
 
 @pytest.mark.usefixtures("_clean")
+def test_a_model_that_computes_while_it_is_built_can_be_described():
+    @register_model("computing", family="linear")
+    def computing():
+        return nn.Linear(int(torch.linspace(1, 7, 3)[-1].item()), 2)
+
+    assert describe_model("computing").parameters == 16
+
+
+@pytest.mark.usefixtures("_clean")
 def test_our_names_are_taken_from_the_start():
     with pytest.raises(UsageError, match="'zhuang' is already registered"):
         register_model("zhuang", family="mine")(nn.Identity)
@@ -164,15 +174,20 @@ def test_models_of_other_packages_arrive_and_broken_ones_are_announced(tmp_path,
         "@register_model('elsewhere', family='theirs')\n"
         "def make():\n    return nn.Identity()\n"
     )
+    broken = tmp_path / "broken_elsewhere.py"
+    broken.write_text("raise RuntimeError('out of order')\n")
     info = tmp_path / "elsewhere-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[brainbench.models]\nmine = elsewhere\nbroken = elsewhere:absent\n")
+    (info / "entry_points.txt").write_text("[brainbench.models]\nmine = elsewhere:make\nbroken = broken_elsewhere\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(registry, "_records", {})
     monkeypatch.setattr(registry, "_sources", set())
+    # The plug-in may be imported before the registry is first asked.
+    importlib.import_module("elsewhere")
     with caplog.at_level(logging.WARNING):
         names = list_models()
     assert "elsewhere" in names
     assert "zhuang" in names
-    assert "entry point 'broken' (elsewhere:absent) could not be loaded" in caplog.text
+    assert "entry point 'broken' (broken_elsewhere) could not be loaded: out of order" in caplog.text
+    assert "mine" not in caplog.text
