@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ class BrainSide:
     """Opened recordings."""
 
     dataset: xr.Dataset
+    source: str
+    """Short name of where they come from, without private folders."""
 
     @property
     def vocabulary(self) -> tuple[str, ...]:
@@ -41,8 +44,8 @@ class BrainSide:
     @property
     def origin(self) -> dict[str, Any]:
         """Provenance of the recordings."""
-        names = ("source", "content_hash", "window", "selection", "removed", "synthetic")
-        return {name: self.dataset.attrs[name] for name in names}
+        names = ("content_hash", "window", "selection", "removed", "synthetic")
+        return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}}
 
     def animals(self, kept: tuple[str, ...], *, time: str = "mean", seed: int = 0) -> tuple[SubjectRDM, ...]:
         """Every animal's RDM and its split halves over the labels ``kept``, in that order."""
@@ -73,10 +76,12 @@ def brain_side(recordings: Any, *, progress: Progress | None, **selection: Any) 
     if isinstance(recordings, xr.Dataset):
         from brainbench.types import check_recordings
 
-        return BrainSide(check_recordings(recordings))
+        return BrainSide(check_recordings(recordings), "data set")
     if recordings == "demo":
-        recordings = demo_recordings(progress=progress)
-    return BrainSide(open_recordings(recordings, **selection))
+        return BrainSide(open_recordings(demo_recordings(progress=progress), **selection), "demo")
+    several = not isinstance(recordings, (str, os.PathLike))
+    name = ", ".join(Path(item).name for item in recordings) if several else Path(recordings).name
+    return BrainSide(open_recordings(recordings, **selection), name)
 
 
 def demo_recordings(*, progress: Progress | None = None) -> Path:

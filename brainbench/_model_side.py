@@ -138,7 +138,7 @@ def _features(path: Path) -> Candidate:
 
     features = read_features(path)
     card = ModelCard(path.stem, family=_ELSEWHERE, weights=file_hash(path))
-    return Candidate(card, None, features.activations, features.labels, {"features": str(path)})
+    return Candidate(card, None, features.activations, features.labels, {"features": path.name})
 
 
 def _chosen(activations: Mapping[str, Any], layers: tuple[str, ...] | None) -> Mapping[str, Any]:

@@ -80,6 +80,7 @@ def score_record(
     time: TimeRule = "mean",
     seed: int = 0,
     baselines: bool = True,
+    command: str | None = None,
     progress: Progress | None = None,
 ) -> ResultRecord:
     """Score a model and its baselines, with everything that a leaderboard needs.
@@ -99,6 +100,7 @@ def score_record(
             ``"concatenate"`` keeps every step as features.
         seed: seed of untrained weights, of split halves and of random features.
         baselines: also score the raw input, random features and animal against animal.
+        command: the command line that makes this record, kept in its provenance.
         progress: called with (done, total, what).
 
     Returns:
@@ -144,6 +146,7 @@ def score_record(
         **network.origin,
         recordings=brain.origin,
         pairs=pairs,
+        **({"command": command} if command else {}),
         settings={"time": time, "normalize": normalize, "layers": layers, "estimator": estimator, "seed": seed},
         seconds=round(clock.perf_counter() - started, 2),
     )

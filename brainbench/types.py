@@ -252,7 +252,7 @@ class ResultRecord:
         plain = to_plain(self)
         for item in (plain["score"], plain["animal_to_animal"], *plain["baselines"].values()):
             if item is not None:
-                for volatile in ("time", "machine", "python", "packages", "seconds"):
+                for volatile in ("time", "machine", "python", "packages", "seconds", "command"):
                     item["provenance"].pop(volatile, None)
         return content_hash(plain)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -58,9 +60,8 @@ def score(
     as_json: JsonOption = False,
 ) -> None:
     """Score a model against neural recordings and write a result record and an HTML report."""
-    from leaderboards.report import write_report
-
     from brainbench.scoring import score_record
+    from leaderboards.report import write_report
     from leaderboards.store import write_record
 
     with progress_bar() as progress:
@@ -78,12 +79,25 @@ def score(
             estimator=estimator,
             normalize=normalize,
             seed=seed,
+            command=_command(),
             progress=progress,
         )
     path = write_record(record, out)
     report = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
     emit(data, f"{_text(record)}\n\nrecord  {path}\nreport  {report}", as_json=as_json)
+
+
+def _command() -> str:
+    """The command as typed, without what only says where and how to print."""
+    words = iter(sys.argv[1:])
+    kept = []
+    for word in words:
+        if word in ("--out", "-o"):
+            next(words, None)
+        elif word not in ("--json", "-v", "--verbose") and not word.startswith("--out="):
+            kept.append(word)
+    return shlex.join(["brainbench", *kept])
 
 
 def _text(record: ResultRecord) -> str:
