@@ -18,12 +18,17 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
     coded in sorted order. The order of appearance never matters.
 
     Raises:
-        UsageError: other types, negative codes, or codes at or above ``count``.
+        UsageError: other types, negative codes, codes at or above ``count``, or strings with a ``count``.
     """
     array = np.asarray(labels)
     if array.ndim != 1:
         raise UsageError(f"Labels are one per trial [R]; received an array of shape {array.shape}.")
     if array.dtype.kind in "US" or (array.dtype == object and all(isinstance(label, str) for label in array)):
+        if count is not None:
+            raise UsageError(
+                "Labels of sessions are integers 0 … K−1 in the order of the stimuli (a session may lack one, so names "
+                f"cannot be numbered here); received strings such as {str(array[0])!r}."
+            )
         names, codes = np.unique(array.astype(str), return_inverse=True)
         return codes.astype(np.int64), tuple(str(name) for name in names)
     if array.dtype.kind not in "iu":

@@ -41,6 +41,12 @@ def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
 
     Raises:
         UsageError: unknown method, or RDMs of different numbers of stimuli.
+
+    >>> round(float(compare([1, 2, 4], [2, 4, 8])), 6)
+    1.0
+    >>> layers, animals = [[1, 2, 3], [3, 2, 1]], [[1, 3, 4], [2, 3, 5], [4, 2, 1]]
+    >>> compare([[layer] for layer in layers], animals, method="spearman").round(6).tolist()
+    [[1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]
     """
     check_comparison(method)
     left, right = rdm_stack(a, "a"), rdm_stack(b, "b")

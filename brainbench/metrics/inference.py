@@ -72,6 +72,10 @@ def permutation_test(
 
     Raises:
         UsageError: unknown method, or RDMs of different numbers of stimuli.
+
+    >>> test = permutation_test([1, 2, 3, 4, 5, 7], [[1, 2, 3, 4, 5, 6], [2, 3, 3, 4, 6, 7]])
+    >>> test.count, round(test.p, 4), test.p == test.smallest
+    (24, 0.0417, True)
     """
     check_comparison(method)
     model = rdm_stack(model_rdm, "model_rdm")

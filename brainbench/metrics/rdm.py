@@ -67,6 +67,11 @@ def rdm(
     Raises:
         UsageError: unknown method, shapes that do not fit, folds missing or not wanted.
         DataError: infinite trials, or negative rates for ``poisson``.
+
+    >>> rdm([[1, 2, 3], [2, 4, 6], [3, 2, 1]]).round(3).tolist()
+    [0.0, 2.0, 2.0]
+    >>> rdm([[1, 2], [3, 2], [5, 5]], ["b", "b", "a"], method="sqeuclidean").tolist()
+    [9.0]
     """
     if method not in _METHODS:
         raise unknown_name("RDM method", method, _METHODS)

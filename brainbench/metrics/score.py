@@ -99,7 +99,7 @@ def score_rdms(
         reliability_interval=reliability_interval,
         interval=None if choice is None else t_interval(choice.values),
         p=math.nan if choice is None else choice.test.p,
-        p_method="" if choice is None else f"{choice.test.method}; {_repeated(estimator, len(defined))}",
+        p_method="" if choice is None else _method(choice.test, estimator, len(defined)),
         p_smallest=smallest_p(len(stimuli)),
         ceiling=ceiling_of(animals, compare),
         layer=None if chosen is None else names[chosen],
@@ -182,7 +182,7 @@ def _choose_on_halves(rdms: Floats, subject: SubjectRDM, comparison: str, seed: 
 
     def statistic(x: Floats) -> Floats:
         pair = x.reshape(*x.shape[:-1], len(some), 2)
-        return choose_on_halves(pair[..., 0], pair[..., 1])[1].mean(axis=-1)
+        return choose_on_halves(pair[..., 0], pair[..., 1])[1].mean(axis=-1) * factor
 
     test = permuted_statistic(rdms, some.reshape(2 * len(some), -1), statistic, method=comparison, seed=seed)
     rule = "chosen on one half of the only reliable animal's trials, evaluated on the other half"
@@ -276,7 +276,9 @@ def _subject_scores(
     return tuple(scores)
 
 
-def _repeated(estimator: str, layers: int) -> str:
-    if layers == 1:
-        return "one layer"
-    return "layer chosen anew in each" if estimator == "default" else "maximum over layers taken anew in each"
+def _method(test: PermutationTest, estimator: str, layers: int) -> str:
+    """Describe the test, and the score that a model without knowledge gets after the same choice of layer."""
+    repeated = "layer chosen anew in each" if estimator == "default" else "maximum over layers taken anew in each"
+    text = f"{test.method}; {'one layer' if layers == 1 else repeated}"
+    # Adding zero keeps a rounded −0.00 out of the sentence.
+    return f"{text}; mean score under permutation {round(test.null.mean(), 2) + 0.0:.2f}" if test.null.size else text

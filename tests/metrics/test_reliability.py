@@ -212,6 +212,8 @@ def test_misuse_is_told_in_a_sentence():
         split_half([TrialBlock(block.responses, block.labels, ["a"])], 6)
     with pytest.raises(UsageError, match="run from 0 to 4; received 0 to 5"):
         split_half([block], 5)
+    with pytest.raises(UsageError, match="integers 0 … K−1"):
+        split_half([TrialBlock(block.responses, np.array(STIMULI)[block.labels])], 6)
     with pytest.raises(DataError, match="infinite"):
         split_half([TrialBlock(np.full((12, 2), np.inf), np.repeat(np.arange(6), 2))], 6)
     with pytest.raises(DataError, match="never negative"):

@@ -72,6 +72,18 @@ def test_the_optimistic_maximum_stands_beside_the_score():
     assert [layer.layer for layer in score.layers] == [f"l{i}" for i in range(30)]
 
 
+def test_the_chance_level_after_choosing_a_layer_stands_in_the_method():
+    rng = np.random.default_rng(20)
+    shared = make_rdm(rng)
+    animals = [make_subject(f"m{i}", shared + 0.05 * rng.normal(size=15), seed=i) for i in range(4)]
+    layers = {f"l{i}": make_rdm(rng) for i in range(10)}
+    many, one = _score(layers, animals), _score({"l0": layers["l0"]}, animals)
+    assert one.p_method.endswith("all 720 orders; one layer; mean score under permutation 0.00")
+    chance = float(many.p_method.rpartition(" ")[2])
+    assert "layer chosen anew in each" in many.p_method
+    assert 0.25 < chance < 0.6
+
+
 def test_one_layer_needs_no_choice():
     latent = make_latent(3)
     animals = _make_animals(latent)
