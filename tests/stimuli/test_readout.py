@@ -56,7 +56,7 @@ def test_other_sub_steps_divide_time_otherwise():
 
 
 def test_both_sides_do_not_fit_one_grid():
-    with pytest.raises(UsageError, match="two whiskers in one cell .both sides."):
+    with pytest.raises(UsageError, match=r"two whiskers in one cell .both sides."):
         to_grid(_dataset(side="both", whiskers="C2"))
 
 

@@ -56,7 +56,7 @@ def _write(tmp_path, text, name="pole.toml"):
 
 def test_a_scene_file_becomes_scenes_in_si_units(tmp_path):
     recipe = load_scene(_write(tmp_path, POLE))
-    near, free = recipe.scenes
+    near, _ = recipe.scenes
     assert (recipe.name, recipe.description, recipe.labels) == ("pole", "a pole", ("near", "free"))
     assert near.array.species == "rat"
     assert near.array.side == "left"
