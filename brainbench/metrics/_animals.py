@@ -70,6 +70,7 @@ def gather(subjects: Sequence[SubjectRDM], *, estimator: str, comparison: str, p
     good = tuple(i for i in usable if corrections[i].status == "ok")
     # The published estimators knew no gate: they average whatever has a value.
     scored = good if good and estimator == "default" else usable
+    # Whoever is not averaged is named, so no animal disappears in silence.
     left_out = [i for i in range(len(ordered)) if i not in scored]
     reasons = [f"{names[i]} left out: {corrections[i].reason}" for i in left_out]
     reliable = bool(scored) and all(corrections[i].status == "ok" for i in scored)

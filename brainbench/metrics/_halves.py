@@ -110,6 +110,7 @@ def _half_means(sessions: list[Session], chosen: list[Floats], count: int) -> tu
                 number = weight.sum(axis=1, keepdims=True)
                 if not session.complete:
                     number = weight @ np.isfinite(session.responses[rows]).astype(np.float64)
+                    # A unit unseen in this half is missing here, not silent.
                     number[number == 0] = np.nan
                 target[:, stimulus, columns] = weight @ filled[rows] / number
     return first, second
@@ -127,6 +128,7 @@ def _from_products(
         group[np.arange(len(session.codes)), session.codes] = 1.0
         for half, weight in enumerate((member, 1.0 - member)):
             number = weight @ group
+            # A half's mean pattern is its trials weighted by these shares.
             share = weight / number[:, session.codes]
             sums[half] += (share * session.responses.sum(axis=1)) @ group
             for stimulus in range(count):
@@ -134,6 +136,7 @@ def _from_products(
                 grams[half][:, stimulus] += ((share[:, rows] @ product[rows]) * share) @ group
     if method == "sqeuclidean":
         return products_from_gram(grams[0], units), products_from_gram(grams[1], units)
+    # Correlation takes each pattern's mean over all units, which spans the sessions.
     common = sums[..., :, None] * sums[..., None, :] / units
     centred = grams - common
     if (np.einsum("...ii->...i", centred) <= _COMMON * np.einsum("...ii->...i", grams)).any():

@@ -29,6 +29,7 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
                 "Labels of sessions are integers 0 … K−1 in the order of the stimuli (a session may lack one, so names "
                 f"cannot be numbered here); received strings such as {str(array[0])!r}."
             )
+        # Sorted, never by first appearance: that misaligned sessions in published code.
         names, codes = np.unique(array.astype(str), return_inverse=True)
         return codes.astype(np.int64), tuple(str(name) for name in names)
     if array.dtype.kind not in "iu":

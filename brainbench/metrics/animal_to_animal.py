@@ -144,6 +144,7 @@ def _against_others(
 ) -> Corrected:
     others = [subjects[other] for other in scored if other != index]
     pooled = np.mean([other.rdm for other in others], axis=0)
+    # Halves are averaged split by split, so every animal must have them.
     splits = min(len(subjects[other].halves) for other in scored)
     halves = np.mean([other.halves[:splits] for other in others], axis=0)
     return noise_corrected(

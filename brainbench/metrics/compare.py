@@ -63,6 +63,7 @@ def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
         return _compare_present(np.broadcast_to(left, shape), np.broadcast_to(right, shape), method)
     if method in _BY_SORTING and left.shape[-1] > _SIGN_LIMIT:
         return _each(np.broadcast_to(left, shape), np.broadcast_to(right, shape), _BY_SORTING[method])
+    # The broadcast product of all comparisons and all pairs is never formed.
     return np.einsum("...p,...p->...", features(left, method), features(right, method))
 
 

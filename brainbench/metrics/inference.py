@@ -128,6 +128,7 @@ def permuted_statistic(
         return PermutationTest(
             math.nan, smallest, exact, count, math.nan, null, "the comparison is undefined (a constant RDM)"
         )
+    # The given order comes first, so the observed statistic went through the same arithmetic.
     p = float(np.mean(null >= null[0] - TIE * max(1.0, abs(null[0]))))
     return PermutationTest(p, smallest, exact, count, float(null[0]), null)
 
@@ -146,6 +147,7 @@ def label_orders(stimuli: int, step: int, seed: int) -> Iterator[Ints]:
         orders = _all_orders(stimuli)
         yield from (orders[start : start + step] for start in range(0, len(orders), step))
         return
+    # Counting the given order once among the random ones is what (b+1)/(n+1) means.
     yield np.arange(stimuli)[None]
     generator = np.random.default_rng(seed)
     for start in range(0, RANDOM_PERMUTATIONS, step):

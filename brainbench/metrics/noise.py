@@ -116,6 +116,7 @@ def noise_corrected(
         value, reason = math.nan, "the comparison of the RDMs is undefined (a constant or missing RDM)"
     if math.isnan(value):
         return Corrected(math.nan, "undefined", reason, r, reliability, splits)
+    # The noisier side decides: one good side does not make up for a bad one.
     lowest = min(sides)
     if not lowest >= RELIABILITY_GATE:
         text = f"reliability {lowest:.2f} is below {RELIABILITY_GATE}, where no noise correction is trustworthy"

@@ -35,6 +35,7 @@ def noise_precision(responses: ArrayLike, labels: ArrayLike, *, method: str = "s
     codes, names = stimulus_codes(labels)
     if len(codes) != len(trials):
         raise UsageError(f"There are {len(trials)} trials but {len(codes)} labels; give one label per trial.")
+    # Products between units need both entries of a trial; filling one would invent covariance.
     complete = ~np.isnan(trials).any(axis=1)
     trials, codes = trials[complete], codes[complete]
     freedom = len(trials) - len(np.unique(codes))

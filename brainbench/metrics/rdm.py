@@ -153,6 +153,7 @@ def _crossnobis(given: _Trials) -> Floats:
     units = given.patterns.shape[1]
     weight = None if given.precision is None else _precision_matrix(given.precision, units)
     count = len(given.patterns)
+    # Fold and stimulus together number the cells, so one pass over the trials averages all of them.
     cells = np.searchsorted(names, folds) * count + given.codes
     means = stimulus_means(given.trials, cells, len(names) * count).reshape(len(names), count, units)
     if np.isfinite(given.patterns).all():

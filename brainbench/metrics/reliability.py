@@ -166,6 +166,7 @@ def _usable(
         recorded = np.isfinite(responses).any(axis=1)
         hashes = _hashes(block, responses, codes)[recorded]
         responses, codes = responses[recorded], codes[recorded]
+        # A trial without any recorded unit is no trial, whatever its label.
         trials = np.bincount(codes, minlength=count)
         total += trials
         if trials.min() < 2:

@@ -144,6 +144,7 @@ def _layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> tupl
 
 def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, seed: int) -> _Choice | None:
     """Choose layers by the estimator's rule, with a test that repeats the choice."""
+    # An animal's factor does not change when labels are permuted, so permutations repeat r alone.
     brain, factors = animals.rdms(animals.scored), animals.factors(animals.scored)
     r = compare_all(rdms, brain, method=comparison)
     count = len(animals.scored)
@@ -151,6 +152,7 @@ def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, see
     if len(rdms) == 1:
         test = permuted_statistic(rdms, brain, lambda x: x[:, 0] @ factors / count, method=comparison, seed=seed)
         return _Choice(r[0], r[0] * factors, (0,) * count, 0, "only layer", test)
+    # The published rule; the test takes the same maximum, so its p stays honest where the value is not.
     if estimator != "default":
         best = first_best((r * factors).mean(axis=1))
         test = permuted_statistic(
