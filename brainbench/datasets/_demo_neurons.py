@@ -29,7 +29,7 @@ LATENCY = 0.015
 """Delay from whisker to spike, s."""
 
 _FAST, _SLOW = 0.03, 0.2
-_COMPRESSION = 0.3
+_COMPRESSION = 0.1
 """Half-saturation of an afferent, in root mean squares of its channel."""
 _OTHERS = 0.15
 """Share of units that prefer an untracked whisker."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,30 +12,12 @@ import numpy as np
 
 from brainbench.datasets import hdf5
 from brainbench.datasets._extract import has_units, no_units, read_spikes
+from brainbench.datasets.proposals import EXAMPLES, ColumnSummary, Proposal, propose, summarise_columns
 from brainbench.datasets.recipes import detect_recipe
-from brainbench.datasets.sessions import SPIKES, Session, Table, as_labels, natural_order
+from brainbench.datasets.sessions import SPIKES, Session, Table, natural_order
 from brainbench.datasets.sources import find_files, open_file, read_file
 from brainbench.errors import DataError
 from brainbench.files import to_json
-
-_EXAMPLES = 6
-_MOST_VALUES = 60
-_STIMULUS = re.compile(r"stim|cond|object|image|texture|shape|categ|orient|freq|odou?r|position", re.IGNORECASE)
-_BEHAVIOUR = re.compile(r"resp|choice|accuracy|correct|outcome|confid|reward|react|lick|key|tags", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class ColumnSummary:
-    """One column of an interval table."""
-
-    name: str
-    kind: str
-    """``text``, ``integer``, ``number``, ``boolean``, ``list`` (ragged) or ``other``."""
-    distinct: int
-    """Number of distinct values; 0 where they are not single values."""
-    examples: tuple[str, ...] = ()
-    fewest: int = 0
-    """Trials of the rarest value."""
 
 
 @dataclass(frozen=True)
@@ -84,16 +65,6 @@ class SessionSummary:
 
 
 @dataclass(frozen=True)
-class Proposal:
-    """A ``--conditions`` value worth trying."""
-
-    conditions: str
-    labels: tuple[str, ...]
-    fewest: int
-    """Trials of the rarest label."""
-
-
-@dataclass(frozen=True)
 class Inspection:
     """What is in the files of one source."""
 
@@ -121,7 +92,7 @@ class Inspection:
         if self.proposals:
             yield "conditions to try:"
             for item in self.proposals:
-                shown = ", ".join(item.labels[:_EXAMPLES]) + (" …" if len(item.labels) > _EXAMPLES else "")
+                shown = ", ".join(item.labels[:EXAMPLES]) + (" …" if len(item.labels) > EXAMPLES else "")
                 yield f"  --conditions {item.conditions}   {len(item.labels)} labels, ≥ {item.fewest} trials: {shown}"
 
 
@@ -159,42 +130,6 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
     )
 
 
-def propose(sessions: Iterable[Session]) -> list[Proposal]:
-    """Rank the columns that could label trials: 2–60 values with at least two trials each.
-
-    Stimulus-like names come before others and before behavioural ones; then text before integers
-    before the rest, the table ``trials`` before others, and balanced columns before unbalanced.
-    """
-    ranked: list[tuple[tuple[float, ...], Proposal]] = []
-    for session in sessions:
-        recipe = detect_recipe(session)
-        for name, table in session.tables.items():
-            for column in _columns(table):
-                if not (2 <= column.distinct <= _MOST_VALUES and column.fewest >= 2) or _is_time(column):
-                    continue
-                ranked.append((_rank(name, column, len(table)), _proposal(session, name, column.name)))
-        if recipe is not None:
-            labels = recipe.conditions.values(session.table(recipe.conditions.table)).tolist()
-            declared = recipe.vocabulary(recipe.conditions) or ()
-            counts = Counter("-".join(row) for row in labels)
-            fewest = min(counts[label] for label in declared)
-            ranked.append(((-1.0,), Proposal(str(recipe.conditions), declared, fewest)))
-    return [proposal for _, proposal in sorted(ranked, key=lambda item: item[0])]
-
-
-def _rank(table: str, column: ColumnSummary, rows: int) -> tuple[float, ...]:
-    topic = 0 if _STIMULUS.search(column.name) else 2 if _BEHAVIOUR.search(column.name) else 1
-    kind = {"text": 0, "integer": 1}.get(column.kind, 2)
-    imbalance = 1 - column.fewest * column.distinct / max(rows, 1)
-    return (topic, kind, table != "trials", imbalance)
-
-
-def _proposal(session: Session, table: str, column: str) -> Proposal:
-    counts = Counter(item for item in as_labels(session.table(table).column(column)).tolist() if item)
-    labels = list(counts)
-    return Proposal(f"{table}:{column}", tuple(labels[index] for index in natural_order(labels)), min(counts.values()))
-
-
 def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
     """Join equal proposals of several files: all labels, the fewest trials."""
     merged: dict[str, Proposal] = {}
@@ -208,10 +143,6 @@ def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
                 labels = [labels[index] for index in natural_order(labels)]
             merged[item.conditions] = Proposal(item.conditions, tuple(labels), min(known.fewest, item.fewest))
     return tuple(merged.values())
-
-
-def _is_time(column: ColumnSummary) -> bool:
-    return column.name in ("start_time", "stop_time") or column.name.endswith(("_time", "_times"))
 
 
 def _summary(session: Session, usable: bool) -> SessionSummary:
@@ -260,34 +191,9 @@ def _units(session: Session) -> UnitsSummary | None:
 def _table(table: Table) -> TableSummary:
     problem = "" if "start_time" in table else "it has no start_time"
     try:
-        return TableSummary(table.name, len(table), tuple(_columns(table)), problem)
+        return TableSummary(table.name, len(table), tuple(summarise_columns(table)), problem)
     except DataError as error:
         return TableSummary(table.name, len(table), (), str(error))
-
-
-def _columns(table: Table) -> Iterator[ColumnSummary]:
-    for name in table.columns:
-        if f"{name}_index" in table:
-            yield ColumnSummary(name, "list", 0)
-            continue
-        try:
-            values = table.column(name)
-        except DataError:
-            yield ColumnSummary(name, "other", 0)
-            continue
-        unique, number = np.unique(values, return_counts=True)
-        present = np.char.strip(unique) != "" if values.dtype.kind == "U" else np.isfinite(unique)
-        unique, number, kind = unique[present], number[present], _kind(values)
-        shown = unique[natural_order(unique)] if kind == "text" else unique
-        labels = as_labels(shown[:_EXAMPLES]).tolist()
-        examples = tuple(f"{float(item):.6g}" for item in labels) if kind == "number" else tuple(labels)
-        yield ColumnSummary(name, kind, len(unique), examples, int(min(number, default=0)))
-
-
-def _kind(values: np.ndarray) -> str:
-    if values.dtype.kind == "f" and len(values) and np.all(np.isfinite(values) & (values == np.round(values))):
-        return "integer"
-    return {"U": "text", "b": "boolean", "i": "integer", "u": "integer"}.get(values.dtype.kind, "number")
 
 
 def _counted(dataset: object, path: Path) -> Inspection:
@@ -318,7 +224,7 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
         yield f"  table {table.name}: {table.rows} rows"
         for column in table.columns:
             values = f"{column.distinct} values: {', '.join(column.examples)}" if column.distinct else column.kind
-            yield f"    {column.name} ({column.kind}) {values}{' …' if column.distinct > _EXAMPLES else ''}"
+            yield f"    {column.name} ({column.kind}) {values}{' …' if column.distinct > EXAMPLES else ''}"
     for name, contents in session.modules:
         yield f"  processing/{name}: {', '.join(contents)}"
     for item in (*session.missing, *session.notes):

@@ -11,18 +11,17 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from brainbench.datasets import hdf5
-from brainbench.datasets._extract import UNIT_COLUMNS, Part, Plan, extract, has_units, no_units
-from brainbench.datasets.conditions import Conditions, natural_vocabulary
-from brainbench.datasets.recipes import Recipe, detect_recipe, get_recipe, resolve_selection, split_source
+from brainbench.datasets._extract import Part, Plan, extract, has_units, no_units
+from brainbench.datasets._join import join
+from brainbench.datasets.conditions import Conditions
+from brainbench.datasets.proposals import propose
+from brainbench.datasets.recipes import Recipe, detect_recipe, get_recipe, list_recipes, resolve_selection, split_source
 from brainbench.datasets.selection import DEFAULT, Selection
-from brainbench.datasets.sessions import Session, natural_key
+from brainbench.datasets.sessions import Session
 from brainbench.datasets.sources import find_files, open_file, read_file
 from brainbench.datasets.window import WHOLE, Window, resolve_window
 from brainbench.errors import DataError, UsageError, listing, unknown_name
-from brainbench.files import content_hash
 from brainbench.types import check_recordings
 
 if TYPE_CHECKING:
@@ -138,18 +137,17 @@ class _Reader:
         if self.plan is None:
             self.recipe = self.recipe if self.named else found
             self.plan = self._make_plan(session)
-        elif not self.named and found is not self.recipe and self.conditions is None:
+        elif not self.named and found is not self.recipe:
+            # Going on with the first file's recipe would make the result depend on the order of files.
             raise UsageError(
-                f"{session.source} has another layout than {next(iter(self.seen.values()))}; say with conditions "
-                f"TABLE:COLUMN how both are to be read."
+                f"{session.source} has another layout than {next(iter(self.seen.values()))}; open them apart, or name "
+                f"the recipe for both: {listing(f'{name}:PATH' for name in list_recipes())}."
             )
         return self.plan
 
     def _make_plan(self, session: Session) -> Plan:
         conditions = self.conditions or (self.recipe.conditions if self.recipe else None)
         if conditions is None:
-            from brainbench.datasets.inspection import propose
-
             proposals = [item.conditions for item in propose([session])][:4]
             if not proposals:
                 raise DataError(
@@ -175,8 +173,13 @@ class _Reader:
             raise DataError(_first_and_count(self.skipped))
         if not self.parts:
             raise unknown_name("subject", self.plan.selection.subjects[0], sorted(set(self.other_subjects)))
-        self.notes += self.skipped
-        return check_recordings(_join(self, self.plan, source))
+        notes = self.notes + self.skipped
+        return check_recordings(join(self.parts, self.plan, source=source, recipe=self._recipe_name(), notes=notes))
+
+    def _recipe_name(self) -> str:
+        if self.recipe is None:
+            return ""
+        return self.recipe.name if self.named else f"{self.recipe.name} (detected from the layout)"
 
 
 def _resolve(source: Source) -> tuple[Recipe | None, list[Path]]:
@@ -196,109 +199,6 @@ def _already_counted(path: Path, options: Iterable[Any]) -> xr.Dataset | None:
                 f"cannot apply; leave them out, or open the original spike times."
             )
         return hdf5.read_counts(file, path)
-
-
-def _join(reader: _Reader, plan: Plan, source: str) -> xr.Dataset:
-    import xarray as xr
-
-    parts = sorted(reader.parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
-    removed = _total(part.tally.removed for part in parts)
-    trials, units = sum(len(part.labels) for part in parts), sum(len(part.unit_ids) for part in parts)
-    if not trials or not units:
-        what = "trial" if not trials else "unit"
-        reasons = "; ".join(f"{rule} removed {number}" for rule, number in removed.items() if number)
-        raise DataError(f"No {what} remains of {source}: {reasons or 'the tables are empty'}.")
-    vocabulary = plan.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
-    present = {label for part in parts for label in part.labels}
-    if len(present) < 2:
-        raise DataError(
-            f"All {trials} trials of {source} that remain have the one condition {next(iter(present))!r} "
-            f"({plan.conditions}); comparing responses needs at least two, choose another column."
-        )
-    bins = max(part.counts.shape[1] for part in parts)
-    counts = np.full((trials, bins, units), np.nan, dtype=np.float32)
-    duration = np.zeros((trials, bins))
-    row = column = 0
-    for part in parts:
-        count, depth, width = part.counts.shape
-        counts[row : row + count, :depth, column : column + width] = part.counts
-        duration[row : row + count, :depth] = part.duration
-        row, column = row + count, column + width
-    edges = np.concatenate([part.edges for part in parts])
-    coordinates: dict[str, Any] = {
-        "time": ("time", np.arange(bins) * (plan.bin or 0.0)),
-        "stimulus": ("trial", [label for part in parts for label in part.labels]),
-        "subject": ("trial", [part.subject for part in parts for _ in part.labels]),
-        "session": ("trial", [part.session for part in parts for _ in part.labels]),
-        "trial_id": ("trial", [name for part in parts for name in part.trial_ids]),
-        "window_start": ("trial", edges[:, 0]),
-        "window_stop": ("trial", edges[:, 1]),
-        "unit_subject": ("unit", [part.subject for part in parts for _ in part.unit_ids]),
-        "unit_session": ("unit", [part.session for part in parts for _ in part.unit_ids]),
-        "unit_id": ("unit", [name for part in parts for name in part.unit_ids]),
-        **{name: ("unit", np.concatenate([part.columns[name] for part in parts])) for name in UNIT_COLUMNS},
-    }
-    dataset = xr.Dataset(
-        {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}, coordinates
-    )
-    dataset.attrs = {
-        "vocabulary": list(vocabulary),
-        "conditions": str(plan.conditions),
-        "recipe": _recipe_name(reader),
-        "window": str(plan.window),
-        "bin": plan.bin,
-        "selection": {"name": plan.selection.name, "rules": list(plan.selection.lines())},
-        "removed": removed,
-        "missing": _missing(parts, vocabulary),
-        "sessions": [_about(part) for part in parts],
-        "notes": [*reader.notes, *(note for part in parts for note in part.tally.notes)],
-        "source": source,
-        "synthetic": any(part.synthetic for part in parts),
-        "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
-    }
-    return dataset
-
-
-def _content(part: Part) -> tuple[Any, ...]:
-    """What makes the data: all else (window, selection, file names) only says how they came about."""
-    names = (part.subject, part.session, part.labels, part.trial_ids, part.unit_ids)
-    return part.counts, part.duration, names
-
-
-def _about(part: Part) -> dict[str, Any]:
-    return {
-        "subject": part.subject,
-        "session": part.session,
-        "source": part.source,
-        "trials": len(part.labels),
-        "trials_in_file": part.trials,
-        "units": len(part.unit_ids),
-        "units_in_file": part.units,
-        "removed": dict(part.tally.removed),
-        "synthetic": part.synthetic,
-    }
-
-
-def _missing(parts: list[Part], vocabulary: tuple[str, ...]) -> dict[str, list[str]]:
-    have: dict[str, set[str]] = {}
-    for part in parts:
-        have.setdefault(part.subject, set()).update(part.labels)
-    gaps = {subject: [label for label in vocabulary if label not in labels] for subject, labels in have.items()}
-    return {subject: labels for subject, labels in gaps.items() if labels}
-
-
-def _recipe_name(reader: _Reader) -> str:
-    if reader.recipe is None:
-        return ""
-    return reader.recipe.name if reader.named else f"{reader.recipe.name} (detected from the layout)"
-
-
-def _total(tallies: Iterable[dict[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for tally in tallies:
-        for rule, number in tally.items():
-            total[rule] = total.get(rule, 0) + number
-    return total
 
 
 def _first_and_count(reasons: list[str]) -> str:

@@ -106,7 +106,7 @@ def read_file(file: h5py.File, path: Path) -> list[Session]:
     """
     if hdf5.is_ours(file):
         if hdf5.read_kind(file, path) == "counts":
-            raise DataError(f"{path} holds counted responses, not sessions of spike times.")
+            raise DataError(f"{path} holds counted responses, not sessions of spike times; open it alone.")
         return hdf5.read_sessions(file, path)
     if nwb.is_nwb(file):
         return [nwb.read_nwb(file, path)]
