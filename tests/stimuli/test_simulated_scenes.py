@@ -1,0 +1,110 @@
+"""Scenes run through the real engine, where the answer is known beforehand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.stimuli.motion import Still, Translation, Whisking
+from brainbench.stimuli.objects import PlacedObject, capsule, euler_matrix, sphere
+from brainbench.stimuli.recipes import get_recipe
+from brainbench.stimuli.scene import Frames, Head, Scene
+from brainbench.stimuli.simulation import simulate
+
+# A straight C2 whose base frame lies on the array frame: it points along +x.
+STRAIGHT = WhiskerArray.mouse(whiskers="C2").replace(
+    position=(0.0, 0.0, 0.0), angles=(math.pi / 2, 0.0, -math.pi / 2), curvature=0.0
+)
+AT = 6e-3
+DEFLECTION = 0.1e-3
+
+
+def _pushed(head=None):
+    """A smooth upright bar that moves from +y against the whisker by DEFLECTION and stops there."""
+    radius = 0.5e-3
+    head = head or Head()
+    rod = float(STRAIGHT["C2"].whisker.radius(AT))
+    speed, onset = 2e-3, 0.02
+    travel = speed * (0.08 - onset / 2)
+    start = np.array([AT, radius + rod + travel - DEFLECTION, 0.0])
+    bar = PlacedObject(
+        capsule(radius, 8e-3),
+        position=tuple(head.matrix @ start + head.position),
+        rotation=head.rotation,
+        motion=Translation(tuple(head.matrix @ [0.0, -speed, 0.0]), onset),
+        friction=0.0,
+    )
+    return Scene("pushed", STRAIGHT, (bar,), Still(), head, Frames(0.08, 0.001, 1))
+
+
+def _wrench(scene):
+    dataset = simulate(scene, fidelity=Fidelity.preset("balanced"), cache=False)
+    assert dataset["contact"].values.all()
+    return dataset["wrench"].values[0, 0, 0].astype(float)
+
+
+def test_a_bar_that_pushes_the_whisker_towards_minus_y_makes_it_push_its_base_towards_minus_y():
+    # The whisker hands the contact force on to its base: force −y at x = +a has the moment −z.
+    force_x, force_y, force_z, *moment = _wrench(_pushed())
+    whisker = STRAIGHT["C2"].whisker
+    stiffness = 3 * float(whisker.bending_stiffness(0.0)) / AT**3 * float(whisker.radius(AT)) / whisker.base_radius
+    assert force_y == pytest.approx(-stiffness * DEFLECTION, rel=0.05)
+    assert moment[2] == pytest.approx(-stiffness * DEFLECTION * AT, rel=0.05)
+    assert max(abs(force_x), abs(force_z)) < 0.05 * abs(force_y)
+    assert max(abs(moment[0]), abs(moment[1])) < 0.01 * abs(moment[2])
+
+
+def test_turning_the_whole_scene_turns_the_wrench():
+    head = Head((0.01, -0.02, 0.03), (0.3, -0.5, 1.2))
+    turned, matrix = _wrench(_pushed(head)), euler_matrix(head.rotation)
+    plain = _wrench(_pushed())
+    np.testing.assert_allclose(turned[:3], matrix @ plain[:3], atol=2e-3 * np.linalg.norm(plain[:3]))
+    np.testing.assert_allclose(turned[3:], matrix @ plain[3:], atol=2e-3 * np.linalg.norm(plain[3:]))
+
+
+def test_the_left_side_feels_the_mirror_image():
+    frames = Frames(0.01, 0.005, 16)
+    wrenches = []
+    for side, sign in (("right", 1), ("left", -1)):
+        ball = PlacedObject(sphere(2e-3), position=(sign * 0.012, 0.004, 0.0065), friction=0.2)
+        scene = Scene("ball", WhiskerArray.mouse(side=side, whiskers="C2"), (ball,), Whisking(), frames=frames)
+        dataset = simulate(scene, fidelity=Fidelity.preset("fast"), cache=False)
+        assert dataset["contact"].values.any()
+        wrenches.append(dataset["wrench"].values[0, :, 0].astype(float))
+    # Forces are vectors and moments pseudo-vectors of the mirror x → −x.
+    mirrored = wrenches[0] * [-1, 1, 1, 1, -1, -1]
+    scale = np.abs(wrenches[0]).max(axis=0)
+    np.testing.assert_allclose(wrenches[1] / scale, mirrored / scale, atol=0.02)
+
+
+def test_a_still_whisker_in_front_of_a_distant_object_feels_exactly_nothing():
+    far = PlacedObject(sphere(1e-3), position=(0.5, 0.0, 0.0))
+    dataset = simulate(Scene("far", STRAIGHT, (far,), Still()), fidelity=Fidelity.preset("fast"), cache=False)
+    assert (dataset["wrench"].values == 0).all()
+    assert not dataset["contact"].values.any()
+
+
+def test_c0_to_c3_touch_each_of_the_six_rodgers_stimuli_after_the_start():
+    scenes = get_recipe("rodgers", whiskers="C0-C3").scenes
+    dataset = simulate(scenes, fidelity=Fidelity.preset("fast"), cache=False)
+    assert (dataset["status"] == "ok").all()
+    touched = dataset["contact"].values.any(axis=2)
+    assert touched.any(axis=1).all()
+    assert not touched[:, 0].any()
+    # No whisker reaches a stimulus before it has left its retracted pose.
+    assert dataset["time"].values[touched.any(axis=0)].min() > 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["balanced", "accurate"])
+def test_all_thirty_whiskers_stay_sound_on_the_six_rodgers_stimuli(preset):
+    dataset = simulate(get_recipe("rodgers").scenes, fidelity=Fidelity.preset(preset), cache=False)
+    assert (dataset["status"] == "ok").all()
+    counts = dataset["contact"].any("time").sum("whisker").values
+    # The unbent whiskers of the whisking array cut these objects 11, 8, 5 and 12, 7, 4 times.
+    np.testing.assert_allclose(counts, [11, 8, 5, 12, 7, 4], atol=1)
+    force = np.linalg.norm(dataset["wrench"].values[..., :3], axis=-1).max(axis=(1, 2))
+    assert (force > 1e-5).all()
+    assert (force < 1e-3).all()
