@@ -140,6 +140,21 @@ class Mesh:
         used, renumbered = np.unique(faces, return_inverse=True)
         return Mesh(self.vertices[used], renumbered.reshape(-1, 3), self.name)
 
+    def pieces(self) -> tuple[Mesh, ...]:
+        """Return the connected pieces of the surface, in the order of their first faces."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        ends = self.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+        size = len(self.vertices)
+        links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
+        owner = connected_components(links, directed=False)[1][self.faces[:, 0]]
+        found = []
+        for piece in dict.fromkeys(owner.tolist()):
+            used, faces = np.unique(self.faces[owner == piece], return_inverse=True)
+            found.append(Mesh(self.vertices[used], faces.reshape(-1, 3), self.name))
+        return tuple(found)
+
     def to_trimesh(self) -> trimesh.Trimesh:
         """Return a :class:`trimesh.Trimesh` with the same vertices and faces."""
         import trimesh

@@ -46,6 +46,15 @@ def test_separate_pieces_are_counted():
     assert mesh.diagnosis.bodies == 2
 
 
+def test_pieces_come_apart_whole():
+    cube = trimesh.creation.box()
+    both = Mesh(np.vstack([cube.vertices, cube.vertices * 2 + 5]), np.vstack([cube.faces, cube.faces + 8]))
+    small, large = both.pieces()
+    assert small.to_trimesh().volume == pytest.approx(1)
+    assert large.to_trimesh().volume == pytest.approx(8)
+    assert large.diagnosis.bodies == 1
+
+
 def test_equal_meshes_have_equal_hashes_and_a_moved_vertex_changes_it():
     cube = trimesh.creation.box()
     mesh = Mesh(cube.vertices, cube.faces, "one")

@@ -5,15 +5,16 @@ A :class:`Solid` stands in its own frame; :class:`PlacedObject` puts it into a s
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from brainbench.errors import UsageError
+from brainbench.errors import UsageError, unknown_name
 from brainbench.geometry import Mesh, load_mesh
 from brainbench.stimuli.motion import Still, Translation
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere, rotation_matrix
@@ -21,7 +22,11 @@ from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obst
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+_LOG = logging.getLogger(__name__)
+
 Vector = tuple[float, float, float]
+
+COLLISIONS = ("hull", "pieces")
 
 RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))
 """Control points (x, y) of the cubic Bézier curve that is the convex face of the Rodgers solid, in the
@@ -74,7 +79,8 @@ class Solid:
         from brainbench.files import content_hash, to_plain
 
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
-        return {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "hash": content_hash(parts)}
+        summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
+        return {**summary, "hash": content_hash(parts)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,25 +181,42 @@ def rodgers_solid(diagonal: float = 0.055, *, segments: int = 24) -> Solid:
     return Solid("rodgers", parts, mesh).to_diagonal(diagonal)
 
 
-def mesh_solid(path: str | os.PathLike[str], *, unit: str, diagonal: float | None = None) -> Solid:
-    """Return a mesh file as a solid; whiskers touch its convex hull.
+def mesh_solid(
+    path: str | os.PathLike[str],
+    *,
+    unit: str,
+    diagonal: float | None = None,
+    collision: Literal["hull", "pieces"] = "hull",
+) -> Solid:
+    """Return a mesh file as a solid.
 
     Args:
         path: any format :func:`brainbench.geometry.load_mesh` reads.
         unit: length unit of the file (``m``, ``mm``, …).
         diagonal: scale to this bounding-box diagonal [m]; None keeps the size.
+        collision: what whiskers touch: the convex ``hull`` of the whole mesh, or the hull of each of its
+            connected ``pieces``, for files that bring a convex decomposition along.
 
     Raises:
+        UsageError: ``collision`` or the unit is unknown.
         DataError: the file is missing, unreadable or flat.
     """
+    if collision not in COLLISIONS:
+        raise unknown_name("collision geometry", collision, COLLISIONS)
     mesh = load_mesh(path, unit=unit)
     if diagonal is not None:
         mesh = mesh.to_diagonal(diagonal)
-    hull = mesh.hull()
-    notes = ["Whiskers touch the convex hull: concavities of the mesh are filled."] if _is_concave(mesh, hull) else []
+    pieces = (mesh,) if collision == "hull" else mesh.pieces()
+    hulls = [piece.hull() for piece in pieces]
+    notes = []
+    if any(_is_concave(piece, hull) for piece, hull in zip(pieces, hulls, strict=True)):
+        what = "the mesh" if collision == "hull" else "its pieces"
+        notes.append(f"whiskers touch the convex hull of {what}: concavities are filled")
     if not mesh.diagnosis.watertight:
-        notes.append(f"The mesh is not a closed solid: {mesh.diagnosis}.")
-    return Solid(mesh.name, (ConvexPart(hull.vertices),), mesh, tuple(notes))
+        notes.append(f"the mesh is not a closed solid: {mesh.diagnosis}")
+    for note in notes:
+        _LOG.warning("%s: %s", os.fspath(path), note)
+    return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, tuple(notes))
 
 
 def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:

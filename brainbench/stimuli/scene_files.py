@@ -28,14 +28,16 @@
 
     [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
     label = "pole"
-    [[scene.object]]             # sphere, box, cylinder, capsule, rodgers or mesh
+    [[scene.object]]             # position and rotation as for the head
     shape = "cylinder"
     radius_mm = 0.5
     height_mm = 20
     position_mm = [14, 5, 0]
     friction = 0.3               # optional; velocity_mm_s = [0, -30, 0] moves the object
 
-``[[object]]`` at the top level stands in every scene. Paths of meshes are relative to the file.
+``[[object]]`` at the top level stands in every scene. Other shapes: ``sphere`` (``radius_mm``), ``box``
+(``size_mm``), ``capsule`` (``radius_mm``, ``length_mm``), ``rodgers`` (``diagonal_mm``, ``segments``) and
+``mesh`` (``path`` relative to the file, ``unit``, ``diagonal_mm``, ``collision`` = "hull" | "pieces").
 """
 
 from __future__ import annotations
@@ -222,7 +224,12 @@ def _object(table: _Table, folder: Path) -> PlacedObject:
 
 def _mesh(table: _Table, folder: Path) -> Solid:
     path = folder / table.take("path", _text)
-    return mesh_solid(path, unit=table.take("unit", _text), diagonal=table.take("diagonal_mm", _length, None))
+    return mesh_solid(
+        path,
+        unit=table.take("unit", _text),
+        diagonal=table.take("diagonal_mm", _length, None),
+        collision=table.take("collision", _text, "hull"),
+    )
 
 
 def _rodgers(table: _Table, folder: Path) -> Solid:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
+from brainbench.files import content_hash
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.recipes import get_recipe, list_recipes
 from brainbench.stimuli.selection import match_whiskers
@@ -41,6 +42,9 @@ class Stimuli:
     content_hash: str
     """Equal for equal stimuli."""
     description: str
+    config_hash: str
+    """Names what was asked for; equal on every machine, while the last digits of a simulation, and with
+    them ``content_hash``, depend on the processor. Equal to ``content_hash`` for arrays from a file."""
 
 
 def load_stimuli(
@@ -102,9 +106,12 @@ def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimu
         names = [str(name) for name in dataset["whisker"].values]
         rows, cols = dataset["row"].values.tolist(), dataset["col"].values.tolist()
         chosen = dataset.isel(whisker=match_whiskers(whiskers, names, rows, cols))
-        dataset = chosen.assign_attrs(content_hash=hash_stimulus_set(chosen))
+        config = content_hash(dataset.attrs.get("config_hash", ""), chosen["whisker"].values.astype(str).tolist())
+        dataset = chosen.assign_attrs(content_hash=hash_stimulus_set(chosen), config_hash=config)
     labels = tuple(str(label) for label in dataset["stimulus"].values)
-    return Stimuli(labels, to_grid(dataset), dataset, dataset.attrs["content_hash"], description)
+    numbers = dataset.attrs["content_hash"]
+    config = dataset.attrs.get("config_hash", numbers)
+    return Stimuli(labels, to_grid(dataset), dataset, numbers, description, config)
 
 
 def _from_hdf5(path: Path, whiskers: str) -> Stimuli:
@@ -125,8 +132,6 @@ def _from_hdf5(path: Path, whiskers: str) -> Stimuli:
 def _from_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
     """Read ``stimuli`` [K, T, …] and ``labels`` [K]."""
     import h5py
-
-    from brainbench.files import content_hash
 
     if whiskers != "all":
         raise UsageError(f"{name!r} holds arrays, in which whiskers have no names; leave the selection at 'all'.")
@@ -155,7 +160,8 @@ def _from_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
     if not np.isfinite(values).all():
         bad = sorted({texts[index[0]] for index in np.argwhere(~np.isfinite(values))})
         raise DataError(f"'stimuli' in {name!r} has values that are not finite, in {listing(bad)}.")
-    return Stimuli(texts, values, None, content_hash(list(texts), values), f"arrays {list(values.shape)} from {name}")
+    numbers = content_hash(list(texts), values)
+    return Stimuli(texts, values, None, numbers, f"arrays {list(values.shape)} from {name}", numbers)
 
 
 def _dataset_of(stimuli: Stimuli) -> xr.Dataset:

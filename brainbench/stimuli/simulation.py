@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench import __version__
 from brainbench.errors import DataError, UsageError
-from brainbench.files import cache_dir, content_hash, to_json, to_plain
+from brainbench.files import cache_dir, content_hash, to_json
 from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.backends._reach import reachable
 from brainbench.stimuli.fidelity import Fidelity
@@ -56,7 +58,9 @@ def simulate(
         whisker, channel] (float32; N, N·m; action of the whisker on its base, about the base point,
         **world** axes) with ``contact`` [stimulus, time, whisker], ``contact_arc`` (m along the
         whisker, NaN without contact), and ``status`` and ``reason`` [stimulus, whisker]. From the
-        instant a whisker became ``unstable`` its numbers are NaN.
+        instant a whisker became ``unstable`` its numbers are NaN. The attribute ``config_hash`` names
+        what was asked for and is equal on every machine; ``content_hash`` names the numbers, whose
+        last digits depend on the processor.
 
     Raises:
         UsageError: the scenes do not fit together, or a name is unknown.
@@ -168,6 +172,7 @@ def _assemble(
             "frame": "world axes; action of the whisker on its base, about the base point",
         },
     )
+    dataset.attrs["config_hash"] = _config_hash(scenes, fidelity, backend)
     dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
     _warn_unstable(dataset)
     return check_stimulus_set(dataset)
@@ -201,16 +206,24 @@ def _array_summary(scenes: Sequence[Scene]) -> dict[str, Any]:
     }
 
 
+def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:
+    """Hash what was asked for: equal on every machine, whatever its arithmetic."""
+    arrays = [scene.array.mounts for scene in scenes]
+    return content_hash(backend, fidelity, [scene.config() for scene in scenes], arrays)
+
+
 def _cache_path(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> Path:
     from importlib import metadata
 
-    key = content_hash(
-        __version__,
-        metadata.version("mujoco-core") if backend == "mujoco" else "",
-        backend,
-        to_plain(fidelity),
-        [scene.config() for scene in scenes],
-        [scene.array.mounts for scene in scenes],
-        length=24,
-    )
+    engine = metadata.version("mujoco-core") if backend == "mujoco" else ""
+    key = content_hash(_config_hash(scenes, fidelity, backend), engine, _code_hash(), length=24)
     return cache_dir("stimuli") / f"{key}.h5"
+
+
+@functools.cache
+def _code_hash() -> str:
+    """Hash the source of this package, so that no other version's results are ever taken for its own."""
+    root = resources.files("brainbench.stimuli")
+    sources = [item for folder in (root, root.joinpath("backends")) for item in folder.iterdir()]
+    code = {item.name: item.read_text(encoding="utf-8") for item in sources if item.name.endswith(".py")}
+    return content_hash(__version__, code)

@@ -126,6 +126,25 @@ def test_whatever_changes_the_result_changes_the_place_in_the_cache(engine, chan
     assert first.attrs["content_hash"] != second.attrs["content_hash"]
 
 
+def test_other_code_never_takes_these_results_for_its_own(engine, monkeypatch):
+    _simulate(_scene(), "fake")
+    monkeypatch.setattr(simulation, "_code_hash", lambda: "other code")
+    _simulate(_scene(), "fake")
+    assert len(engine.jobs) == 6
+
+
+def test_the_configuration_hash_names_the_request_and_not_the_numbers():
+    class Blurred(FakeBackend):
+        def _trace(self, job, reason):
+            trace = super()._trace(job, reason)
+            return dataclasses.replace(trace, wrench=trace.wrench * (1 + 1e-6))
+
+    exact, blurred = _simulate(_scene()), _simulate(_scene(), Blurred())
+    assert exact.attrs["content_hash"] != blurred.attrs["content_hash"]
+    assert exact.attrs["config_hash"] == blurred.attrs["config_hash"]
+    assert exact.attrs["config_hash"] != _simulate(_scene(head=Head((0.0, 0.0, 1e-6)))).attrs["config_hash"]
+
+
 def test_fidelity_changes_the_place_in_the_cache(engine):
     simulate(_scene(), fidelity=Fidelity(links=10), backend="fake")
     ran = len(engine.jobs)
