@@ -29,7 +29,9 @@ LATENCY = 0.015
 """Delay from whisker to spike, s."""
 
 _FAST, _SLOW = 0.03, 0.2
-_COMPRESSION = 0.1
+_ONSET = 3.0
+"""Weight of the fast-adapting afferents."""
+_COMPRESSION = 1.0
 """Half-saturation of an afferent, in root mean squares of its channel."""
 _OTHERS = 0.15
 """Share of units that prefer an untracked whisker."""
@@ -37,11 +39,11 @@ _SPREAD = 0.6
 """Width of a receptive field, in whiskers."""
 _SPARSE = 0.25
 """Share of afferent channels that drive one unit."""
-_SEQUENCE = 0.6
+_SEQUENCE = 0.5
 """Share of units that need an earlier input."""
 _DELAYS = (2, 6)
 """How much earlier, in frames; the end is excluded."""
-_EXPONENT = 1.6
+_EXPONENT = 2.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def make_afferents(stimuli: xr.Dataset) -> Afferents:
     halves = halves / (halves + _COMPRESSION)
     fast = np.maximum(halves - _smooth(halves, _FAST, frame), 0.0)
     slow = halves / (0.5 + _smooth(halves, _SLOW, frame))
-    afferents = np.concatenate([2.0 * fast, slow], axis=3)
+    afferents = np.concatenate([_ONSET * fast, slow], axis=3)
     surround = afferents[:, :, tracked].mean(axis=(2, 3), keepdims=True)
     position = np.stack([stimuli["row"].values, stimuli["col"].values], axis=1).astype(np.float64)
     return Afferents(afferents / (0.3 + surround), names, position, frame)

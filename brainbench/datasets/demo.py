@@ -54,10 +54,10 @@ _ANIMALS = (
     (SessionPlan("demo01", "01", 34, 170, detection=True), SessionPlan("demo01", "02", 30, 140)),
     (SessionPlan("demo02", "01", 56, 270, lost_whisker="C0"),),
     (SessionPlan("demo03", "01", 30, 140, spans=True), SessionPlan("demo03", "02", 28, 150)),
-    (SessionPlan("demo04", "01", 40, 220, depth=0.5),),
+    (SessionPlan("demo04", "01", 40, 220, depth=0.4),),
 )
 """The animals; the last is hard to read on purpose."""
-_INDIVIDUAL = 0.25
+_INDIVIDUAL = 0.4
 """How far animals differ in what they weigh (standard deviation of the logarithm)."""
 _MANY = 4000
 """Units that stand for the shared geometry in the truth."""
