@@ -124,11 +124,15 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
 def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
     """Compliance of each joint [N] (rad/(N·m)): product integration of M²/(E I) with M² quadratic around each cell."""
     cell = whisker.arc_length / links
-    total = np.zeros(links + 2)
+    total = np.zeros(links + 1)
     for i in range(links + 1):
         low, high = max(0.0, (i - 0.5) * cell), min(whisker.arc_length, (i + 0.5) * cell)
         s = low + (high - low) / 2 * (_NODES + 1)
         flexibility = (high - low) / 2 * _WEIGHTS / whisker.bending_stiffness(s)
+        if i == links:
+            # Next to the free tip the moment of a tip load falls to zero linearly.
+            total[i - 1] += flexibility @ (s / cell - i) ** 2
+            continue
         if whisker.radius(low) > _STEEPEST * whisker.radius(high):
             # Across such a steep cell a parabola would take more from a neighbour than that has; keep it whole.
             total[i] += flexibility.sum()

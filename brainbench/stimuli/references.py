@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -105,6 +106,7 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
     return 1 / np.sqrt(inverse) / (2 * np.pi)
 
 
+@lru_cache(maxsize=256)
 def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
     """Large bending by a frictionless point peg at the point (``at``, ``offset``) of the plane [m].
 

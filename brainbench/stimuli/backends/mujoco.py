@@ -110,15 +110,13 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     built = build_model(job, chain, reach, step, times)
     still = not built.drives and not job.loads and not np.any(job.gravity)
     if still and not reach.obstacles:
-        hinges = np.zeros((1, 2 * chain.links))
+        rest = _shape(built, chain, np.zeros((1, 2 * chain.links)), np.array([0])) / MILLI
         return Trace(
             wrench=np.zeros((len(where), 6)),
             contact=np.zeros(len(where), dtype=bool),
             contact_arc=np.full(len(where), np.nan),
             seconds=time.thread_time() - started,
-            link_positions=np.repeat(_shape(built, chain, hinges, np.array([0])), len(where), axis=0)
-            if record_shape
-            else None,
+            link_positions=np.repeat(rest, len(where), axis=0) if record_shape else None,
         )
     sensors, hinges, failed, reason = _integrate(built, job, chain.links, times)
     good = after < failed

@@ -1,0 +1,60 @@
+"""Presets and the measured table behind them."""
+
+import pytest
+
+from brainbench.errors import UsageError
+from brainbench.stimuli.fidelity import Fidelity, list_presets, measured
+
+
+def test_presets_are_on_record_as_accurate_as_they_promise():
+    table = {(p.settings["links"], p.settings["time_step"]): p for p in measured()}
+    for name, promise in zip(list_presets(), (0.15, 0.05, 0.03), strict=True):
+        preset = Fidelity.preset(name)
+        assert table[preset.links, preset.time_step].error <= promise
+
+
+def test_presets_cost_more_as_they_get_more_accurate():
+    table = {(p.settings["links"], p.settings["time_step"]): p for p in measured()}
+    costs = [table[f.links, f.time_step].cost for f in map(Fidelity.preset, list_presets())]
+    assert costs == sorted(costs)
+
+
+def test_auto_takes_the_cheapest_measured_setting_that_is_good_enough():
+    for error in (0.1, 0.05, 0.02):
+        chosen = Fidelity.auto(error=error)
+        good = [p for p in measured() if p.error <= error]
+        best = min(good, key=lambda p: p.cost)
+        assert (chosen.links, chosen.time_step) == (best.settings["links"], best.settings["time_step"])
+
+
+def test_auto_refuses_what_was_never_measured():
+    with pytest.raises(UsageError, match="No measured setting reaches an error of 1e-06"):
+        Fidelity.auto(error=1e-6)
+    with pytest.raises(UsageError, match="error must be positive"):
+        Fidelity.auto(error=0)
+
+
+def test_links_per_mm_give_long_whiskers_more_links():
+    fidelity = Fidelity(links=6, links_per_mm=1.0)
+    assert fidelity.link_count(0.003) == 6
+    assert fidelity.link_count(0.0205) == 21
+    with pytest.raises(UsageError, match="at most 100"):
+        Fidelity(links_per_mm=10).link_count(0.05)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"links": 1}, "links must lie between 2 and 100"),
+        ({"links_per_mm": 0.0}, "links_per_mm must be positive"),
+        ({"time_step": 0.1}, "time_step must lie between"),
+    ],
+)
+def test_impossible_settings_are_refused(values, message):
+    with pytest.raises(UsageError, match=message):
+        Fidelity(**values)
+
+
+def test_an_unknown_preset_suggests_the_nearest():
+    with pytest.raises(UsageError, match="did you mean 'balanced'"):
+        Fidelity.preset("balance")
