@@ -101,6 +101,7 @@ def make_demo(
     runs = tracked_runs(afferents.whiskers, contact, afferents.frame)
     plans = [_animal(index) for index in range(animals)]
     total = sum(map(len, plans))
+    first = {plan: _first_contacts(labels, runs, plan.lost_whisker) for sessions in plans for plan in sessions}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     rdms: dict[str, NDArray[np.float64]] = {}
@@ -113,8 +114,7 @@ def make_demo(
             random = np.random.default_rng([seed, VERSION, index, number])
             population = draw_population(random, afferents, plan.units, emphasis, plan.depth)
             rates = population.rates(afferents)
-            seen = {name: items for name, items in runs.items() if name != plan.lost_whisker}
-            expected.append(_expected(rates, afferents, labels, seen))
+            expected.append(_expected(rates, afferents, first[plan]))
             behaviour = draw_behaviour(random, plan, labels)
             spikes = draw_spikes(random, behaviour, rates, population.baseline, afferents.frame)
             contacts = draw_contacts(random, behaviour, runs)
@@ -133,7 +133,7 @@ def make_demo(
             "seed": seed,
             "stimuli": str(stimuli.attrs["content_hash"]),
             "labels": labels,
-            "shared": _shared(afferents, labels, runs, seed),
+            "shared": _shared(afferents, _first_contacts(labels, runs), seed),
             "subjects": rdms,
             "files": {path.name: {"bytes": path.stat().st_size, "hash": file_hash(path)} for path in paths},
         },
@@ -215,35 +215,34 @@ def _in_vocabulary_order(stimuli: xr.Dataset) -> xr.Dataset:
     return stimuli.isel(stimulus=[have.index(label) for label in wanted])
 
 
-def _expected(
-    rates: NDArray[np.float64],
-    afferents: Afferents,
-    labels: tuple[str, ...],
-    runs: dict[str, list[NDArray[np.float64]]],
+def _first_contacts(
+    labels: tuple[str, ...], runs: dict[str, list[NDArray[np.float64]]], lost: str | None = None
 ) -> NDArray[np.float64]:
-    """Expected response [K, U] in the recipe's window, first contact to choice."""
+    """First contact [K] (s after onset) of each stimulus with the whiskers whose contacts are known."""
+    known = {name: items for name, items in runs.items() if name != lost}
     first = np.array(
         [
-            min((items[stimulus][0, 0] for items in runs.values() if len(items[stimulus])), default=np.inf)
+            min((items[stimulus][0, 0] for items in known.values() if len(items[stimulus])), default=np.inf)
             for stimulus in range(len(labels))
         ]
     )
     for label, onset in zip(labels, first, strict=True):
         if onset >= CHOICE[0]:
-            raise DataError(f"The stimulus {label!r} touches none of {listing(runs)} in time for the demo's choices.")
+            raise DataError(f"The stimulus {label!r} touches none of {listing(known)} in time for the demo's choices.")
+    return first
+
+
+def _expected(rates: NDArray[np.float64], afferents: Afferents, first: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected response [K, U] in the recipe's window, first contact to choice."""
     return window_rates(rates, afferents.frame, first, np.linspace(*CHOICE, 18))
 
 
-def _shared(
-    afferents: Afferents, labels: tuple[str, ...], runs: dict[str, list[NDArray[np.float64]]], seed: int
-) -> NDArray[np.float64]:
+def _shared(afferents: Afferents, first: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     plain = np.ones(afferents.values.shape[2:])
     random = np.random.default_rng([seed, VERSION, 10_000])
     # In portions: the rates of all units at once would take a gigabyte.
     portions = [draw_population(random, afferents, _MANY // 8, plain) for _ in range(8)]
-    return correlation_rdm(
-        np.concatenate([_expected(item.rates(afferents), afferents, labels, runs) for item in portions], axis=1)
-    )
+    return correlation_rdm(np.concatenate([_expected(item.rates(afferents), afferents, first) for item in portions], 1))
 
 
 def _complete(folder: Path) -> bool:

@@ -228,7 +228,8 @@ def test_two_processes_may_make_them_at_once(monkeypatch, tmp_path):
     assert not list((tmp_path / "recordings").glob(".demo-*"))
 
 
-def test_unsuitable_stimuli_are_refused():
+def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     stimuli = make_stimuli()
     with pytest.raises(DataError, match="need the stimuli 'convex-close'"):
         demo.make_demo("unused", stimuli.isel(stimulus=slice(5)))
@@ -244,6 +245,7 @@ def test_unsuitable_stimuli_are_refused():
         demo.make_demo("unused", stimuli.assign(contact=stimuli["contact"] & (stimuli["stimulus"] != "concave-far")))
     with pytest.raises(UsageError, match="at least one animal"):
         demo.make_demo("unused", stimuli, animals=0)
+    assert list(tmp_path.iterdir()) == []
     with pytest.raises(UsageError, match="needs a key"):
         demo.ensure_demo(make_stimuli)
 
