@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +37,7 @@ class Stimuli:
     """One per stimulus, all different."""
     input: NDArray[np.float32]
     """[K, T, …] what the model receives; [K, T, S·C, H, W] in SI units for simulated stimuli."""
-    dataset: xr.Dataset | None = field(repr=False)
+    dataset: xr.Dataset | None
     """The stimulus set behind ``input``; None for arrays from a file."""
     content_hash: str
     """Equal for equal stimuli."""
@@ -45,6 +45,10 @@ class Stimuli:
     config_hash: str
     """Names what was asked for; equal on every machine, while the last digits of a simulation, and with
     them ``content_hash``, depend on the processor. Equal to ``content_hash`` for arrays from a file."""
+
+    def __repr__(self) -> str:
+        shape = " × ".join(map(str, self.input.shape))
+        return f"Stimuli({listing(self.labels, limit=6)}; input {shape}; hash {self.content_hash})"
 
 
 def load_stimuli(

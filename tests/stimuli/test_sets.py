@@ -32,6 +32,8 @@ def test_a_recipe_name_gives_labelled_input():
     assert stimuli.input.shape == (6, 22, 30, 5, 7)
     assert stimuli.input.dtype == np.float32
     assert "Rodgers (2022)" in stimuli.description
+    assert repr(stimuli).startswith("Stimuli('convex-close', 'convex-medium'")
+    assert "input 6 × 22 × 30 × 5 × 7" in repr(stimuli)
     assert stimuli.content_hash == stimuli.dataset.attrs["content_hash"]
 
 
