@@ -1,3 +1,5 @@
+from datetime import UTC, datetime
+
 import h5py
 import numpy as np
 import pytest
@@ -116,6 +118,52 @@ def test_a_table_name_that_occurs_twice_carries_its_module(tmp_path):
         file.copy("processing/behavior/pokes", "intervals/pokes")
         session = read_nwb(file, path)
         assert set(session.tables) == {"trials", "pokes", "behavior/pokes"}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_files_written_by_pynwb_are_read(tmp_path):
+    """Another writer: booleans, text, ragged columns, electrode references and observed spans."""
+    pynwb = pytest.importorskip("pynwb")
+    start = datetime(2020, 1, 1, tzinfo=UTC)
+    file = pynwb.NWBFile("a session", "id-1", start, session_id="s9")
+    file.subject = pynwb.file.Subject(subject_id="rat3", species="Rattus norvegicus")
+    device = file.create_device("probe")
+    group = file.create_electrode_group("shank", "d", "S1", device)
+    for _ in range(2):
+        file.add_electrode(group=group, location="S1")
+    file.add_unit_column("layer", "cortical layer")
+    file.add_unit_column("inhibitory", "putatively")
+    for unit, layer in ((12, "4"), (5, "2/3")):
+        spans = [[0.0, 10.0]] if unit == 12 else [[0.0, 3.5], [3.5, 6.0]]
+        file.add_unit(
+            id=unit,
+            spike_times=np.arange(0.05, spans[-1][1], 0.1),
+            obs_intervals=spans,
+            electrodes=[0, 1],
+            electrode_group=group,
+            layer=layer,
+            inhibitory=unit == 5,
+        )
+    file.add_trial_column("grating", "spatial frequency")
+    file.add_trial_column("rewarded", "bool")
+    for trial in range(8):
+        file.add_trial(
+            start_time=float(trial), stop_time=trial + 1.0, grating=[0.5, 2.0, 10.0][trial % 3], rewarded=trial != 7
+        )
+    with pynwb.NWBHDF5IO(tmp_path / "a.nwb", "w") as io:
+        io.write(file)
+    dataset = open_recordings(tmp_path / "a.nwb", conditions="trials:grating", select="rewarded=true")
+    assert dataset.attrs["vocabulary"] == ["0.5", "2", "10"]
+    assert dataset.attrs["removed"]["trials: rewarded=true"] == 1
+    assert (dataset["subject"].values[0], dataset["session"].values[0]) == ("rat3", "s9")
+    assert dataset["unit_id"].values.tolist() == ["5", "12"]
+    assert dataset["layer"].values.tolist() == ["2/3", "4"]
+    assert dataset["inhibitory"].values.tolist() == [1.0, 0.0]
+    np.testing.assert_array_equal(dataset["counts"].values[:, 0, 1], 10)
+    # The second unit's spans touch, so the trial across their seam was recorded; the last one was not.
+    np.testing.assert_array_equal(dataset["counts"].values[:, 0, 0], [10] * 6 + [np.nan])
+    kinds = {column.name: column.kind for column in inspect(tmp_path / "a.nwb").sessions[0].tables[0].columns}
+    assert kinds["rewarded"] == "boolean"
 
 
 @pytest.mark.shared
