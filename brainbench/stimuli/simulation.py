@@ -57,8 +57,9 @@ def simulate(
         The data set of :func:`brainbench.types.check_stimulus_set`: ``wrench`` [stimulus, time,
         whisker, channel] (float32; N, N·m; action of the whisker on its base, about the base point,
         **world** axes) with ``contact`` [stimulus, time, whisker], ``contact_arc`` (m along the
-        whisker, NaN without contact), and ``status`` and ``reason`` [stimulus, whisker]. From the
-        instant a whisker became ``unstable`` its numbers are NaN. The attribute ``config_hash`` names
+        whisker, NaN without contact), and ``penetration`` (m, deepest overlap; a poor contact when
+        large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker became
+        ``unstable`` its numbers are NaN. The attribute ``config_hash`` names
         what was asked for and is equal on every machine; ``content_hash`` names the numbers, whose
         last digits depend on the processor.
 
@@ -78,7 +79,10 @@ def simulate(
     traces = _run(chosen, fidelity, engine, progress)
     dataset = _assemble(chosen, traces, fidelity, engine.name)
     if path is not None:
-        write_stimulus_set(dataset, path)
+        try:
+            write_stimulus_set(dataset, path)
+        except OSError as error:
+            _LOG.warning("the stimuli could not be kept in the cache (%s)", error)
     return dataset
 
 
@@ -91,7 +95,7 @@ def _checked(scenes: Scene | Iterable[Scene]) -> list[Scene]:
     if len(set(labels)) < len(labels):
         raise UsageError(f"The labels of the scenes must differ; received {labels}.")
     for scene in chosen[1:]:
-        if scene.array.names != first.array.names:
+        if (scene.array.names, scene.array.side) != (first.array.names, first.array.side):
             raise UsageError(f"The scenes {first.label!r} and {scene.label!r} have different whiskers.")
         if scene.frames != first.frames:
             raise UsageError(f"The scenes {first.label!r} and {scene.label!r} are read at different times.")
@@ -148,6 +152,11 @@ def _assemble(
                 ("stimulus", "time", "whisker"),
                 stack("contact_arc").astype(np.float32),
                 {"units": "m", "long_name": "arc length of the force-weighted contact point"},
+            ),
+            "penetration": (
+                grid,
+                np.array([[trace.penetration for trace in row] for row in traces], dtype=np.float32),
+                {"units": "m", "long_name": "deepest overlap of whisker and object"},
             ),
             "status": (grid, np.array([[trace.status for trace in row] for row in traces], dtype=object)),
             "reason": (grid, np.array([[trace.reason for trace in row] for row in traces], dtype=object)),

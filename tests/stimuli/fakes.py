@@ -48,5 +48,6 @@ class FakeBackend:
             contact_arc=np.where(contact, job.whisker.arc_length, np.nan),
             status="ok" if reason is None else "unstable",
             reason=reason or "",
+            penetration=1e-6 * contact.any(),
             steps=len(job.times),
         )

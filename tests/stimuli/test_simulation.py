@@ -47,6 +47,7 @@ def test_the_result_is_a_stimulus_set_with_contacts_and_status():
     assert dataset["contact"].dtype == bool
     assert dataset["contact"].dims == dataset["contact_arc"].dims == ("stimulus", "time", "whisker")
     assert (dataset["status"] == "ok").all()
+    assert dataset["penetration"].dims == dataset["status"].dims == ("stimulus", "whisker")
     assert list(dataset["whisker"].values) == ["C1", "C2", "D6"]
     assert list(dataset["row"].values) == [2, 2, 3]
     assert list(dataset["col"].values) == [1, 2, 6]
@@ -165,6 +166,17 @@ def test_a_damaged_cache_file_is_made_again(engine, tmp_path, caplog, damage):
     assert len(engine.jobs) == 6
 
 
+def test_a_full_disk_costs_the_cache_and_not_the_result(engine, monkeypatch, caplog):
+    def full(dataset, path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(simulation, "write_stimulus_set", full)
+    with caplog.at_level(logging.WARNING):
+        assert _simulate(_scene(), "fake")["wrench"].shape == (1, 10, 3, 6)
+    assert "could not be kept in the cache" in caplog.text
+    assert "No space left" in caplog.text
+
+
 def test_a_changed_number_in_the_cache_is_noticed(engine, tmp_path, caplog):
     import h5py
 
@@ -183,6 +195,7 @@ def test_a_changed_number_in_the_cache_is_noticed(engine, tmp_path, caplog):
         ([], "no scene to simulate"),
         ([_scene("a"), _scene("a")], "labels of the scenes must differ"),
         ([_scene("a"), _scene("b", array=ARRAY.select("C1"))], "'a' and 'b' have different whiskers"),
+        ([_scene("a"), _scene("b", array=ARRAY.on_side("left"))], "'a' and 'b' have different whiskers"),
         ([_scene("a"), _scene("b", frames=Frames())], "'a' and 'b' are read at different times"),
     ],
 )
