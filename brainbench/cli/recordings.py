@@ -38,13 +38,19 @@ def rdm(
     conditions: Annotated[
         str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] that labels the trials; see 'recordings inspect'.")
     ] = None,
+    select: Annotated[
+        str | None, typer.Option(help="Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name.")
+    ] = None,
+    window: Annotated[
+        str | None, typer.Option(help="Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Compute every animal's RDM (correlation distance) and its split-half reliability."""
     from brainbench._brain_side import brain_side
 
-    brain = brain_side(source, conditions=conditions, progress=None)
+    brain = brain_side(source, conditions=conditions, select=select, window=window, progress=None)
     labels = brain.vocabulary
     animals = brain.animals(labels, time="mean", seed=seed)
     data = {
@@ -93,3 +99,19 @@ def _matrix(title: str, labels: tuple[str, ...], rdm: NDArray[np.float64]) -> st
 
     rows = [[label, *(f"{value:.3f}" for value in line)] for label, line in zip(labels, squareform(rdm), strict=True)]
     return table(title, ["", *labels], rows, right=tuple(range(1, len(labels) + 1)))
+
+
+@app.command("recipe")
+def recipe(
+    name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without one.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print every rule by which a named recipe selects trials and units and cuts windows."""
+    from brainbench.datasets import get_recipe, list_recipes
+
+    if name is None:
+        known = {item: get_recipe(item).title for item in list_recipes()}
+        emit(known, table("", ["recipe", ""], [[key, text] for key, text in known.items()]), as_json=as_json)
+        return
+    found = get_recipe(name)
+    emit({"name": found.name, "rules": found.describe().splitlines()}, found.describe(), as_json=as_json)

@@ -42,6 +42,12 @@ def score(
     match: Annotated[
         Path | None, typer.Option(help="JSON, TOML or CSV file: recording label → stimulus label.")
     ] = None,
+    select: Annotated[
+        str | None, typer.Option(help="Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name.")
+    ] = None,
+    window: Annotated[
+        str | None, typer.Option(help="Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'.")
+    ] = None,
     whiskers: Annotated[str, typer.Option(help="Whiskers to simulate: all, C0-C3, C2,D1, …")] = "all",
     fidelity: Annotated[str, typer.Option(help="Simulation preset: fast, balanced or accurate.")] = "balanced",
     layers: Annotated[str | None, typer.Option(help="Comma-separated layers to compare; all by default.")] = None,
@@ -71,6 +77,8 @@ def score(
             stimuli=stimuli,
             conditions=conditions,
             match=match,
+            select=select,
+            window=window,
             whiskers=whiskers,
             fidelity=fidelity,
             layers=tuple(name.strip() for name in layers.split(",")) if layers else None,

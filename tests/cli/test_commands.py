@@ -184,3 +184,11 @@ def test_intracellular_files_are_refused_in_one_sentence(run, reference, kind: s
     assert result.status == 1
     assert "has no units table" in result.err
     assert len(result.err.strip().splitlines()) == 1
+
+
+def test_recipes_print_every_rule(run):
+    assert "rodgers" in run("recordings", "recipe").out
+    rules = run("recordings", "recipe", "rodgers").out
+    for word in ("convex-close, convex-medium", "first-contact", "spoil", "nothing", "citation"):
+        assert word in rules
+    assert "did you mean 'rodgers'" in run("recordings", "recipe", "rogers").err
