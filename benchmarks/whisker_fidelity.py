@@ -40,7 +40,7 @@ PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2), (0.9, 0.1))
 LINKS = (4, 6, 8, 10, 14, 20, 30)
 TIME_STEPS = (2e-4, 1e-4, 5e-5, 2e-5)
 FINE = Fidelity(links=40, time_step=1e-5)
-FRAMES = np.arange(1, 151) * 1e-3
+FRAMES = np.arange(1.0, 151.0) * 1e-3
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
         (lambda: ConvexPart(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])), "lie in one plane"),
         (lambda: Obstacle(()), "at least one part"),
         (lambda: Obstacle((Sphere((0, 0, 0), 1.0),), friction=-1.0), "friction of an obstacle must be zero or more"),
-        (lambda: Obstacle(("ball",)), "received str"),
+        (lambda: Obstacle(("ball",)), "received str"),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_impossible_shapes_are_refused(make, message):

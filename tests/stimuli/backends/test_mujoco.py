@@ -3,11 +3,13 @@
 import logging
 import math
 from dataclasses import dataclass, replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from brainbench.errors import UsageError
 from brainbench.stimuli.backends import get_backend, list_backends
@@ -74,7 +76,7 @@ def _rigid_wrench(whisker, follicle, times):
     ],
 )
 def test_a_stiff_whisker_in_free_air_shows_its_centripetal_and_euler_wrench(follicle):
-    times = np.arange(1, 101) * 1e-3
+    times = np.arange(1.0, 101.0) * 1e-3
     trace = _run(Job(STIFF, follicle, (), times), fidelity=Fidelity(links=8, time_step=2e-5))[0]
     expected = _rigid_wrench(STIFF, follicle, times)
     for part in (slice(0, 3), slice(3, 6)):
@@ -85,7 +87,7 @@ def test_a_stiff_whisker_in_free_air_shows_its_centripetal_and_euler_wrench(foll
 
 def test_the_follicle_follows_its_trajectory_to_a_millionth_against_a_post():
     follicle = Swing(angles=(0.35, 0.1, 0.2), shift=(5e-4, 0, 0))
-    times = np.arange(1, 101) * 1e-3
+    times = np.arange(1.0, 101.0) * 1e-3
     trace = _run(Job(C2, follicle, (_post(0.010, 0.002),), times), record_shape=True)[0]
     assert trace.contact.any()
     assert trace.link_positions is not None
@@ -93,7 +95,7 @@ def test_the_follicle_follows_its_trajectory_to_a_millionth_against_a_post():
     from brainbench.stimuli.backends import _mujoco_model, mujoco
 
     job = Job(C2, follicle, (_post(0.010, 0.002),), times)
-    steps = np.arange(0, 1002) * 1e-4
+    steps = np.arange(0.0, 1002.0) * 1e-4
     chain = build_chain(C2, 8)
     reach = mujoco.reachable(C2, follicle.pose(steps)[0], job.obstacles, steps)
     built = _mujoco_model.build_model(job, chain, reach, 1e-4, steps)
@@ -105,9 +107,7 @@ def test_the_follicle_follows_its_trajectory_to_a_millionth_against_a_post():
 
 def _follow(built, steps):
     """Prescribed coordinates [steps, …] as MuJoCo integrates them from chunk to chunk."""
-    import mujoco
-    from mujoco import rollout
-
+    mujoco, rollout = import_module("mujoco"), import_module("mujoco.rollout")
     from brainbench.stimuli.backends._mujoco_drive import ARMATURE
     from brainbench.stimuli.backends.mujoco import CHUNK
 
@@ -133,7 +133,7 @@ def _follow(built, steps):
 def test_the_base_wrench_is_the_applied_force_less_the_growth_of_momentum():
     force = np.array([0.0, 2e-6, 1e-6])
     step = 2e-5
-    times = np.arange(1, 400) * step
+    times = np.arange(1.0, 400.0) * step
     job = Job(C2, StillFollicle(), (), times, loads=(Load(0.011, tuple(force)),))
     trace = _run(job, fidelity=Fidelity(links=12, time_step=step), record_shape=True)[0]
     chain = build_chain(C2, 12)
@@ -174,7 +174,7 @@ def test_an_object_on_one_side_pushes_the_base_to_the_other_whatever_its_shape(p
     rest = (math.pi / 2 + 0.3, 0.0, -math.pi / 2)
     # The whisker swings down onto the object from above and rests on it.
     follicle = Swing(angles=(-0.3, 0, 0), rest=rest, frequency=5.0)
-    times = np.arange(1, 51) * 1e-3
+    times = np.arange(1.0, 51.0) * 1e-3
     critical = replace(C2, damping_ratio=1.0)
     trace = _run(Job(critical, follicle, (Obstacle((part,), friction=0.0),), times))[0]
     assert trace.status == "ok"
@@ -201,8 +201,62 @@ def test_friction_drags_the_base_along_with_a_moving_object_and_is_bounded_by_co
     assert drag[2] == pytest.approx(0.3 * normal[2], rel=0.15)
 
 
+def test_a_turning_arm_that_carries_a_ball_does_what_the_ball_on_its_circle_does():
+    arm, centre = 6e-3, np.array([0.010, -7.5e-3, 0.0])
+
+    def angle(times):
+        u = np.clip(times / 0.04, 0, 1)
+        return np.pi / 2 - 1.2 + 1.2 * u**3 * (10 - 15 * u + 6 * u**2)
+
+    def turning(times):
+        half = angle(times) / 2
+        zero = np.zeros_like(half)
+        return np.tile(centre, (len(times), 1)), np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
+
+    def circling(times):
+        around = np.stack([np.cos(angle(times)), np.sin(angle(times)), np.zeros(len(times))], axis=1)
+        return centre + arm * around, np.tile([1.0, 0, 0, 0], (len(times), 1))
+
+    times = np.arange(1.0, 71.0) * 1e-3
+    a, b = _run(
+        Job(C2, StillFollicle(), (Obstacle((Sphere((arm, 0, 0), 2e-3),), turning, friction=0.0),), times),
+        Job(C2, StillFollicle(), (Obstacle((Sphere((0, 0, 0), 2e-3),), circling, friction=0.0),), times),
+    )
+    assert a.contact[-1]
+    np.testing.assert_allclose(a.wrench[-1], b.wrench[-1], atol=1e-3 * np.abs(b.wrench[-1]).max())
+    # Contact sees the arm's ball on the tangent and the other on the chord of each step: first order apart.
+    assert np.linalg.norm(a.wrench - b.wrench) < 0.03 * np.linalg.norm(b.wrench)
+
+
+def test_moving_the_object_to_the_whisker_is_moving_the_whisker_to_the_object():
+    def approach(times):
+        u = np.clip(times / 0.04, 0, 1)
+        return 1.5e-3 * u**3 * (10 - 15 * u + 6 * u**2)
+
+    def lifted(times):
+        position = np.zeros((len(times), 3))
+        position[:, 1] = approach(times)
+        return position, np.tile([1.0, 0, 0, 0], (len(times), 1))
+
+    class Lowered:
+        def pose(self, times):
+            position = np.zeros((len(times), 3))
+            position[:, 1] = -approach(times)
+            return position, np.tile(FLAT, (len(times), 1))
+
+    times = np.array([0.08, 0.1])
+    rest = replace(C2, damping_ratio=1.0)
+    part = Capsule((0.009, -1.5e-3, -0.01), (0.009, -1.5e-3, 0.01), 1e-3)
+    a, b = _run(
+        Job(rest, StillFollicle(), (Obstacle((part,), lifted, friction=0.0),), times),
+        Job(rest, Lowered(), (Obstacle((part,), friction=0.0),), times),
+    )
+    assert a.contact.all()
+    np.testing.assert_allclose(a.wrench, b.wrench, atol=1e-5 * np.abs(a.wrench).max())
+
+
 def test_mirrored_scenes_give_mirrored_wrenches():
-    times = np.arange(1, 51) * 1e-3
+    times = np.arange(1.0, 51.0) * 1e-3
     curved = replace(C2, curvature=12.0)
     left = Job(curved, Swing(angles=(0.3, 0.1, 0.2)), (_post(0.010, 2e-3, friction=0.0),), times)
     right = Job(
@@ -218,7 +272,7 @@ def test_mirrored_scenes_give_mirrored_wrenches():
 @given(turn=st.floats(-3, 3), shift=st.floats(-0.03, 0.03))
 @settings(max_examples=5, deadline=None)
 def test_a_scene_turned_about_z_and_moved_gives_turned_wrenches(turn, shift):
-    times = np.arange(1, 41) * 1e-3
+    times = np.arange(1.0, 41.0) * 1e-3
     post = np.array([0.010, 2e-3])
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     moved = rotation @ post + shift
@@ -227,8 +281,8 @@ def test_a_scene_turned_about_z_and_moved_gives_turned_wrenches(turn, shift):
     class Turned:
         inner: Swing
 
-        def pose(self, t):
-            position, euler = self.inner.pose(t)
+        def pose(self, times: NDArray) -> tuple[NDArray, NDArray]:
+            position, euler = self.inner.pose(times)
             return position + np.array([shift, shift, 0]), euler + np.array([turn, 0, 0])
 
     swing = Swing(angles=(0.3, 0.0, 0.0))
@@ -243,7 +297,7 @@ def test_a_scene_turned_about_z_and_moved_gives_turned_wrenches(turn, shift):
 
 
 def test_refining_step_and_links_converges():
-    times = np.arange(1, 101) * 1e-3
+    times = np.arange(1.0, 101.0) * 1e-3
     job = Job(C2, Swing(angles=(0.25, 0, 0)), (_post(0.0107, 0.0025, friction=0.0),), times)
     best = _run(job, fidelity=Fidelity(links=24, time_step=2e-5))[0].wrench[:, 5]
     assert np.abs(best).max() > 1e-7
@@ -257,7 +311,7 @@ def test_refining_step_and_links_converges():
 
 
 def test_a_whisker_that_cannot_be_touched_or_moved_is_not_simulated():
-    times = np.arange(1, 6) * 1e-2
+    times = np.arange(1.0, 6.0) * 1e-2
     far = _post(0.05, 0.0)
     trace = _run(Job(C2, StillFollicle(), (far,), times), record_shape=True)[0]
     assert trace.steps == 0
@@ -268,7 +322,7 @@ def test_a_whisker_that_cannot_be_touched_or_moved_is_not_simulated():
 
 
 def test_objects_out_of_reach_change_nothing():
-    times = np.arange(1, 31) * 1e-3
+    times = np.arange(1.0, 31.0) * 1e-3
     swing = Swing(angles=(0.3, 0, 0))
     without, with_far = _run(Job(C2, swing, (), times), Job(C2, swing, (_post(0.03, 0.0),), times))
     np.testing.assert_array_equal(without.wrench, with_far.wrench)
@@ -303,7 +357,7 @@ def test_a_load_beyond_all_reason_is_reported_as_unstable_and_never_as_a_number(
 
 
 def test_results_do_not_depend_on_workers_order_or_company():
-    times = np.arange(1, 31) * 1e-3
+    times = np.arange(1.0, 31.0) * 1e-3
     jobs = [Job(C2, Swing(angles=(a, 0, 0)), (_post(0.010, 2e-3),), times) for a in (0.1, 0.2, 0.3)]
     calls = []
     together = _run(*jobs, workers=2, progress=lambda done, total: calls.append((done, total)))
@@ -315,8 +369,9 @@ def test_results_do_not_depend_on_workers_order_or_company():
 
 def test_an_overdamping_step_is_told_in_the_log(caplog):
     with caplog.at_level(logging.WARNING):
-        _run(Job(C2, StillFollicle(), (), np.array([0.01])), fidelity=Fidelity(links=8, time_step=1e-3))
-    assert "damps at least one whisker" in caplog.text
+        light = replace(C2, damping_ratio=0.1)
+        _run(Job(light, StillFollicle(), (), np.array([0.01])), fidelity=Fidelity(links=8, time_step=1e-3))
+    assert "damps the first mode of at least one whisker" in caplog.text
 
 
 def test_unknown_backends_and_bad_jobs_are_refused():
