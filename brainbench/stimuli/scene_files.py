@@ -25,6 +25,7 @@
     first_ms = 1
     interval_ms = 9
     count = 110
+    average = 18                 # readings per frame; 1 = instantaneous
 
     [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
     label = "pole"
@@ -194,6 +195,7 @@ def _frames(table: _Table) -> Frames:
         first=table.take("first_ms", _number(_MM), usual.first),
         interval=table.take("interval_ms", _number(_MM), usual.interval),
         count=table.take("count", _whole, usual.count),
+        average=table.take("average", _whole, usual.average),
     )
     table.finish()
     return frames

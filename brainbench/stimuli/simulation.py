@@ -139,18 +139,21 @@ def _assemble(
 
     array = scenes[0].array
     grid = ("stimulus", "whisker")
+    frames = scenes[0].frames
     wrench = np.stack([_to_world(scene, row) for scene, row in zip(scenes, traces, strict=True)])
 
-    def stack(name: str) -> NDArray[Any]:
-        return np.stack([np.stack([getattr(trace, name) for trace in row], axis=1) for row in traces])
+    def readings(name: str) -> NDArray[Any]:
+        """[stimulus, frame, reading, whisker]."""
+        stacked = np.stack([np.stack([getattr(trace, name) for trace in row], axis=1) for row in traces])
+        return stacked.reshape(len(scenes), frames.count, frames.average, len(array))
 
     dataset = xr.Dataset(
         {
             "wrench": (("stimulus", "time", "whisker", "channel"), wrench, {"units": "N (F), N m (M)"}),
-            "contact": (("stimulus", "time", "whisker"), stack("contact")),
+            "contact": (("stimulus", "time", "whisker"), readings("contact").any(axis=2)),
             "contact_arc": (
                 ("stimulus", "time", "whisker"),
-                stack("contact_arc").astype(np.float32),
+                _mean_of_known(readings("contact_arc")).astype(np.float32),
                 {"units": "m", "long_name": "arc length of the force-weighted contact point"},
             ),
             "penetration": (
@@ -163,7 +166,7 @@ def _assemble(
         },
         coords={
             "stimulus": np.array([scene.label for scene in scenes], dtype=object),
-            "time": ("time", scenes[0].frames.times, {"units": "s"}),
+            "time": ("time", frames.times, {"units": "s"}),
             "whisker": np.array(array.names, dtype=object),
             "row": ("whisker", [mount.row for mount in array]),
             "col": ("whisker", [mount.col for mount in array]),
@@ -188,9 +191,19 @@ def _assemble(
 
 
 def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
-    """Turn the wrenches [time, whisker, channel] of one scene from the array frame to world axes."""
-    vectors = np.stack([trace.wrench.reshape(-1, 2, 3) for trace in traces], axis=1)
-    return (vectors @ scene.head.matrix.T).reshape(*vectors.shape[:2], 6).astype(np.float32)
+    """Average the readings of each frame and turn the wrenches [time, whisker, channel] to world axes."""
+    frames = scene.frames
+    means = [trace.wrench.reshape(frames.count, frames.average, 6).mean(axis=1) for trace in traces]
+    vectors = np.stack(means, axis=1).reshape(frames.count, len(traces), 2, 3)
+    return (vectors @ scene.head.matrix.T).reshape(frames.count, len(traces), 6).astype(np.float32)
+
+
+def _mean_of_known(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over axis 2 of what is not NaN; NaN where nothing is known."""
+    known = np.isfinite(values)
+    count = known.sum(axis=2)
+    total = np.where(known, values, 0.0).sum(axis=2)
+    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
 def _warn_unstable(dataset: xr.Dataset) -> None:

@@ -40,6 +40,17 @@ def test_every_recipe_loads_and_has_a_description():
         assert describe_recipe(name)
 
 
+def test_the_instant_recipe_differs_in_its_readings_alone():
+    mean, instant = get_recipe("rodgers"), get_recipe("rodgers-instant")
+    assert mean.scenes[0].frames.average == 18
+    assert instant.scenes[0].frames.average == 1
+    assert "instantaneously" in instant.description
+    for first, second in zip(mean.scenes, instant.scenes, strict=True):
+        drop = {"frames": None}
+        assert {**first.config(), **drop} == {**second.config(), **drop}
+        np.testing.assert_array_equal(first.frames.times, second.frames.times)
+
+
 def test_an_unknown_recipe_suggests_the_nearest():
     with pytest.raises(UsageError, match="Unknown stimulus recipe 'rogers'; did you mean 'rodgers'"):
         get_recipe("rogers")

@@ -18,11 +18,22 @@ def test_the_default_frames_are_those_of_the_published_pipeline():
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"first": -1.0}, "at 0 s or later"), ({"interval": 0.0}, "positive"), ({"count": 0}, "at least one frame")],
+    [
+        ({"first": -1.0}, "at 0 s or later"),
+        ({"interval": 0.0}, "positive"),
+        ({"count": 0}, "count .* at least 1"),
+        ({"average": 1.5}, "average"),
+    ],
 )
 def test_impossible_frames_are_refused(changes, message):
     with pytest.raises(UsageError, match=message):
         Frames(**changes)
+
+
+def test_the_readings_of_a_frame_fill_its_interval():
+    frames = Frames(0.001, 0.009, 2, average=3)
+    np.testing.assert_allclose(frames.times, [0.001, 0.010])
+    np.testing.assert_allclose(frames.readings, [0.001, 0.004, 0.007, 0.010, 0.013, 0.016])
 
 
 def test_a_scene_needs_a_label():

@@ -7,9 +7,10 @@ import xarray as xr
 
 from brainbench.errors import UsageError
 from brainbench.stimuli import simulation
+from brainbench.stimuli.backends.protocol import base_rotation
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import Still, Translation, Whisking
+from brainbench.stimuli.motion import ArrayFollicle, Still, Translation, Whisking
 from brainbench.stimuli.objects import PlacedObject, euler_matrix, sphere
 from brainbench.stimuli.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
@@ -61,6 +62,24 @@ def test_wrenches_are_turned_from_the_array_to_the_world():
     matrix = euler_matrix(turn)
     np.testing.assert_allclose(turned[..., :3], straight[..., :3] @ matrix.T, atol=1e-8)
     np.testing.assert_allclose(turned[..., 3:], straight[..., 3:] @ matrix.T, atol=1e-6)
+
+
+def test_a_frame_is_the_mean_of_its_readings_and_touches_when_one_of_them_does():
+    # C1 points here half-way through its first protraction.
+    (position,), (euler,) = ArrayFollicle(ARRAY["C1"], Whisking()).pose(np.array([0.02]))
+    tip = position + base_rotation(euler)[:, :2] @ ARRAY["C1"].whisker.centre_line(ARRAY["C1"].whisker.arc_length)
+    met = (PlacedObject(sphere(0.5e-3), position=tuple(tip)),)
+    dense = _simulate(_scene(objects=met, frames=Frames(0.0, 0.001, 40)))
+    averaged = _simulate(_scene(objects=met, frames=Frames(0.0, 0.01, 4, average=10)))
+    expected = dense["wrench"].values.reshape(1, 4, 10, 3, 6).mean(axis=2)
+    np.testing.assert_allclose(averaged["wrench"], expected, atol=1e-7)
+    contact = dense["contact"].values.reshape(1, 4, 10, 3)
+    assert contact.any()
+    assert (contact.any(axis=2) != contact.all(axis=2)).any()
+    np.testing.assert_array_equal(averaged["contact"], contact.any(axis=2))
+    np.testing.assert_array_equal(np.isfinite(averaged["contact_arc"]), contact.any(axis=2))
+    arc = averaged["contact_arc"].sel(whisker="C1").values
+    np.testing.assert_allclose(arc[np.isfinite(arc)], ARRAY["C1"].whisker.arc_length, rtol=1e-6)
 
 
 def test_a_whisker_that_reaches_nothing_is_simulated_once_for_all_scenes():
