@@ -29,7 +29,7 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
     from rich.console import Console
     from rich.table import Table
 
-    grid = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    grid = Table(title=title or None, title_justify="left", box=None, pad_edge=False, header_style="bold")
     for index, column in enumerate(columns):
         grid.add_column(column, justify="right" if index in right else "left", overflow="fold")
     for row in rows:
