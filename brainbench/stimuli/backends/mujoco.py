@@ -237,18 +237,20 @@ def _contacts(slots: NDArray, shape: NDArray, chain: Chain) -> tuple[NDArray[np.
     total = force.sum(axis=1)
     contact = total > 0
     arc = np.full(len(slots), np.nan)
-    for frame in np.flatnonzero(contact):
-        arcs = [_nearest_arc(point, shape[frame], chain) for point in slots[frame, :, 5:8]]
-        arc[frame] = np.dot(force[frame], arcs) / total[frame]
+    arcs = _nearest_arcs(slots[contact, :, 5:8], shape[contact], chain)
+    arc[contact] = np.sum(force[contact] * arcs, axis=1) / total[contact]
     return contact, arc
 
 
-def _nearest_arc(point: NDArray, joints: NDArray, chain: Chain) -> float:
-    """Arc length (m) of the point of the chain [N + 1, 3] that is nearest to ``point`` [3]."""
-    along = np.diff(joints, axis=0)
-    share = np.clip(np.sum((point - joints[:-1]) * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
-    link = int(np.argmin(np.linalg.norm(joints[:-1] + share[:, None] * along - point, axis=1)))
-    return float(chain.nodes[link] + share[link] * (chain.nodes[link + 1] - chain.nodes[link]))
+def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.float64]:
+    """Arc lengths [n, k] (m) of the points of the chain [n, N + 1, 3] that are nearest to ``points`` [n, k, 3]."""
+    along = np.diff(joints, axis=1)[:, None]
+    offset = points[:, :, None] - joints[:, None, :-1]
+    share = np.clip(np.sum(offset * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
+    distance = np.linalg.norm(offset - share[..., None] * along, axis=-1)
+    link = np.argmin(distance, axis=-1)
+    share = np.take_along_axis(share, link[..., None], axis=-1)[..., 0]
+    return chain.nodes[link] + share * np.diff(chain.nodes)[link]
 
 
 def _penetration(slots: NDArray) -> float:
