@@ -186,7 +186,7 @@ def _integrate(
         hinges[first] = state[at][q:]
         hinges[first + 1 : first + count] = angles[:-1]
         bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window]) < LARGEST_BEND).all(axis=1)
-        warned = [str(mujoco.mjtWarning(k).name) for k, item in enumerate(data.warning) if item.number]
+        warned = [str(mujoco.mjtWarning(int(kind)).name) for kind in np.flatnonzero(data.warning.number)]
         if bad.any() or warned:
             failed = first + (int(np.argmax(bad)) if bad.any() else 0)
             return sensors, hinges, failed, _reason(hinges[failed], warned, times[failed])
