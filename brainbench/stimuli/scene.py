@@ -57,7 +57,7 @@ class Frames:
     The default reads 110 instantaneous frames, 9 ms apart, the first at 1 ms, as the published pipeline
     does (every ninth sample of a 1 kHz simulation). Whatever vibrates above 1/(2·interval) = 56 Hz then
     aliases, and a sliding tip does: the RDM of the six Rodgers stimuli at the presets ``balanced`` and
-    ``accurate`` correlates by .91. With ``average`` = 18, each frame the mean of 18 readings, by .995.
+    ``accurate`` correlates by .90. With ``average`` = 18, each frame the mean of 18 readings, by .995.
     """
 
     first: float = 0.001
