@@ -87,7 +87,8 @@ class Candidate:
         from brainbench.stimuli import load_stimuli
 
         shown = load_stimuli(stimuli or DEFAULT_STIMULI, whiskers=whiskers, fidelity=fidelity, progress=progress)
-        origin = {**self.origin, "stimuli": {"description": shown.description, "content_hash": shown.content_hash}}
+        names = ("description", "content_hash", "config_hash")
+        origin = {**self.origin, "stimuli": {name: getattr(shown, name) for name in names}}
         if self.module is None:
             given = {
                 layer: _as_steps(layer, item, len(shown.labels)) for layer, item in (self.activations or {}).items()

@@ -147,7 +147,15 @@ def score_record(
         recordings=brain.origin,
         pairs=pairs,
         **({"command": command} if command else {}),
-        settings={"time": time, "normalize": normalize, "layers": layers, "estimator": estimator, "seed": seed},
+        settings={
+            "time": time,
+            "whiskers": whiskers,
+            "fidelity": fidelity or "balanced",
+            "normalize": normalize,
+            "layers": layers,
+            "estimator": estimator,
+            "seed": seed,
+        },
         seconds=round(clock.perf_counter() - started, 2),
     )
     first, *others = (dataclasses.replace(item, provenance=origin) for item in scores)

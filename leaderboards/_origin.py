@@ -34,8 +34,11 @@ def stimuli_name(score: Score) -> str:
 
 
 def stimuli_hash(score: Score) -> str | None:
-    """Return the content hash of the stimuli, if the record states it."""
-    return _text(_part(score, "stimuli", "content_hash"))
+    """Return the hash that names the stimuli, if the record states one.
+
+    That of their configuration is equal on every machine; the numbers differ in their last digits.
+    """
+    return _text(_part(score, "stimuli", "config_hash")) or _text(_part(score, "stimuli", "content_hash"))
 
 
 def time_rule(score: Score) -> str:

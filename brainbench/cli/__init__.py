@@ -7,6 +7,7 @@ Exit status: 0 done; 1 the request was fine but the job failed (unusable data, i
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from typing import Annotated
 
@@ -54,6 +55,8 @@ def _root(
 
 def main() -> None:
     """Entry point: run a command and turn our own errors into one line and an exit status."""
+    # Idle OpenMP threads would otherwise spin and slow each other down on a busy machine.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         app()
     except BrainbenchError as error:

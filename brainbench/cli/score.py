@@ -49,7 +49,12 @@ def score(
         str | None, typer.Option(help="Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'.")
     ] = None,
     whiskers: Annotated[str, typer.Option(help="Whiskers to simulate: all, C0-C3, C2,D1, …")] = "all",
-    fidelity: Annotated[str, typer.Option(help="Simulation preset: fast, balanced or accurate.")] = "balanced",
+    fidelity: Annotated[
+        str,
+        typer.Option(
+            help="Simulation preset: balanced, accurate, or fast (only to try things out: its RDMs are coarse)."
+        ),
+    ] = "balanced",
     layers: Annotated[str | None, typer.Option(help="Comma-separated layers to compare; all by default.")] = None,
     time: Annotated[
         str, typer.Option(help="Time axis of both sides: 'mean' averages over it, 'concatenate' keeps every step.")
