@@ -50,10 +50,7 @@ def score(
     ] = None,
     whiskers: Annotated[str, typer.Option(help="Whiskers to simulate: all, C0-C3, C2,D1, …")] = "all",
     fidelity: Annotated[
-        str,
-        typer.Option(
-            help="Simulation preset: balanced, accurate, or fast (only to try things out: its RDMs are coarse)."
-        ),
+        str, typer.Option(help="Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs).")
     ] = "balanced",
     layers: Annotated[str | None, typer.Option(help="Comma-separated layers to compare; all by default.")] = None,
     time: Annotated[
