@@ -54,7 +54,7 @@ class ModelSide:
         weights = np.random.default_rng(seed).standard_normal((raw.shape[-1], RANDOM_FEATURES)) / np.sqrt(raw.shape[-1])
         return {
             "raw input": {"input": _rdm(raw, self.time)},
-            "random features": {"relu(input · random)": _rdm(np.maximum(raw @ weights, 0.0), self.time)},
+            "random features": {"random": _rdm(np.maximum(raw @ weights, 0.0), self.time)},
         }
 
 
