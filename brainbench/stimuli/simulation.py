@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
+import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -14,10 +14,10 @@ import numpy as np
 from brainbench import __version__
 from brainbench.errors import DataError, UsageError
 from brainbench.files import cache_dir, content_hash, to_json
+from brainbench.stimuli._plan import plan
 from brainbench.stimuli.backends import get_backend
-from brainbench.stimuli.backends._reach import reachable
+from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.motion import Still
 from brainbench.stimuli.scene import Scene
 from brainbench.stimuli.storage import hash_stimulus_set, read_stimulus_set, write_stimulus_set
 from brainbench.types import CHANNELS, check_stimulus_set
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from brainbench.stimuli.backends.protocol import Backend, Job, Trace
+    from brainbench.stimuli.backends.protocol import Backend, Trace
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,7 +61,8 @@ def simulate(
         large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker became
         ``unstable`` its numbers are NaN. The attribute ``config_hash`` names
         what was asked for and is equal on every machine; ``content_hash`` names the numbers, whose
-        last digits depend on the processor.
+        last digits depend on the processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads from
+        the set what was simulated, shared and left out.
 
     Raises:
         UsageError: the scenes do not fit together, or a name is unknown.
@@ -72,12 +73,14 @@ def simulate(
     engine = get_backend(backend) if isinstance(backend, str) else backend
     path = _cache_path(chosen, fidelity, engine.name) if cache and isinstance(backend, str) else None
     if path is not None and path.exists():
+        started = time.perf_counter()
         try:
-            return read_stimulus_set(path)
+            dataset = read_stimulus_set(path)
+            dataset.encoding[SECONDS] = {"read": time.perf_counter() - started}
+            return dataset
         except DataError as error:
             _LOG.warning("cached stimuli are damaged and are simulated again: %s", error)
-    traces = _run(chosen, fidelity, engine, progress)
-    dataset = _assemble(chosen, traces, fidelity, engine.name)
+    dataset = _simulate(chosen, fidelity, engine, progress)
     if path is not None:
         try:
             write_stimulus_set(dataset, path)
@@ -102,34 +105,21 @@ def _checked(scenes: Scene | Iterable[Scene]) -> list[Scene]:
     return chosen
 
 
-def _run(scenes: Sequence[Scene], fidelity: Fidelity, engine: Backend, progress: Progress | None) -> list[list[Trace]]:
-    """Simulate every distinct job once and return traces [scene][whisker].
-
-    A whisker that reaches no object does the same in every scene with the same motion.
-    """
-    distinct: dict[str, int] = {}
-    jobs: list[Job] = []
-    places: list[list[int]] = []
-    for scene in scenes:
-        row = []
-        for mount, job in zip(scene.array, scene.jobs(), strict=True):
-            travels = not isinstance(scene.head.motion, Still)
-            seen = scene.config() if travels or _reaches(job) else {"whisking": scene.whisking.config()}
-            key = content_hash(mount, {**seen, "label": None})
-            if key not in distinct:
-                distinct[key] = len(jobs)
-                jobs.append(job)
-            row.append(distinct[key])
-        places.append(row)
+def _simulate(scenes: Sequence[Scene], fidelity: Fidelity, engine: Backend, progress: Progress | None) -> xr.Dataset:
+    """Simulate every distinct job once; put the traces together and say what was done."""
+    clock = [time.perf_counter()]
+    planned = plan(scenes)
+    clock.append(time.perf_counter())
     report = None if progress is None else lambda done, total: progress(done, total, "simulating whiskers")
-    traces = engine.run(jobs, fidelity, progress=report)
-    return [[traces[index] for index in row] for row in places]
-
-
-def _reaches(job: Job) -> bool:
-    """Whether the whisker of this job could ever touch an object."""
-    times = np.linspace(job.start, job.times[-1], max(2, math.ceil((job.times[-1] - job.start) * 1000)))
-    return bool(reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times))
+    traces = engine.run(planned.jobs, fidelity, progress=report)
+    clock.append(time.perf_counter())
+    rows = [[traces[index] for index in row] for row in planned.places]
+    dataset = _assemble(scenes, rows, fidelity, engine.name)
+    clock.append(time.perf_counter())
+    seconds = dict(zip(("plan", "simulate", "assemble"), np.diff(clock).tolist(), strict=True))
+    dataset.attrs[ATTRIBUTE] = explain(scenes, planned, traces, fidelity).to_attribute()
+    dataset.encoding[SECONDS] = {**seconds, "processor": sum(trace.seconds for trace in traces)}
+    return dataset
 
 
 def _assemble(

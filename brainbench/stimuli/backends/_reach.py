@@ -13,6 +13,7 @@ from brainbench.stimuli.obstacle import Obstacle, rotation_matrix
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from brainbench.stimuli.chain import Chain
     from brainbench.stimuli.whisker import Whisker
 
 
@@ -29,6 +30,15 @@ class Reach:
         """Whether anything is within reach."""
         return bool(self.obstacles)
 
+    @property
+    def parts(self) -> int:
+        """Number of convex parts within reach."""
+        return sum(len(obstacle.parts) for obstacle in self.obstacles)
+
+    def links(self, chain: Chain) -> int:
+        """Number of links of the chain that come near enough to touch; links closer to the base never do."""
+        return int(np.count_nonzero(chain.nodes[1:] + chain.radii >= self.nearest)) if self else 0
+
 
 def reachable(
     whisker: Whisker, base: NDArray[np.float64], obstacles: tuple[Obstacle, ...], times: NDArray[np.float64]
@@ -37,12 +47,14 @@ def reachable(
 
     Conservative: an inextensible whisker never leaves the ball of its arc length around its base, so a
     part whose bounding box stays outside that ball at every time cannot be touched, however it bends.
+    What base and obstacle travel against one another between two times is added to the ball.
     """
     limit = whisker.arc_length + max(whisker.base_radius, whisker.tip_radius)
     kept, nearest = [], math.inf
     for obstacle in obstacles:
         points = _in_obstacle_frame(obstacle, base, times)
-        distances = [float(_box_distance(part.bounds(), points).min()) for part in obstacle.parts]
+        between = _largest_step(points) / 2
+        distances = [max(0.0, float(_box_distance(part.bounds(), points).min()) - between) for part in obstacle.parts]
         parts = tuple(part for part, distance in zip(obstacle.parts, distances, strict=True) if distance <= limit)
         if parts:
             kept.append(replace(obstacle, parts=parts))
@@ -55,6 +67,11 @@ def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> N
         return points[:1] if np.ptp(points, axis=0).max() == 0 else points
     position, quaternion = obstacle.motion(times)
     return np.einsum("nji,nj->ni", rotation_matrix(quaternion), points - position)
+
+
+def _largest_step(points: NDArray) -> float:
+    """Longest way (m) from one of the points [n, 3] to the next."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0))
 
 
 def _box_distance(bounds: NDArray, points: NDArray) -> NDArray[np.float64]:

@@ -1,0 +1,62 @@
+"""What a list of scenes costs: which whisker runs are distinct, and what of each scene they could ever touch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.files import content_hash
+from brainbench.stimuli.backends._reach import Reach, reachable
+from brainbench.stimuli.motion import Still
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.backends.protocol import Job
+    from brainbench.stimuli.scene import Scene
+
+SAMPLING = 1000.0
+"""Instants per second at which reach is judged; what moves in between counts as an error bound."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Distinct jobs of some scenes, and where each whisker of each scene finds its trace."""
+
+    jobs: tuple[Job, ...]
+    """Jobs to run: a whisker that reaches no object does the same in every scene with the same motion."""
+    places: tuple[tuple[int, ...], ...]
+    """[scene][whisker] index into ``jobs``."""
+    reaches: tuple[tuple[Reach, ...], ...]
+    """[scene][whisker] what of its scene the whisker could ever touch."""
+
+
+def plan(scenes: Sequence[Scene]) -> Plan:
+    """Find the distinct jobs of ``scenes``."""
+    distinct: dict[str, int] = {}
+    jobs: list[Job] = []
+    places, reaches = [], []
+    for scene in scenes:
+        row, near = [], []
+        for mount, job in zip(scene.array, scene.jobs(), strict=True):
+            reach = reach_of(job)
+            travels = not isinstance(scene.head.motion, Still)
+            seen = scene.config() if travels or reach else {"whisking": scene.whisking.config()}
+            key = content_hash(mount, {**seen, "label": None})
+            if key not in distinct:
+                distinct[key] = len(jobs)
+                jobs.append(job)
+            row.append(distinct[key])
+            near.append(reach)
+        places.append(tuple(row))
+        reaches.append(tuple(near))
+    return Plan(tuple(jobs), tuple(places), tuple(reaches))
+
+
+def reach_of(job: Job) -> Reach:
+    """Return what of its obstacles the whisker of this job could ever touch."""
+    duration = job.times[-1] - job.start
+    times = np.linspace(job.start, job.times[-1], max(2, math.ceil(duration * SAMPLING)))
+    return reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times)

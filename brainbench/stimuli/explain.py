@@ -1,0 +1,184 @@
+"""What a simulation did and what it could leave out: whisker runs, time steps, contact pairs and seconds.
+
+A *run* is one whisker in one stimulus. Runs that cannot differ are simulated once and shared; runs that
+cannot feel anything are not simulated. A contact *pair* is one link of a whisker against one convex part
+of an object: a physics engine looks at every pair that it was given in every step.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING
+
+from brainbench.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from brainbench.stimuli._plan import Plan
+    from brainbench.stimuli.backends.protocol import Trace
+    from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.stimuli.scene import Scene
+
+ATTRIBUTE = "explanation"
+"""Attribute of a stimulus set that holds the explanation as JSON."""
+SECONDS = "seconds"
+"""Key of a stimulus set's ``encoding`` under which this process keeps what took how long."""
+_PASSING = ("seconds", "source")
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Work of one simulation, beside the work of simulating every whisker of every stimulus in full.
+
+    Kept in the stimulus set, so a set from the cache tells how it was once made. Where the set came from
+    and how long that took differ from time to time and are known only to the process that made it.
+    """
+
+    stimuli: int
+    whiskers: int
+    """Whiskers per stimulus."""
+    links: tuple[int, int]
+    """Fewest and most links of a whisker."""
+    simulated: int
+    """Runs that were integrated."""
+    shared: int
+    """Runs that took over the trace of an equal run."""
+    silent: int
+    """Runs without any motion, load or object within reach: their wrench is exactly zero, without simulation."""
+    steps: int
+    """Time steps of all whiskers that were computed."""
+    steps_in_full: int
+    """Time steps that all runs together would take."""
+    pairs: int
+    """Contact pairs of the simulated runs that lie within reach; no others were built."""
+    pairs_in_full: int
+    """Contact pairs of all links of all runs with all parts of their objects."""
+    out_of_reach: Mapping[str, tuple[str, ...]]
+    """Stimulus → whiskers that its objects cannot touch, whatever these whiskers do."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Elapsed time of each part [s]: ``plan``, ``simulate``, ``assemble``, and ``processor``, the processor time of
+    ``simulate`` on all threads together; or ``read`` alone. Empty when this process did not make the set."""
+    source: str | None = None
+    """File from which the finished set was read; None when it was simulated now."""
+
+    @property
+    def runs(self) -> int:
+        """Runs that were asked for."""
+        return self.stimuli * self.whiskers
+
+    @classmethod
+    def of(cls, dataset: xr.Dataset) -> Explanation:
+        """Read the explanation that :func:`brainbench.stimuli.simulate` left in a stimulus set.
+
+        Raises:
+            UsageError: the set carries none.
+            DataError: it is damaged.
+        """
+        text = dataset.attrs.get(ATTRIBUTE)
+        if text is None:
+            raise UsageError("This stimulus set does not say how it was made; simulate it again to have it explained.")
+        try:
+            data = json.loads(text)
+            data = {item.name: data[item.name] for item in fields(cls) if item.name not in _PASSING}
+        except (TypeError, KeyError, json.JSONDecodeError) as error:
+            raise DataError(f"The explanation in this stimulus set is damaged ({error!r}).") from error
+        data["links"] = tuple(data["links"])
+        data["out_of_reach"] = {label: tuple(names) for label, names in data["out_of_reach"].items()}
+        source = dataset.encoding.get("source")
+        return cls(**data, seconds=dataset.encoding.get(SECONDS, {}), source=None if source is None else str(source))
+
+    def to_attribute(self) -> str:
+        """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""
+        from brainbench.files import to_json, to_plain
+
+        return to_json({key: item for key, item in to_plain(self).items() if key not in _PASSING}, indent=None)
+
+    def lines(self) -> list[tuple[str, str]]:
+        """Return (what, how much) for people, in reading order."""
+        low, high = self.links
+        links = f"{low}" if low == high else f"{low}–{high}"
+        elapsed = ", ".join(f"{name} {value:.2f} s" for name, value in self.seconds.items())
+        rows = [
+            ("asked for", f"{self.stimuli} stimuli × {self.whiskers} whiskers = {self.runs} runs of {links} links"),
+            ("simulated", f"{self.simulated} runs, {self.steps:,} of {self.steps_in_full:,} time steps"),
+            ("shared", f"{self.shared} runs equal to another stimulus's"),
+            ("silent", f"{self.silent} runs that can feel nothing: exactly zero without simulation"),
+            ("contact pairs", f"{self.pairs:,} of {self.pairs_in_full:,} (links × convex parts) can ever meet"),
+            ("saved", f"{_share(self.steps, self.steps_in_full)} of the steps, {_share(self.pairs, self.pairs_in_full)}"
+             " of the contact pairs"),
+            ("time", elapsed or "not known: made by another process"),
+            ("made", "now" if self.source is None else f"earlier, read from {self.source}"),
+        ]  # fmt: skip
+        return rows
+
+    def __str__(self) -> str:
+        width = max(len(name) for name, _ in self.lines())
+        text = [f"{name:<{width}}  {value}" for name, value in self.lines()]
+        text += [
+            f"{'out of reach' if index == 0 else '':<{width}}  {label}: {', '.join(names) or 'none'}"
+            for index, (label, names) in enumerate(self.out_of_reach.items())
+        ]
+        return "\n".join(text)
+
+
+def explain(
+    scenes: Sequence[Scene],
+    plan: Plan,
+    traces: Sequence[Trace],
+    fidelity: Fidelity,
+) -> Explanation:
+    """Sum up a finished simulation.
+
+    Args:
+        scenes: what was asked for.
+        plan: its distinct jobs.
+        traces: one per job of the plan.
+        fidelity: links and time step.
+    """
+    from brainbench.stimuli.chain import build_chain
+
+    chains = {
+        whisker: build_chain(whisker, fidelity.link_count(whisker.arc_length))
+        for whisker in {job.whisker for job in plan.jobs}
+    }
+    pairs = pairs_in_full = steps_in_full = 0
+    counted: set[int] = set()
+    for scene, places, reaches in zip(scenes, plan.places, plan.reaches, strict=True):
+        parts = sum(len(item.solid.parts) for item in scene.objects)
+        for index, reach in zip(places, reaches, strict=True):
+            job = plan.jobs[index]
+            chain = chains[job.whisker]
+            pairs_in_full += chain.links * parts
+            steps_in_full += math.ceil((job.times[-1] - job.start) / fidelity.time_step - 1e-6) + 1
+            if index not in counted and traces[index].steps:
+                pairs += reach.links(chain) * reach.parts
+            counted.add(index)
+    counts = [chain.links for chain in chains.values()]
+    silent = sum(traces[index].steps == 0 for places in plan.places for index in places)
+    simulated = sum(trace.steps > 0 for trace in traces)
+    runs = sum(len(places) for places in plan.places)
+    return Explanation(
+        stimuli=len(scenes),
+        whiskers=len(scenes[0].array),
+        links=(min(counts), max(counts)),
+        simulated=simulated,
+        shared=runs - simulated - silent,
+        silent=silent,
+        steps=sum(trace.steps for trace in traces),
+        steps_in_full=steps_in_full,
+        pairs=pairs,
+        pairs_in_full=pairs_in_full,
+        out_of_reach={
+            scene.label: tuple(name for name, reach in zip(scene.array.names, reaches, strict=True) if not reach)
+            for scene, reaches in zip(scenes, plan.reaches, strict=True)
+        },
+    )
+
+
+def _share(part: int, whole: int) -> str:
+    """Return what is saved of ``whole`` as a percentage."""
+    return f"{100 * (1 - part / whole):.0f} %" if whole else "none"

@@ -1,0 +1,156 @@
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from brainbench.errors import DataError, UsageError
+from brainbench.stimuli import simulation
+from brainbench.stimuli._plan import plan, reach_of
+from brainbench.stimuli.backends import _reach, mujoco
+from brainbench.stimuli.backends._mujoco_model import build_model
+from brainbench.stimuli.backends._reach import Reach
+from brainbench.stimuli.chain import build_chain
+from brainbench.stimuli.explain import Explanation
+from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.stimuli.motion import Still, Translation
+from brainbench.stimuli.objects import PlacedObject, box, rodgers_solid, sphere
+from brainbench.stimuli.recipes import get_recipe
+from brainbench.stimuli.scene import Frames, Scene
+from brainbench.stimuli.simulation import simulate
+
+from .fakes import FakeBackend
+
+FAST = Fidelity.preset("fast")
+ARRAY = WhiskerArray.mouse(whiskers="C1,C2,D6")
+FRAMES = Frames(0.0, 0.01, 10)
+NEAR = PlacedObject(sphere(2e-3), position=(0.015, 0.002, 0.003))
+FAR = PlacedObject(sphere(2e-3), position=(1.0, 0.0, 0.0))
+
+
+def _scene(label, *objects, **changes):
+    return Scene(label, **{"array": ARRAY, "objects": objects, "frames": FRAMES, **changes})
+
+
+@pytest.fixture
+def in_full(monkeypatch):
+    """Make the engine simulate every whisker with every object, whether it can be reached or not."""
+    monkeypatch.setattr(mujoco, "reachable", lambda whisker, base, obstacles, times: Reach(obstacles, 0.0))
+
+
+def test_runs_are_counted_as_simulated_shared_or_silent():
+    scenes = [_scene("near", NEAR), _scene("far", FAR), _scene("nothing")]
+    told = Explanation.of(simulate(scenes, fidelity=FAST, cache=False))
+    # C1 and C2 reach the ball; all three whisk through air once, for both other scenes and D6 for all.
+    assert (told.runs, told.simulated, told.shared, told.silent) == (9, 5, 4, 0)
+    assert told.out_of_reach == {"near": ("D6",), "far": ("C1", "C2", "D6"), "nothing": ("C1", "C2", "D6")}
+    assert told.steps == 5 * told.steps_in_full // 9
+    assert told.links == (6, 6)
+
+
+def test_whiskers_without_motion_or_object_are_silent_and_a_full_simulation_feels_nothing_either(in_full, monkeypatch):
+    scene = _scene("far", FAR, NEAR, whisking=Still(), array=ARRAY.select("C1,D6"))
+    full = simulate(scene, fidelity=FAST, cache=False)
+    monkeypatch.setattr(mujoco, "reachable", _reach.reachable)
+    pruned = simulate(scene, fidelity=FAST, cache=False)
+    told = Explanation.of(pruned)
+    assert told.silent == 1
+    assert told.out_of_reach == {"far": ("D6",)}
+    assert Explanation.of(full).silent == 0
+    assert told.steps < Explanation.of(full).steps
+    np.testing.assert_allclose(full["wrench"], pruned["wrench"], atol=1e-12)
+    assert (pruned["wrench"].sel(whisker="D6") == 0).all()
+    assert not full["contact"].any()
+
+
+@pytest.mark.parametrize("label", ["convex-far", "concave-far"])
+def test_whiskers_that_the_rodgers_solid_cannot_touch_feel_the_same_in_a_full_simulation(in_full, monkeypatch, label):
+    (scene,) = (scene for scene in get_recipe("rodgers").scenes if scene.label == label)
+    out = Explanation.of(simulate(scene, fidelity=FAST, backend=FakeBackend())).out_of_reach[label]
+    assert 5 < len(out) < 30
+    short = Scene(
+        label, scene.array.select(",".join(out)), scene.objects, scene.whisking, scene.head, Frames(0, 2e-3, 30)
+    )
+    full = simulate(short, fidelity=FAST, cache=False)
+    monkeypatch.setattr(mujoco, "reachable", _reach.reachable)
+    pruned = simulate(short, fidelity=FAST, cache=False)
+    assert not full["contact"].any()
+    scale = np.abs(pruned["wrench"].values).max(axis=(0, 1, 2))
+    np.testing.assert_allclose(full["wrench"] / scale, pruned["wrench"] / scale, atol=1e-6)
+    assert Explanation.of(pruned).pairs == 0
+
+
+def test_the_pairs_told_are_the_pairs_the_engine_builds():
+    scene = Scene(
+        "solid", ARRAY, (PlacedObject(rodgers_solid(0.055), position=(0.0137, 0.0045, 0.003)),), frames=FRAMES
+    )
+    dataset = simulate(scene, fidelity=FAST, cache=False)
+    built = 0
+    for job in scene.jobs():
+        chain = build_chain(job.whisker, FAST.links)
+        times = FAST.time_step * np.arange(round(job.times[-1] / FAST.time_step) + 2)
+        reach = _reach.reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times)
+        model = build_model(job, chain, reach, FAST.time_step, times).model
+        objects = int((model.geom_conaffinity > 0).sum())
+        built += objects * (model.ngeom - objects)
+    told = Explanation.of(dataset)
+    assert told.pairs == built > 0
+    assert told.pairs_in_full == 3 * FAST.links * 24
+
+
+def test_reach_is_not_missed_between_two_instants():
+    # In 1 ms the ball flies 4 mm: at no instant judged is it within reach, in between it passes the tip.
+    whisker = WhiskerArray.mouse(whiskers="D6").replace(position=(0.0, 0.0, 0.0))
+    length = whisker["D6"].whisker.arc_length
+    speed, aside = 4.0, length - 0.1e-3
+    flying = PlacedObject(box((1e-4, 1e-4, 1e-4)), (aside, -0.034, 0.0), motion=Translation((0.0, speed, 0.0), 0.0))
+    scene = Scene("flying", whisker, (flying,), Still(), frames=Frames(0.001, 0.001, 20))
+    (job,) = scene.jobs()
+    assert reach_of(job)
+    beyond = PlacedObject(
+        box((1e-4, 1e-4, 1e-4)), (aside + 3e-3, -0.034, 0.0), motion=Translation((0.0, speed, 0.0), 0.0)
+    )
+    (job,) = Scene("beyond", whisker, (beyond,), Still(), frames=Frames(0.001, 0.001, 20)).jobs()
+    assert not reach_of(job)
+
+
+def test_equal_runs_are_planned_once():
+    planned = plan([_scene("a", NEAR), _scene("b", NEAR)])
+    assert len(planned.jobs) == 3
+    assert planned.places == ((0, 1, 2), (0, 1, 2))
+
+
+def test_the_same_simulation_is_explained_in_the_same_words_and_survives_the_cache(monkeypatch, tmp_path):
+    monkeypatch.setattr(simulation, "get_backend", lambda name: FakeBackend())
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    first = simulate(_scene("near", NEAR), fidelity=FAST, backend="fake")
+    second = simulate(_scene("near", NEAR), fidelity=FAST, backend="fake")
+    xr.testing.assert_identical(first, second)
+    fresh, read = Explanation.of(first), Explanation.of(second)
+    assert fresh.source is None
+    assert set(fresh.seconds) == {"plan", "simulate", "assemble", "processor"}
+    assert read.source is not None
+    assert read.source.startswith(str(tmp_path))
+    assert set(read.seconds) == {"read"}
+    assert read.out_of_reach == fresh.out_of_reach
+    assert "D6" in str(read)
+    assert f"read from {read.source}" in str(read)
+
+
+def test_the_text_says_what_was_saved():
+    text = str(Explanation.of(simulate([_scene("near", NEAR), _scene("far", FAR)], fidelity=FAST, cache=False)))
+    assert "2 stimuli × 3 whiskers = 6 runs of 6 links" in text
+    assert "saved          17 % of the steps" in text
+    assert "near: D6" in text
+
+
+def test_a_set_without_or_with_a_damaged_explanation_is_refused_in_words():
+    dataset = simulate(_scene("near", NEAR), fidelity=FAST, backend=FakeBackend())
+    data = json.loads(dataset.attrs["explanation"])
+    del data["steps"]
+    with pytest.raises(DataError, match=r"damaged \(.*steps"):
+        Explanation.of(dataset.assign_attrs(explanation=json.dumps(data)))
+    del dataset.attrs["explanation"]
+    with pytest.raises(UsageError, match="simulate it again"):
+        Explanation.of(dataset)
