@@ -18,6 +18,7 @@ _LAZY = {
     "Solid": "objects",
     "Still": "motion",
     "Stimuli": "sets",
+    "SweepGrid": "sweeps",
     "Translation": "motion",
     "Whisker": "whisker",
     "WhiskerArray": "morphology",
@@ -45,6 +46,7 @@ __all__ = [
     "Solid",
     "Still",
     "Stimuli",
+    "SweepGrid",
     "Translation",
     "Whisker",
     "WhiskerArray",
@@ -75,6 +77,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.sets import Stimuli, load_stimuli
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.storage import read_stimulus_set, write_stimulus_set
+    from brainbench.stimuli.sweeps import SweepGrid
     from brainbench.stimuli.whisker import Whisker
 
 

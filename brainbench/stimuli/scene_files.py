@@ -46,7 +46,7 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,7 @@ from brainbench.stimuli.objects import (
     sphere,
 )
 from brainbench.stimuli.scene import Frames, Head, Scene
+from brainbench.stimuli.sweeps import SweepScenes
 
 _MM = 1e-3
 _NOTHING: Mapping[str, Any] = {}
@@ -76,12 +77,13 @@ class Recipe:
 
     name: str
     description: str
-    scenes: tuple[Scene, ...]
+    scenes: Sequence[Scene]
+    """A tuple, or a lazy sequence that builds each scene when it is asked for (sweeps)."""
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels in order."""
-        return tuple(scene.label for scene in self.scenes)
+        return self.scenes.labels if isinstance(self.scenes, SweepScenes) else tuple(s.label for s in self.scenes)
 
 
 def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe:
