@@ -62,7 +62,7 @@ def _memory(memory: Memory | None, channels: int) -> Cell | None:
     if memory is None:
         return None
     if memory.kind == "time-decay":
-        return TimeDecay(channels, channels, tau=memory.tau)
+        return TimeDecay(channels, channels, tau=memory.tau, layer_norm=memory.layer_norm)
     return CELLS[memory.kind](channels, channels, kernel_size=memory.kernel_size, layer_norm=memory.layer_norm)
 
 

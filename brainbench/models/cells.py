@@ -27,11 +27,11 @@ FORGET_BIAS = 1.0
 
 
 class ChannelNorm(nn.LayerNorm):
-    """LayerNorm over the channels of [B, C, H, W], separately at every place."""
+    """LayerNorm over the channels of [B, C, ...], separately at every place."""
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
-        """Normalise [B, C, H, W] over C."""
-        return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        """Normalise [B, C, ...] over C."""
+        return super().forward(input.movedim(1, -1)).movedim(-1, 1)
 
 
 class Cell(nn.Module):
@@ -102,8 +102,12 @@ class Cell(nn.Module):
 class TimeDecay(Cell):
     """Leaky trace: s ← x + τ s, y = s, with one trainable scalar τ that starts at zero.
 
-    Works on any [B, C, ...]. ``kernel_size`` is accepted for a uniform signature and unused.
+    There is no gate to normalise, so ``layer_norm`` normalises the output (y = LN(s)); the trace itself
+    stays as it is, or it would forget how strong the stimulus was. Works on any [B, C, ...].
+    ``kernel_size`` is accepted for a uniform signature and unused.
     """
+
+    tnn_names: ClassVar[Mapping[str, str]] = {"norm": "norm"}
 
     def __init__(
         self,
@@ -115,16 +119,15 @@ class TimeDecay(Cell):
         tau: float = 0.0,
     ) -> None:
         super().__init__(in_channels, out_channels)
-        if layer_norm:
-            raise UsageError("TimeDecay has no gates to normalise; leave layer_norm off or take a gated cell.")
         if in_channels != out_channels:
             raise UsageError(f"TimeDecay keeps its channels; received {in_channels} in and {out_channels} out.")
         self.tau = nn.Parameter(torch.tensor(float(tau)))
+        self.norm = ChannelNorm(out_channels) if layer_norm else nn.Identity()
 
     def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, C, ...]."""
         state = x + self.tau * self._check(x, state)
-        return state, state
+        return self.norm(state), state
 
 
 class _GatedCell(Cell):

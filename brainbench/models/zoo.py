@@ -30,7 +30,7 @@ def zhuang(cell: str, *, layer_norm: bool = False, small: bool = False, gpt: boo
 
     Args:
         cell: Cell of the encoder.
-        layer_norm: Normalise the cell's gates.
+        layer_norm: Normalise the cell's gates (the output of time decay).
         small: All widths × 3/16; the GPT attender is then 96 wide, at equal depth.
         gpt: Add the GPT attender, as wide as the encoder's output.
     """
@@ -51,8 +51,7 @@ def register() -> None:
     for small in (False, True):
         for gpt in (False, True):
             for part, (cell, words) in CELLS.items():
-                # Time decay has no gates that could be normalised.
-                for layer_norm in (False, True) if part else (False,):
+                for layer_norm in (False, True):
                     _register(part, cell, words, layer_norm=layer_norm, small=small, gpt=gpt)
 
 

@@ -8,7 +8,7 @@ from brainbench.errors import DataError, UsageError
 from brainbench.models.cells import CELLS, GRU, LSTM, UGRNN, IntersectionRNN, TimeDecay
 
 GATED = [UGRNN, IntersectionRNN, GRU, LSTM]
-VARIANTS = [(TimeDecay, False), *((cell, layer_norm) for cell in GATED for layer_norm in (False, True))]
+VARIANTS = [(cell, layer_norm) for cell in (TimeDecay, *GATED) for layer_norm in (False, True)]
 
 
 def _unroll(cell, xs):
@@ -143,6 +143,16 @@ def test_time_decay_is_a_geometric_sum_of_its_inputs(tau, steps):
     torch.testing.assert_close(outputs[-1].detach(), torch.full((1, 2, 3, 3), float(expected)), atol=1e-4, rtol=1e-4)
 
 
+def test_a_normalised_time_decay_shows_its_trace_but_keeps_it_whole():
+    cell, plain = TimeDecay(4, 4, layer_norm=True, tau=0.5), TimeDecay(4, 4, tau=0.5)
+    xs = torch.randn(5, 2, 4, 3, 3)
+    outputs, state = _unroll(cell, xs)
+    traces, trace = _unroll(plain, xs)
+    torch.testing.assert_close(state, trace)
+    expected = torch.nn.functional.layer_norm(traces[-1].permute(0, 2, 3, 1), (4,)).permute(0, 3, 1, 2)
+    torch.testing.assert_close(outputs[-1], expected)
+
+
 def test_time_decay_starts_without_memory():
     x = torch.randn(1, 2, 3, 3)
     y, _ = TimeDecay(2, 2)(x, torch.randn(1, 2, 3, 3))
@@ -197,7 +207,6 @@ def test_wrong_parameters_are_named():
     ("make", "message"),
     [
         (lambda: TimeDecay(3, 4), "TimeDecay keeps its channels; received 3 in and 4 out"),
-        (lambda: TimeDecay(3, 3, layer_norm=True), "no gates to normalise"),
         (lambda: IntersectionRNN(3, 4, kernel_size=2), "same channels; received 3 in and 4 out"),
         (lambda: UGRNN(0, 3, kernel_size=2), "needs channels ≥ 1"),
         (lambda: UGRNN(3, 3, kernel_size=2)(torch.zeros(1, 4, 5, 7)), r"expects \[batch, 3, rows, columns\]"),

@@ -26,7 +26,7 @@ def _clean(monkeypatch):
 def test_names_follow_the_grammar_and_patterns_select_them():
     names = list_models()
     assert names[0] == "zhuang"
-    assert len(names) == len(set(names)) == 36
+    assert len(names) == len(set(names)) == 40
     assert list_models("zhuang-intersection-ln*") == [
         "zhuang-intersection-ln",
         "zhuang-intersection-ln+gpt",

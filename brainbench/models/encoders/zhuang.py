@@ -52,7 +52,7 @@ class ZhuangEncoder:
             Node(name, Convolution(self._width(width), padding="valid" if name == "conv1" else "same"), memory)
             for name, width in zip(names, _FULL, strict=True)
         ]
-        dense = memory if self.cell == "time-decay" else None
+        dense = Memory() if self.cell == "time-decay" else None
         nodes += [Node("fc7", Dense(self._width(1024)), dense), Node("fc8", Dense(self.features), dense)]
         forward = [*pairwise(names), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
         edges = [Edge(*ends) for ends in (*forward, ("fc7", "fc8"))]
