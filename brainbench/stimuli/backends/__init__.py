@@ -10,7 +10,10 @@ from brainbench.errors import unknown_name
 if TYPE_CHECKING:
     from brainbench.stimuli.backends.protocol import Backend
 
-_BACKENDS = {"mujoco": ("brainbench.stimuli.backends.mujoco", "MujocoBackend")}
+_BACKENDS = {
+    "bullet": ("brainbench.stimuli.backends.bullet", "BulletBackend"),
+    "mujoco": ("brainbench.stimuli.backends.mujoco", "MujocoBackend"),
+}
 
 
 def list_backends() -> tuple[str, ...]:
