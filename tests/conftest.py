@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
+
+# Processes that a test spawns inherit this path and find the test's module; at the end, so that the installed
+# package is the one under test.
+sys.path.append(str(Path(__file__).parents[1]))
 
 REFERENCE = Path(os.environ.get("BRAINBENCH_REFERENCE", Path(__file__).parents[2] / "shared" / "reference"))
 
