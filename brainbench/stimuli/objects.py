@@ -1,4 +1,4 @@
-"""Objects that whiskers meet: primitives, the Rodgers solid and meshes from files. Metres.
+"""Objects that whiskers meet: primitives, the Rodgers solid, procedural shapes and meshes from files. Metres.
 
 A :class:`Solid` stands in its own frame; :class:`PlacedObject` puts it into a scene.
 """
@@ -10,23 +10,31 @@ import math
 import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
-from brainbench.geometry import Mesh, load_mesh
+from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.motion import Still, Translation
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere, rotation_matrix
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike, NDArray
+
+    from brainbench.stimuli.shapes import Shape
 
 _LOG = logging.getLogger(__name__)
 
 Vector = tuple[float, float, float]
 
-COLLISIONS = ("hull", "pieces")
+COLLISIONS = ("exact", "hull", "pieces", "decomposition")
+"""What whiskers touch of a mesh. ``exact``: the surface itself, for convex meshes and for shapes that know their
+convex parts (every backend here collides convex bodies only). ``hull``: the convex hull. ``pieces``: the hull of
+each connected piece, for files that bring a convex decomposition along. ``decomposition``: convex pieces cut by
+CoACD or V-HACD."""
 
 RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))
 """Control points (x, y) of the cubic Bézier curve that is the convex face of the Rodgers solid, in the
@@ -49,6 +57,8 @@ class Solid:
     """Surface for pictures and measurements; None for primitives."""
     notes: tuple[str, ...] = ()
     """What a user should know, such as a concavity lost to the convex hull."""
+    origin: Mapping[str, Any] | None = None
+    """What the parts were computed from, where their last digits depend on the machine; :meth:`config` has it."""
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -75,9 +85,12 @@ class Solid:
         return self.scaled(diagonal / self.diagonal)
 
     def config(self) -> dict[str, Any]:
-        """Plain values that determine the physics; the parts count by a hash of their numbers."""
+        """Plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
         from brainbench.files import content_hash, to_plain
 
+        if self.origin is not None:
+            stated = {"name": self.name, "diagonal": self.diagonal, "notes": list(self.notes)}
+            return {**stated, "hash": content_hash(self.origin, round(self.diagonal, 12))}
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
         return {**summary, "hash": content_hash(parts)}
@@ -186,37 +199,99 @@ def mesh_solid(
     *,
     unit: str,
     diagonal: float | None = None,
-    collision: Literal["hull", "pieces"] = "hull",
+    collision: str = "hull",
+    decomposition: DecompositionSettings | None = None,
 ) -> Solid:
-    """Return a mesh file as a solid.
+    """Return a mesh file as a solid, repaired where that needs no guessing (see :func:`brainbench.geometry.repair`).
 
     Args:
         path: any format :func:`brainbench.geometry.load_mesh` reads.
         unit: length unit of the file (``m``, ``mm``, …).
         diagonal: scale to this bounding-box diagonal [m]; None keeps the size.
-        collision: what whiskers touch: the convex ``hull`` of the whole mesh, or the hull of each of its
-            connected ``pieces``, for files that bring a convex decomposition along.
+        collision: what whiskers touch, one of :data:`COLLISIONS`.
+        decomposition: how ``decomposition`` cuts; its defaults when None.
 
     Raises:
-        UsageError: ``collision`` or the unit is unknown.
-        DataError: the file is missing, unreadable or flat.
+        UsageError: ``collision`` or the unit is unknown, or ``exact`` is asked of a concave mesh.
+        DataError: the file is missing, unreadable or flat, or the decomposition passed its limits.
+        MissingDependencyError: the decomposition needs a package that is not installed.
     """
+    _check_collision(collision)
+    repaired = repair(load_mesh(path, unit=unit))
+    solid = _touchable(repaired.mesh, collision, decomposition)
+    # Separate bodies are what "pieces" is for.
+    expected = collision == "pieces" and repaired.mesh.diagnosis.watertight
+    solid = replace(solid, notes=(*repaired.done, *solid.notes, *(() if expected else repaired.remaining)))
+    for note in solid.notes:
+        _LOG.warning("%s: %s", os.fspath(path), note)
+    return solid if diagonal is None else solid.to_diagonal(diagonal)
+
+
+def shape_solid(
+    shape: Shape,
+    *,
+    diagonal: float = 0.04,
+    collision: str | None = None,
+    decomposition: DecompositionSettings | None = None,
+) -> Solid:
+    """Return a procedural shape (:func:`brainbench.stimuli.shapes.make`) as a solid.
+
+    Args:
+        shape: any member of a family.
+        diagonal: bounding-box diagonal [m]; the thesis used 40 mm.
+        collision: one of :data:`COLLISIONS`; None takes the convex parts that the family knows (``exact``), or
+            the ``hull`` where it knows none, and a note says which.
+        decomposition: how ``decomposition`` cuts; its defaults when None.
+
+    Raises:
+        UsageError: ``collision`` is unknown, or ``exact`` is asked of a concave shape without known parts.
+        DataError: the decomposition passed its limits.
+        MissingDependencyError: the decomposition needs a package that is not installed.
+    """
+    if collision is None:
+        collision = "exact" if shape.parts else "hull"
+    _check_collision(collision)
+    name = f"{shape.label}-{shape.seed}"
+    mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, name)
+    if collision != "exact" or not shape.parts:
+        return _touchable(mesh, collision, decomposition).to_diagonal(diagonal)
+    notes: tuple[str, ...] = ()
+    if len(shape.parts) > 1:
+        found = deviation(mesh, shape.parts, samples=1000)
+        notes = (
+            f"whiskers touch {len(shape.parts)} convex parts of the shape, which stand out from its mesh by at most"
+            f" {found.outward:.2%} and fall short of it by at most {found.inward:.2%} of its diagonal (sampled)",
+        )
+    parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
+    origin = {"mesh": mesh.content_hash, "collision": "exact"}
+    return Solid(name, parts, mesh, notes, origin).to_diagonal(diagonal)
+
+
+def _check_collision(collision: str) -> None:
     if collision not in COLLISIONS:
         raise unknown_name("collision geometry", collision, COLLISIONS)
-    mesh = load_mesh(path, unit=unit)
-    if diagonal is not None:
-        mesh = mesh.to_diagonal(diagonal)
-    pieces = (mesh,) if collision == "hull" else mesh.pieces()
+
+
+def _touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
+    """Make the parts of a solid from its mesh."""
+    if collision == "decomposition":
+        settings = settings or DecompositionSettings()
+        cut = decompose(mesh, settings)
+        origin = {"mesh": mesh.content_hash, **settings.config()}
+        return Solid(mesh.name, tuple(ConvexPart(piece.vertices) for piece in cut.pieces), mesh, cut.notes, origin)
+    pieces = mesh.pieces() if collision == "pieces" else (mesh,)
     hulls = [piece.hull() for piece in pieces]
-    notes = []
+    notes: tuple[str, ...] = ()
     if any(_is_concave(piece, hull) for piece, hull in zip(pieces, hulls, strict=True)):
+        if collision == "exact":
+            raise UsageError(
+                f"The mesh {mesh.name!r} is not convex, and no backend here collides with a concave surface as it is;"
+                " use collision = 'decomposition' (convex pieces, whose deviation is stated) or 'hull'"
+                " (its concavities filled)."
+            )
         what = "the mesh" if collision == "hull" else "its pieces"
-        notes.append(f"whiskers touch the convex hull of {what}: concavities are filled")
-    if not mesh.diagnosis.watertight:
-        notes.append(f"the mesh is not a closed solid: {mesh.diagnosis}")
-    for note in notes:
-        _LOG.warning("%s: %s", os.fspath(path), note)
-    return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, tuple(notes))
+        notes = (f"whiskers touch the convex hull of {what}: concavities are filled",)
+    return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, notes)
 
 
 def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:
@@ -264,4 +339,4 @@ def scale_part(part: Part, factor: float) -> Part:
 def _is_concave(mesh: Mesh, hull: Mesh) -> bool:
     if not mesh.diagnosis.watertight:
         return True
-    return bool(mesh.to_trimesh().volume < 0.999 * hull.to_trimesh().volume)
+    return mesh.volume < 0.999 * hull.volume

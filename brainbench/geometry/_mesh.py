@@ -32,6 +32,10 @@ class Diagnosis:
     """Connected pieces."""
     inconsistent: bool
     """Whether neighbouring triangles disagree on which side is out."""
+    duplicate_faces: int = 0
+    """Triangles that another triangle with the same corners repeats."""
+    inside_out: bool = False
+    """Whether the closed surface faces inward."""
 
     @property
     def watertight(self) -> bool:
@@ -43,7 +47,9 @@ class Diagnosis:
             f"{self.open_edges} open edges (not watertight)" if self.open_edges else "",
             f"{self.degenerate_faces} triangles without area" if self.degenerate_faces else "",
             f"{self.bodies} separate pieces" if self.bodies > 1 else "",
+            f"{self.duplicate_faces} duplicate triangles" if self.duplicate_faces else "",
             "triangles that disagree on inside and outside" if self.inconsistent else "",
+            "a surface that is inside out" if self.inside_out else "",
         ]
         return ", ".join(fault for fault in faults if fault) or "watertight"
 
@@ -91,13 +97,25 @@ class Mesh:
     def diagnosis(self) -> Diagnosis:
         """Faults of this mesh as a solid."""
         solid = self.to_trimesh()
-        counts = np.unique(solid.edges_sorted, axis=0, return_counts=True)[1]
+        edges = solid.edges_sorted.astype(np.int64)
+        counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
+        open_edges = int((counts != 2).sum())
+        consistent = bool(solid.is_winding_consistent)
+        distinct = len(np.unique(np.sort(self.faces, axis=1), axis=0))
         return Diagnosis(
-            open_edges=int((counts != 2).sum()),
+            open_edges=open_edges,
             degenerate_faces=int((solid.area_faces <= 1e-12 * self.diagonal**2).sum()),
-            bodies=int(solid.body_count),
-            inconsistent=not solid.is_winding_consistent,
+            bodies=len(np.unique(face_owners(self))),
+            inconsistent=not consistent,
+            duplicate_faces=len(self.faces) - distinct,
+            inside_out=open_edges == 0 and consistent and self.volume < 0,
         )
+
+    @cached_property
+    def volume(self) -> float:
+        """Signed volume inside a closed surface [m³]; negative when it is inside out, meaningless when open."""
+        a, b, c = np.moveaxis(self.vertices[self.faces] - self.bounds.mean(axis=0), 1, 0)
+        return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
 
     @cached_property
     def content_hash(self) -> str:
@@ -126,29 +144,11 @@ class Mesh:
         Raises:
             DataError: the mesh is flat and has no volume.
         """
-        from scipy.spatial import ConvexHull
-
-        spread = np.linalg.svd(self.vertices - self.vertices.mean(axis=0), compute_uv=False)
-        if spread[2] < 1e-9 * spread[0]:
-            raise DataError(f"The mesh {self.name!r} has no volume: its points lie in a plane.")
-        hull = ConvexHull(self.vertices)
-        faces = np.array(hull.simplices)
-        # Qhull orders the corners of a facet as it likes; its equations know the way out.
-        first, second, third = (self.vertices[faces[:, corner]] for corner in range(3))
-        inward = np.einsum("fi,fi->f", np.cross(second - first, third - first), hull.equations[:, :3]) < 0
-        faces[inward] = faces[inward][:, ::-1]
-        used, renumbered = np.unique(faces, return_inverse=True)
-        return Mesh(self.vertices[used], renumbered.reshape(-1, 3), self.name)
+        return convex_hull(self.vertices, self.name)
 
     def pieces(self) -> tuple[Mesh, ...]:
         """Return the connected pieces of the surface, in the order of their first faces."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
-        ends = self.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-        size = len(self.vertices)
-        links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
-        owner = connected_components(links, directed=False)[1][self.faces[:, 0]]
+        owner = face_owners(self)
         found = []
         for piece in dict.fromkeys(owner.tolist()):
             used, faces = np.unique(self.faces[owner == piece], return_inverse=True)
@@ -160,6 +160,38 @@ class Mesh:
         import trimesh
 
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
+    """Return the convex hull of points [n, 3] as a closed outward mesh.
+
+    Raises:
+        DataError: the points lie in a plane.
+    """
+    from scipy.spatial import ConvexHull
+
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if spread[2] < 1e-9 * spread[0]:
+        raise DataError(f"The mesh {name!r} has no volume: its points lie in a plane.")
+    hull = ConvexHull(points)
+    faces = np.array(hull.simplices)
+    # Qhull orders the corners of a facet as it likes; its equations know the way out.
+    first, second, third = (points[faces[:, corner]] for corner in range(3))
+    inward = np.einsum("fi,fi->f", np.cross(second - first, third - first), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return Mesh(points[used], renumbered.reshape(-1, 3), name)
+
+
+def face_owners(mesh: Mesh) -> NDArray[np.int64]:
+    """Number [F] of the connected piece that each face belongs to."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    size = len(mesh.vertices)
+    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
+    return connected_components(links, directed=False)[1][mesh.faces[:, 0]]
 
 
 def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:

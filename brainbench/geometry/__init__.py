@@ -1,0 +1,25 @@
+"""Triangle meshes: loading with units, diagnosis, repair, distances, hulls and convex decomposition. Metres inside."""
+
+from __future__ import annotations
+
+from brainbench.geometry._decomposition import Decomposition, DecompositionSettings, decompose
+from brainbench.geometry._distance import Deviation, deviation, hausdorff, winding_number
+from brainbench.geometry._mesh import UNITS, Diagnosis, Mesh, convex_hull, load_mesh
+from brainbench.geometry._repair import Repair, repair
+
+__all__ = [
+    "UNITS",
+    "Decomposition",
+    "DecompositionSettings",
+    "Deviation",
+    "Diagnosis",
+    "Mesh",
+    "Repair",
+    "convex_hull",
+    "decompose",
+    "deviation",
+    "hausdorff",
+    "load_mesh",
+    "repair",
+    "winding_number",
+]
