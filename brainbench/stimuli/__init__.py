@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 _LAZY = {
     "Fidelity": "fidelity",
-    "Frames": "scene",
+    "Frames": "frames",
     "Head": "scene",
     "PlacedObject": "objects",
     "Recipe": "scene_files",
@@ -67,12 +67,13 @@ __all__ = [
 if TYPE_CHECKING:
     from brainbench.stimuli.backends import get_backend
     from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.stimuli.frames import Frames
     from brainbench.stimuli.morphology import WhiskerArray
     from brainbench.stimuli.motion import Still, Translation, Whisking
     from brainbench.stimuli.objects import PlacedObject, Solid
     from brainbench.stimuli.readout import to_frame, to_grid
     from brainbench.stimuli.recipes import describe_recipe, get_recipe, list_recipes
-    from brainbench.stimuli.scene import Frames, Head, Scene
+    from brainbench.stimuli.scene import Head, Scene
     from brainbench.stimuli.scene_files import Recipe, load_scene
     from brainbench.stimuli.sets import Stimuli, load_stimuli
     from brainbench.stimuli.simulation import simulate

@@ -1,18 +1,24 @@
-"""Two views of a stimulus set: the network's input grid and a tidy table."""
+"""Views of a stimulus set: the network's input grid, a tidy table, and other axes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from brainbench.errors import DataError, UsageError, listing
+from brainbench.errors import DataError, UsageError, listing, unknown_name
+from brainbench.files import content_hash
+from brainbench.stimuli.frames import Axes
+from brainbench.stimuli.storage import hash_stimulus_set
 from brainbench.types import CHANNELS, GRID_SHAPE, check_stimulus_set
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
     from numpy.typing import NDArray
+
+ORIENTATION = "orientation"
+"""Variable [stimulus, time, whisker, 3, 3] with the rotations from the follicle's axes to the world."""
 
 
 def to_grid(
@@ -50,6 +56,42 @@ def to_grid(
     grid = np.zeros((stimuli, frames, channels, GRID_SHAPE[0] * GRID_SHAPE[1]), dtype=np.float32)
     grid[..., cells] = np.swapaxes(wrench, 2, 3)
     return grid.reshape(stimuli, frames // substeps, substeps * channels, *GRID_SHAPE)
+
+
+def to_axes(dataset: xr.Dataset, axes: Axes) -> xr.Dataset:
+    """Return the stimulus set in ``world`` or in ``follicle`` axes; the same set when it has them already.
+
+    The follicle's pose at each frame must be in the set: it is when the scenes were read with
+    ``Frames(axes="follicle")``. Moments stay about the base point. Clipped numbers are turned as they are.
+
+    Raises:
+        UsageError: the axes are unknown, or the set does not hold the poses.
+    """
+    if axes not in get_args(Axes):
+        raise unknown_name("axes", str(axes), get_args(Axes))
+    if axes == dataset.attrs.get("axes", "world"):
+        return dataset
+    if ORIENTATION not in dataset:
+        raise UsageError(
+            "This stimulus set holds no follicle poses, so its axes cannot be changed; simulate it with "
+            "Frames(axes='follicle'), which keeps them."
+        )
+    rotation = dataset[ORIENTATION].values
+    turned = dataset.copy()
+    turned["wrench"] = dataset["wrench"].copy(
+        data=turn(dataset["wrench"].values, rotation if axes == "world" else np.swapaxes(rotation, -1, -2))
+    )
+    turned.attrs["axes"] = axes
+    turned.attrs["frame"] = f"{axes} axes; action of the whisker on its base, about the base point"
+    turned.attrs["config_hash"] = content_hash(dataset.attrs.get("config_hash", ""), axes)
+    turned.attrs["content_hash"] = hash_stimulus_set(turned)
+    return turned
+
+
+def turn(wrench: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.floating]:
+    """Turn forces and moments [..., 6] by the matrices ``rotation`` [..., 3, 3]; keeps the number type."""
+    vectors = wrench.reshape(*wrench.shape[:-1], 2, 3)
+    return np.einsum("...ij,...kj->...ki", rotation, vectors).reshape(wrench.shape).astype(wrench.dtype)
 
 
 def to_frame(dataset: xr.Dataset) -> pd.DataFrame:

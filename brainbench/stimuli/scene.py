@@ -6,15 +6,14 @@ the mean base point, x right, y rostral, z dorsal), placed in the world by :clas
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.errors import UsageError
-from brainbench.files import to_plain
-from brainbench.stimuli.backends.protocol import Job
+from brainbench.stimuli.backends.protocol import Job, base_rotation
+from brainbench.stimuli.frames import Frames
 from brainbench.stimuli.motion import ArrayFollicle, Still, Translation, Whisking
 from brainbench.stimuli.objects import PlacedObject, euler_matrix
 
@@ -48,47 +47,6 @@ class Head:
             "rotation": list(self.rotation),
             "motion": self.motion.config(),
         }
-
-
-@dataclass(frozen=True)
-class Frames:
-    """When forces are read.
-
-    The default reads 110 instantaneous frames, 9 ms apart, the first at 1 ms, as the published pipeline
-    does (every ninth sample of a 1 kHz simulation). Whatever vibrates above 1/(2·interval) = 56 Hz then
-    aliases, and a sliding tip does: the RDM of the six Rodgers stimuli at the presets ``balanced`` and
-    ``accurate`` correlates by .90. With ``average`` = 18, each frame the mean of 18 readings, by .995.
-    """
-
-    first: float = 0.001
-    """Time of the first frame [s]; the whiskers start at rest at t = 0."""
-    interval: float = 0.009
-    """Time between frames [s]."""
-    count: int = 110
-    average: int = 1
-    """Readings, evenly spread over the interval that begins at the frame's time, whose mean a frame is."""
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.first) and self.first >= 0 and math.isfinite(self.interval) and self.interval > 0):
-            raise UsageError(
-                "The first frame lies at 0 s or later and the interval is positive;"
-                f" received {self.first!r} s and {self.interval!r} s."
-            )
-        for name in ("count", "average"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise UsageError(f"{name} of the frames must be a whole number of at least 1; received {value!r}.")
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Frame times [count] (s)."""
-        return np.asarray(self.first + self.interval * np.arange(self.count), dtype=np.float64)
-
-    @property
-    def readings(self) -> NDArray[np.float64]:
-        """Times [count · average] (s) at which the simulation is read."""
-        within = self.interval / self.average * np.arange(self.average)
-        return (self.times[:, None] + within).reshape(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +84,12 @@ class Scene:
             for mount in self.array
         ]
 
+    def orientations(self) -> NDArray[np.float64]:
+        """Rotations [time, whisker, 3, 3] from each whisker's base frame to the world at the frame times."""
+        times = self.frames.times
+        bases = [ArrayFollicle(mount, self.whisking).pose(times)[1] for mount in self.array]
+        return self.head.matrix @ base_rotation(np.stack(bases, axis=1))
+
     def config(self) -> dict[str, Any]:
         """Plain values that determine the result, for hashing and for the data set's attributes."""
         return {
@@ -133,5 +97,5 @@ class Scene:
             "objects": [item.config() for item in self.objects],
             "whisking": self.whisking.config(),
             "head": self.head.config(),
-            "frames": to_plain(self.frames),
+            "frames": self.frames.config(),
         }

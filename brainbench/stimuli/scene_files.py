@@ -26,6 +26,8 @@
     interval_ms = 9
     count = 110
     average = 18                 # readings per frame; 1 = instantaneous
+    # instead of interval_ms: rate_hz = 1000. lowpass_hz = 50 filters the readings instead of averaging them;
+    # phase = "zero" | "causal". axes = "world" | "follicle". clip_newton = 1 (moments: 1 mm times that)
 
     [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
     label = "pole"
@@ -52,6 +54,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.stimuli.frames import Frames
 from brainbench.stimuli.morphology import SPECIES, WhiskerArray
 from brainbench.stimuli.motion import ROTATIONS, Still, Translation, Whisking
 from brainbench.stimuli.objects import (
@@ -64,7 +67,7 @@ from brainbench.stimuli.objects import (
     rodgers_solid,
     sphere,
 )
-from brainbench.stimuli.scene import Frames, Head, Scene
+from brainbench.stimuli.scene import Head, Scene
 from brainbench.stimuli.sweeps import SweepScenes
 
 _MM = 1e-3
@@ -193,11 +196,23 @@ def _whisking(table: _Table) -> Still | Whisking:
 
 def _frames(table: _Table) -> Frames:
     usual = Frames()
+    interval = table.take("interval_ms", _number(_MM), None)
+    rate = table.take("rate_hz", _number(1.0), None)
+    if interval is not None and rate is not None:
+        raise UsageError("[frames] takes interval_ms or rate_hz, not both.")
+    if rate is not None:
+        if rate <= 0:
+            raise UsageError(f"'rate_hz' of [frames] must be positive; received {rate:g}.")
+        interval = 1 / rate
     frames = Frames(
         first=table.take("first_ms", _number(_MM), usual.first),
-        interval=table.take("interval_ms", _number(_MM), usual.interval),
+        interval=usual.interval if interval is None else interval,
         count=table.take("count", _whole, usual.count),
         average=table.take("average", _whole, usual.average),
+        lowpass=table.take("lowpass_hz", _number(1.0), usual.lowpass),
+        phase=table.take("phase", _text, usual.phase),
+        axes=table.take("axes", _text, usual.axes),
+        clip=table.take("clip_newton", _number(1.0), usual.clip),
     )
     table.finish()
     return frames

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
@@ -18,6 +19,8 @@ from brainbench.stimuli._plan import plan
 from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.frames import clip_wrenches
+from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scene import Scene
 from brainbench.stimuli.storage import hash_stimulus_set, read_stimulus_set, write_stimulus_set
 from brainbench.types import CHANNELS, check_stimulus_set
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
     from brainbench.stimuli.backends.protocol import Backend, Trace
 
 _LOG = logging.getLogger(__name__)
+
+_PACKAGES = {"bullet": "pybullet", "mujoco": "mujoco-core"}
 
 Progress = Callable[[int, int, str], None]
 """Called with the whiskers done, the whiskers in all, and what is being done."""
@@ -56,13 +61,16 @@ def simulate(
     Returns:
         The data set of :func:`brainbench.types.check_stimulus_set`: ``wrench`` [stimulus, time,
         whisker, channel] (float32; N, N·m; action of the whisker on its base, about the base point,
-        **world** axes) with ``contact`` [stimulus, time, whisker], ``contact_arc`` (m along the
-        whisker, NaN without contact), and ``penetration`` (m, deepest overlap; a poor contact when
-        large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker became
-        ``unstable`` its numbers are NaN. The attribute ``config_hash`` names
-        what was asked for and is equal on every machine; ``content_hash`` names the numbers, whose
-        last digits depend on the processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads from
-        the set what was simulated, shared and left out.
+        world axes or the follicle's, as the frames say) with ``contact`` [stimulus, time, whisker],
+        ``contact_arc`` (m along the whisker, NaN without contact), ``first_contact`` (s, when the first
+        reading with contact was taken; NaN without), ``penetration`` (m, deepest overlap; a poor contact
+        when large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker became
+        ``unstable`` its numbers are NaN. Attributes say how frames were made (``readout``), their ``axes``
+        and, when clipping was asked for, how many components it changed in each stimulus (``clipped``).
+        The attribute ``config_hash`` names what was asked for and is equal on every machine;
+        ``content_hash`` names the numbers, whose last digits depend on the processor.
+        :meth:`brainbench.stimuli.explain.Explanation.of` reads from the set what was simulated, shared and
+        left out.
 
     Raises:
         UsageError: the scenes do not fit together, or a name is unknown.
@@ -131,11 +139,15 @@ def _assemble(
     grid = ("stimulus", "whisker")
     frames = scenes[0].frames
     wrench = np.stack([_to_world(scene, row) for scene, row in zip(scenes, traces, strict=True)])
+    orientation = None
+    if frames.axes == "follicle":
+        orientation = np.stack([scene.orientations() for scene in scenes])
+        wrench = turn(wrench, np.swapaxes(orientation, -1, -2))
+    wrench, clipped = (wrench, None) if frames.clip is None else clip_wrenches(wrench, frames.clip)
 
     def readings(name: str) -> NDArray[Any]:
         """[stimulus, frame, reading, whisker]."""
-        stacked = np.stack([np.stack([getattr(trace, name) for trace in row], axis=1) for row in traces])
-        return stacked.reshape(len(scenes), frames.count, frames.average, len(array))
+        return np.stack([frames.split(np.stack([getattr(trace, name) for trace in row], axis=1)) for row in traces])
 
     dataset = xr.Dataset(
         {
@@ -145,6 +157,11 @@ def _assemble(
                 ("stimulus", "time", "whisker"),
                 _mean_of_known(readings("contact_arc")).astype(np.float32),
                 {"units": "m", "long_name": "arc length of the force-weighted contact point"},
+            ),
+            "first_contact": (
+                grid,
+                np.array([[_first(trace.contact, frames.readings) for trace in row] for row in traces]),
+                {"units": "s", "long_name": "time of the first reading with contact"},
             ),
             "penetration": (
                 grid,
@@ -171,9 +188,15 @@ def _assemble(
             "seed": 0,
             "backend": backend,
             "version": __version__,
-            "frame": "world axes; action of the whisker on its base, about the base point",
+            "frame": f"{frames.axes} axes; action of the whisker on its base, about the base point",
+            "axes": frames.axes,
+            "readout": frames.describe(),
         },
     )
+    if orientation is not None:
+        dataset[ORIENTATION] = (("stimulus", "time", "whisker", "row_axis", "col_axis"), orientation)
+    if clipped is not None:
+        dataset.attrs["clipped"] = _count_clipped(dataset, clipped, frames.clip)
     dataset.attrs["config_hash"] = _config_hash(scenes, fidelity, backend)
     dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
     _warn_unstable(dataset)
@@ -181,11 +204,25 @@ def _assemble(
 
 
 def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
-    """Average the readings of each frame and turn the wrenches [time, whisker, channel] to world axes."""
+    """Make frames of the readings and turn the wrenches [time, whisker, channel] to world axes."""
     frames = scene.frames
-    means = [trace.wrench.reshape(frames.count, frames.average, 6).mean(axis=1) for trace in traces]
-    vectors = np.stack(means, axis=1).reshape(frames.count, len(traces), 2, 3)
+    vectors = np.stack([frames.reduce(trace.wrench) for trace in traces], axis=1)
+    vectors = vectors.reshape(frames.count, len(traces), 2, 3)
     return (vectors @ scene.head.matrix.T).reshape(frames.count, len(traces), 6).astype(np.float32)
+
+
+def _first(contact: NDArray[np.bool_], times: NDArray[np.float64]) -> float:
+    """Time (s) of the first reading [n] with contact; NaN without."""
+    return float(times[np.argmax(contact)]) if contact.any() else math.nan
+
+
+def _count_clipped(dataset: xr.Dataset, clipped: NDArray[np.bool_], limit: float | None) -> str:
+    """JSON of how many force and moment components were clipped in each stimulus."""
+    counts = {
+        str(label): {"force": int(part[..., :3].sum()), "moment": int(part[..., 3:].sum())}
+        for label, part in zip(dataset["stimulus"].values, clipped, strict=True)
+    }
+    return to_json({"limit_N": limit, "components": counts}, indent=None)
 
 
 def _mean_of_known(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -227,7 +264,8 @@ def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> s
 def _cache_path(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> Path:
     from importlib import metadata
 
-    engine = metadata.version("mujoco-core") if backend == "mujoco" else ""
+    package = _PACKAGES.get(backend)
+    engine = metadata.version(package) if package else ""
     key = content_hash(_config_hash(scenes, fidelity, backend), engine, _code_hash(), length=24)
     return cache_dir("stimuli") / f"{key}.h5"
 

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.stimuli.frames import Frames
 from brainbench.stimuli.motion import ROTATIONS, Still, Translation
 from brainbench.stimuli.obstacle import Cylinder
 from brainbench.stimuli.scene_files import load_scene
@@ -157,3 +158,16 @@ def test_a_file_that_is_not_toml_is_refused(tmp_path):
 def test_a_missing_scene_file_is_named(tmp_path):
     with pytest.raises(DataFileNotFoundError, match=r"no scene file .*gone\.toml"):
         load_scene(tmp_path / "gone.toml")
+
+
+def test_the_frames_table_sets_rate_filter_axes_and_clip(tmp_path):
+    table = "rate_hz = 100\naverage = 10\nlowpass_hz = 40\nphase = 'causal'\naxes = 'follicle'\nclip_newton = 1"
+    frames = load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", table))).scenes[0].frames
+    assert frames == Frames(0.0, 0.01, 10, 10, lowpass=40.0, phase="causal", axes="follicle", clip=1.0)
+    both = POLE.replace("interval_ms = 1", "interval_ms = 1\nrate_hz = 1000")
+    with pytest.raises(UsageError, match="interval_ms or rate_hz, not both"):
+        load_scene(_write(tmp_path, both))
+    with pytest.raises(UsageError, match=r"'rate_hz' of .frames. must be positive"):
+        load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "rate_hz = 0")))
+    with pytest.raises(UsageError, match="did you mean 'lowpass_hz'"):
+        load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "lowpas_hz = 40")))
