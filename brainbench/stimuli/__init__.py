@@ -14,6 +14,7 @@ _LAZY = {
     "Head": "scene",
     "PlacedObject": "objects",
     "Recipe": "scene_files",
+    "Recorded": "trajectory",
     "Scene": "scene",
     "Solid": "objects",
     "Still": "motion",
@@ -29,6 +30,7 @@ _LAZY = {
     "list_recipes": "recipes",
     "load_scene": "scene_files",
     "load_stimuli": "sets",
+    "load_trajectory": "trajectory",
     "read_stimulus_set": "storage",
     "simulate": "simulation",
     "to_frame": "readout",
@@ -42,6 +44,7 @@ __all__ = [
     "Head",
     "PlacedObject",
     "Recipe",
+    "Recorded",
     "Scene",
     "Solid",
     "Still",
@@ -57,6 +60,7 @@ __all__ = [
     "list_recipes",
     "load_scene",
     "load_stimuli",
+    "load_trajectory",
     "read_stimulus_set",
     "simulate",
     "to_frame",
@@ -79,6 +83,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.storage import read_stimulus_set, write_stimulus_set
     from brainbench.stimuli.sweeps import SweepGrid
+    from brainbench.stimuli.trajectory import Recorded, load_trajectory
     from brainbench.stimuli.whisker import Whisker
 
 

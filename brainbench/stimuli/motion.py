@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.stimuli.morphology import MountedWhisker
+    from brainbench.stimuli.trajectory import Recorded
 
 Vector = tuple[float, float, float]
 
@@ -26,6 +27,11 @@ class Rotations:
     name: str
     elevation: tuple[float, float, float, float, float]
     torsion: tuple[float, float, float, float, float]
+
+    def rates(self, mount: MountedWhisker) -> Vector:
+        """Return the change of (θ, φ, ζ) per radian of protraction; the left side mirrors the right."""
+        mirror = 1.0 if mount.side == "right" else -1.0
+        return mirror, self.elevation[mount.row], mirror * self.torsion[mount.row]
 
 
 ROTATIONS = {
@@ -104,9 +110,7 @@ class Whisking:
     def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (θ, φ, ζ) [n, 3] (rad) of one whisker."""
         azimuth = self.azimuth(times)[:, None]
-        mirror = 1.0 if mount.side == "right" else -1.0
-        rate = [mirror, self.rotations.elevation[mount.row], mirror * self.rotations.torsion[mount.row]]
-        return np.array(mount.angles) + azimuth * np.array(rate)
+        return np.array(mount.angles) + azimuth * np.array(self.rotations.rates(mount))
 
     def config(self) -> dict[str, Any]:
         """Plain values for hashing and display."""
@@ -152,7 +156,7 @@ class ArrayFollicle:
     """Trajectory of one whisker base in the frame in which its array stood at t = 0."""
 
     mount: MountedWhisker
-    whisking: Still | Whisking = field(default_factory=Still)
+    whisking: Still | Whisking | Recorded = field(default_factory=Still)
     travel: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Displacement of the head [n, 3] (m) at times [n]; None when it stands still."""
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.stimuli.morphology import WhiskerArray
+    from brainbench.stimuli.trajectory import Recorded
 
 Vector = tuple[float, float, float]
 
@@ -56,7 +57,7 @@ class Scene:
     label: str
     array: WhiskerArray
     objects: tuple[PlacedObject, ...] = ()
-    whisking: Still | Whisking = field(default_factory=Whisking)
+    whisking: Still | Whisking | Recorded = field(default_factory=Whisking)
     head: Head = field(default_factory=Head)
     frames: Frames = field(default_factory=Frames)
 

@@ -14,12 +14,13 @@
     position_mm = [0, 0, 0]
     rotation_deg = [0, 0, 0]
 
-    [whisking]                   # kind = "sinusoid" | "still"
+    [whisking]                   # kind = "sinusoid" | "still" | "recorded"
     frequency_hz = 20
     protraction_deg = 30
     retraction_deg = 10
     onset_ms = 50
     rotations = "knutsen"
+    # recorded: path = "whisking.csv", rate_hz = 1000, layout = "rat-60", start_deg = -10, initial_path = "angles.csv"
 
     [frames]
     first_ms = 1
@@ -40,7 +41,10 @@
 
 ``[[object]]`` at the top level stands in every scene. Other shapes: ``sphere`` (``radius_mm``), ``box``
 (``size_mm``), ``capsule`` (``radius_mm``, ``length_mm``), ``rodgers`` (``diagonal_mm``, ``segments``) and
-``mesh`` (``path`` relative to the file, ``unit``, ``diagonal_mm``, ``collision`` = "hull" | "pieces").
+``mesh`` (``path`` relative to the file, ``unit``, ``diagonal_mm``, ``collision`` = "hull" | "exact" | "pieces" |
+"decomposition") and ``family:NAME`` for a procedural shape (``seed``, ``diagonal_mm``, ``detail``, ``collision``;
+names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coacd" | "vhacd", ``threshold`` and
+``most_pieces``.
 """
 
 from __future__ import annotations
@@ -51,9 +55,11 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brainbench.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.geometry import DecompositionSettings
+from brainbench.stimuli import shapes
 from brainbench.stimuli.frames import Frames
 from brainbench.stimuli.morphology import SPECIES, WhiskerArray
 from brainbench.stimuli.motion import ROTATIONS, Still, Translation, Whisking
@@ -65,12 +71,19 @@ from brainbench.stimuli.objects import (
     cylinder,
     mesh_solid,
     rodgers_solid,
+    shape_solid,
     sphere,
 )
 from brainbench.stimuli.scene import Head, Scene
 from brainbench.stimuli.sweeps import SweepScenes
 
+if TYPE_CHECKING:
+    from brainbench.stimuli.motion import Rotations
+    from brainbench.stimuli.trajectory import Recorded
+
+_WHISKINGS = ("sinusoid", "still", "recorded")
 _MM = 1e-3
+_FAMILY = "family:"
 _NOTHING: Mapping[str, Any] = {}
 
 
@@ -146,7 +159,7 @@ def _scene(
         label=label,
         array=array,
         objects=tuple(_object(_Table(f"[[object]] of scene {label!r}", item), folder) for item in objects),
-        whisking=_whisking(_Table("[whisking]", merged["whisking"])),
+        whisking=_whisking(_Table("[whisking]", merged["whisking"]), folder),
         head=_head(_Table("[head]", merged["head"])),
         frames=_frames(_Table("[frames]", shared["frames"])),
     )
@@ -175,10 +188,10 @@ def _head(table: _Table) -> Head:
     return head
 
 
-def _whisking(table: _Table) -> Still | Whisking:
+def _whisking(table: _Table, folder: Path) -> Still | Whisking | Recorded:
     kind = table.take("kind", _text, "sinusoid")
-    if kind not in ("sinusoid", "still"):
-        raise unknown_name("kind of whisking", kind, ("sinusoid", "still"))
+    if kind not in _WHISKINGS:
+        raise unknown_name("kind of whisking", kind, _WHISKINGS)
     usual = Whisking()
     name = table.take("rotations", _text, usual.rotations.name)
     if name not in ROTATIONS:
@@ -190,8 +203,23 @@ def _whisking(table: _Table) -> Still | Whisking:
         onset=table.take("onset_ms", _number(_MM), usual.onset),
         rotations=ROTATIONS[name],
     )
+    recorded = _recorded(table, folder, ROTATIONS[name]) if kind == "recorded" else None
     table.finish()
-    return whisking if kind == "sinusoid" else Still()
+    return recorded or (whisking if kind == "sinusoid" else Still())
+
+
+def _recorded(table: _Table, folder: Path, rotations: Rotations) -> Recorded:
+    from brainbench.stimuli.trajectory import Recorded, load_initial_angles, load_trajectory
+
+    layout = table.take("layout", _text, None)
+    rate = table.take("rate_hz", _number(1.0), 1000.0)
+    initial = table.take("initial_path", _text, None)
+    return Recorded(
+        load_trajectory(folder / table.take("path", _text), layout=layout, rate=rate),
+        start=table.take("start_deg", _number(math.pi / 180), 0.0),
+        rotations=rotations,
+        initial={} if initial is None else load_initial_angles(folder / initial, layout=layout),
+    )
 
 
 def _frames(table: _Table) -> Frames:
@@ -228,10 +256,10 @@ def _motion(table: _Table) -> Still | Translation:
 
 def _object(table: _Table, folder: Path) -> PlacedObject:
     shape = table.take("shape", _text)
-    if shape not in _SHAPES:
-        raise unknown_name("shape", shape, _SHAPES)
+    if shape not in _SHAPES and not shape.startswith(_FAMILY):
+        raise unknown_name("shape", shape, [*_SHAPES, f"{_FAMILY}NAME"])
     placed = PlacedObject(
-        solid=_SHAPES[shape](table, folder),
+        solid=_family(table, shape.removeprefix(_FAMILY)) if shape not in _SHAPES else _SHAPES[shape](table, folder),
         position=table.take("position_mm", _vector(_MM), (0.0, 0.0, 0.0)),
         rotation=table.take("rotation_deg", _vector(math.pi / 180), (0.0, 0.0, 0.0)),
         motion=_motion(table),
@@ -248,6 +276,26 @@ def _mesh(table: _Table, folder: Path) -> Solid:
         unit=table.take("unit", _text),
         diagonal=table.take("diagonal_mm", _length, None),
         collision=table.take("collision", _text, "hull"),
+        decomposition=_decomposition(table),
+    )
+
+
+def _family(table: _Table, name: str) -> Solid:
+    shape = shapes.make(name, table.take("seed", _whole, 0), detail=table.take("detail", _whole, 4_000))
+    return shape_solid(
+        shape,
+        diagonal=table.take("diagonal_mm", _length, 0.04),
+        collision=table.take("collision", _text, None),
+        decomposition=_decomposition(table),
+    )
+
+
+def _decomposition(table: _Table) -> DecompositionSettings:
+    usual = DecompositionSettings()
+    return DecompositionSettings(
+        method=table.take("method", _text, usual.method),  # type: ignore[arg-type]
+        threshold=table.take("threshold", _number(1.0), usual.threshold),
+        most_pieces=table.take("most_pieces", _whole, usual.most_pieces),
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from brainbench.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
 from brainbench.files import content_hash
 from brainbench.stimuli.readout import to_grid
-from brainbench.stimuli.recipes import get_recipe, list_recipes
+from brainbench.stimuli.recipes import get_recipe, is_recipe, list_recipes
 from brainbench.stimuli.selection import match_whiskers
 from brainbench.stimuli.storage import hash_stimulus_set, read_stimulus_set
 from brainbench.types import check_stimulus_set
@@ -78,7 +78,7 @@ def load_stimuli(
         return source if whiskers == "all" else load_stimuli(_dataset_of(source), whiskers=whiskers)
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
-    if isinstance(source, str) and source in list_recipes():
+    if isinstance(source, str) and is_recipe(source):
         recipe = get_recipe(source, whiskers=whiskers)
         return _from_recipe(recipe, fidelity, backend, progress, cache)
     path = Path(source)

@@ -14,7 +14,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import numpy as np
 
@@ -229,18 +229,21 @@ class SweepScenes(Sequence[Scene]):
         whiskers: str = "all",
     ) -> None:
         """Take ``objects`` as solids, or as a mapping from names to solids or to functions that load them."""
-        if not isinstance(objects, Mapping):
+        named: dict[str, Solid | Callable[[], Solid]]
+        if isinstance(objects, Mapping):
+            named = dict(cast("Mapping[str, Solid | Callable[[], Solid]]", objects))
+        else:
             solids = list(objects)
             names = [solid.name for solid in solids]
             if len(set(names)) < len(names):
                 twice = sorted({name for name in names if names.count(name) > 1})
                 raise UsageError(f"Several objects are called {listing(twice)}; give a mapping from names to objects.")
-            objects = dict(zip(names, solids, strict=True))
-        if not objects:
+            named = {solid.name: solid for solid in solids}
+        if not named:
             raise UsageError("Sweeps need at least one object to move past the whiskers.")
         self.grid = grid
         self.array = default_array(grid.species).select(whiskers)
-        self._objects = dict(objects)
+        self._objects = named
         self._names = tuple(self._objects)
         self._last: tuple[str, Solid] | None = None
 

@@ -8,9 +8,11 @@ from brainbench.stimuli.backends.protocol import base_rotation
 from brainbench.stimuli.objects import box, euler_matrix, rodgers_solid
 from brainbench.stimuli.recipes import describe_recipe, get_recipe, list_recipes
 from brainbench.stimuli.sweeps import GRIDS
+from brainbench.stimuli.trajectory import Trajectory
 
 LABELS = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 NEEDS = {name: {"objects": [box((0.01, 0.02, 0.03))]} for name in GRIDS}
+NEEDS["rodgers-recorded"] = {"trajectory": Trajectory(("RC2",), np.zeros((1, 1000, 3))), "whiskers": "C*"}
 
 
 def _unbent_hits(scene):
