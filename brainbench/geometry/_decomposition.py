@@ -32,6 +32,8 @@ METHODS = {
 }
 """Method → module, distribution and extra that it needs, and what it is for."""
 
+_OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Unable to allocate", "allocate memory", "Thread creation failed")
+
 REDUCTION = 5
 """A mesh of too many triangles is simplified to the limit over this: CoACD's time grows with their number."""
 
@@ -198,7 +200,7 @@ def _run(mesh: Mesh, settings: DecompositionSettings) -> list[np.ndarray]:
 
 def _failure(mesh: Mesh, settings: DecompositionSettings, status: int, errors: str) -> str:
     what = f"The decomposition of {mesh.name!r} ({len(mesh.faces):,} triangles)"
-    if any(word in errors for word in ("bad_alloc", "MemoryError", "Unable to allocate", "allocate memory")):
+    if any(word in errors for word in _OUT_OF_MEMORY):
         return f"{what} needed more than {settings.memory / 1e9:.3g} GB of memory and was stopped; {_advice(settings)}."
     last = (errors.strip().splitlines() or ["no message"])[-1]
     return f"{what} by {settings.method} failed with exit status {status} ({last[:200]}); {_advice(settings)}."
