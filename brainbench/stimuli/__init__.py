@@ -9,9 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _LAZY = {
+    "Animal": "scene",
     "Fidelity": "fidelity",
     "Frames": "frames",
     "Head": "scene",
+    "Path": "motion",
     "PlacedObject": "objects",
     "Recipe": "scene_files",
     "Recorded": "trajectory",
@@ -39,9 +41,11 @@ _LAZY = {
 }
 
 __all__ = [
+    "Animal",
     "Fidelity",
     "Frames",
     "Head",
+    "Path",
     "PlacedObject",
     "Recipe",
     "Recorded",
@@ -73,11 +77,11 @@ if TYPE_CHECKING:
     from brainbench.stimuli.fidelity import Fidelity
     from brainbench.stimuli.frames import Frames
     from brainbench.stimuli.morphology import WhiskerArray
-    from brainbench.stimuli.motion import Still, Translation, Whisking
+    from brainbench.stimuli.motion import Path, Still, Translation, Whisking
     from brainbench.stimuli.objects import PlacedObject, Solid
     from brainbench.stimuli.readout import to_frame, to_grid
     from brainbench.stimuli.recipes import describe_recipe, get_recipe, list_recipes
-    from brainbench.stimuli.scene import Head, Scene
+    from brainbench.stimuli.scene import Animal, Head, Scene
     from brainbench.stimuli.scene_files import Recipe, load_scene
     from brainbench.stimuli.sets import Stimuli, load_stimuli
     from brainbench.stimuli.simulation import simulate

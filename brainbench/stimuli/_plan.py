@@ -40,10 +40,11 @@ def plan(scenes: Sequence[Scene]) -> Plan:
     places, reaches = [], []
     for scene in scenes:
         row, near = [], []
-        for mount, job in zip(scene.array, scene.jobs(), strict=True):
+        owners = [part for part in scene.split() for _ in part.array]
+        for mount, owner, job in zip(scene.mounts, owners, scene.jobs(), strict=True):
             reach = reach_of(job)
-            travels = not isinstance(scene.head.motion, Still)
-            seen = scene.config() if travels or reach else {"whisking": scene.whisking.config()}
+            travels = not isinstance(owner.head.motion, Still)
+            seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
             key = content_hash(mount, {**seen, "label": None})
             if key not in distinct:
                 distinct[key] = len(jobs)

@@ -163,7 +163,7 @@ def explain(
     runs = sum(len(places) for places in plan.places)
     return Explanation(
         stimuli=len(scenes),
-        whiskers=len(scenes[0].array),
+        whiskers=len(scenes[0].names),
         links=(min(counts), max(counts)),
         simulated=simulated,
         shared=runs - simulated - silent,
@@ -173,7 +173,7 @@ def explain(
         pairs=pairs,
         pairs_in_full=pairs_in_full,
         out_of_reach={
-            scene.label: tuple(name for name, reach in zip(scene.array.names, reaches, strict=True) if not reach)
+            scene.label: tuple(name for name, reach in zip(scene.names, reaches, strict=True) if not reach)
             for scene, reaches in zip(scenes, plan.reaches, strict=True)
         },
     )

@@ -151,6 +151,78 @@ class Translation:
         return {"kind": "translation", "velocity": list(self.velocity), "onset": self.onset}
 
 
+@dataclass(frozen=True)
+class Path:
+    """Motion of a body through keyframes: translation and rotation, such as those of a tracked head.
+
+    Positions follow a natural cubic spline and orientations a rotation spline, so velocity and acceleration are
+    continuous, angular ones too. The body moves off with the velocity of the first stretch; repeat the first
+    keyframe to start from rest.
+
+    Raises:
+        UsageError: the lists differ in length, times do not ascend from 0, or the first keyframe is displaced.
+    """
+
+    times: tuple[float, ...]
+    """When [s], ascending from 0, at least two."""
+    displacements: tuple[Vector, ...]
+    """How far the body's origin has moved since t = 0 [m, world]."""
+    rotations: tuple[Vector, ...]
+    """How far the body has turned about its origin since t = 0: angles [rad] about the world's x, then y, then z."""
+
+    def __post_init__(self) -> None:
+        for name in ("displacements", "rotations"):
+            rows = tuple(tuple(map(float, row)) for row in getattr(self, name))
+            if len(rows) != len(self.times) or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in rows):
+                raise UsageError(
+                    f"A path needs three finite numbers of {name} for each of its {len(self.times)} times."
+                )
+            if any(rows[0]):
+                raise UsageError(f"A path starts without {name}: they count from t = 0; received {rows[0]}.")
+            object.__setattr__(self, name, rows)
+        times = np.array(self.times, dtype=float)
+        if len(times) < 2 or times[0] != 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise UsageError(f"The times of a path ascend from 0 and are at least two; received {self.times!r}.")
+        object.__setattr__(self, "times", tuple(times.tolist()))
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the origin has moved, [n, 3] (m, world).
+
+        Raises:
+            UsageError: a time lies beyond the last keyframe.
+        """
+        from scipy.interpolate import CubicSpline
+
+        return CubicSpline(self.times, self.displacements, bc_type="natural")(self._within(times))
+
+    def turn(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the body has turned, rotation matrices [n, 3, 3] in world axes.
+
+        Raises:
+            UsageError: a time lies beyond the last keyframe.
+        """
+        from scipy.spatial.transform import Rotation, RotationSpline
+
+        spline = RotationSpline(self.times, Rotation.from_euler("xyz", self.rotations))
+        return spline(self._within(times)).as_matrix()
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        from brainbench.files import to_plain
+
+        return {"kind": "path", **to_plain(self)}
+
+    def _within(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        times = np.asarray(times, dtype=float)
+        # A simulation ends a step or two behind its last reading.
+        if times.size and times.max() > self.times[-1] + 0.01:
+            raise UsageError(
+                f"The path ends at {self.times[-1]:g} s; the scene needs it at {times.max():g} s: add keyframes or "
+                "read fewer frames."
+            )
+        return times
+
+
 @dataclass(frozen=True, eq=False)
 class ArrayFollicle:
     """Trajectory of one whisker base in the frame in which its array stood at t = 0."""
@@ -159,14 +231,35 @@ class ArrayFollicle:
     whisking: Still | Whisking | Recorded = field(default_factory=Still)
     travel: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Displacement of the head [n, 3] (m) at times [n]; None when it stands still."""
+    turn: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    """Rotation of the head [n, 3, 3] about the origin of the array at times [n]; None when it does not turn."""
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions [n, 3] (m) and Euler angles (θ, φ, ζ) [n, 3] (rad)."""
+        """Return positions [n, 3] (m) and Euler angles (θ, φ, ζ) [n, 3] (rad).
+
+        Raises:
+            UsageError: the head turns a whisker upright, where these angles lose their meaning.
+        """
         times = np.asarray(times, dtype=float)
         position = np.tile(np.array(self.mount.position), (len(times), 1))
+        angles = self.whisking.angles(self.mount, times)
+        if self.turn is not None:
+            position = self.turn(times) @ np.array(self.mount.position)
+            angles = self._turned(self.turn, times)
         if self.travel is not None:
             position = position + self.travel(times)
-        return position, self.whisking.angles(self.mount, times)
+        return position, angles
+
+    def _turned(
+        self, turn: Callable[[NDArray[np.float64]], NDArray[np.float64]], times: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        from brainbench.stimuli._rotation import follow_angles
+        from brainbench.stimuli.backends.protocol import base_rotation
+
+        first = self.whisking.angles(self.mount, np.zeros(1))[0]
+        return follow_angles(
+            lambda t: turn(t) @ base_rotation(self.whisking.angles(self.mount, t)), times, first, self.mount.name
+        )
 
 
 def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float64]:

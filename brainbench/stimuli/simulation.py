@@ -79,7 +79,7 @@ def simulate(
     fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
     fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
     engine = get_backend(backend) if isinstance(backend, str) else backend
-    path = _cache_path(chosen, fidelity, engine.name) if cache and isinstance(backend, str) else None
+    path = cache_path(chosen, fidelity, engine.name) if cache and isinstance(backend, str) else None
     if path is not None and path.exists():
         started = time.perf_counter()
         try:
@@ -106,7 +106,7 @@ def _checked(scenes: Scene | Iterable[Scene]) -> list[Scene]:
     if len(set(labels)) < len(labels):
         raise UsageError(f"The labels of the scenes must differ; received {labels}.")
     for scene in chosen[1:]:
-        if (scene.array.names, scene.array.side) != (first.array.names, first.array.side):
+        if (scene.names, [mount.side for mount in scene.mounts]) != (first.names, [m.side for m in first.mounts]):
             raise UsageError(f"The scenes {first.label!r} and {scene.label!r} have different whiskers.")
         if scene.frames != first.frames:
             raise UsageError(f"The scenes {first.label!r} and {scene.label!r} are read at different times.")
@@ -135,7 +135,7 @@ def _assemble(
 ) -> xr.Dataset:
     import xarray as xr
 
-    array = scenes[0].array
+    names, mounts = scenes[0].names, scenes[0].mounts
     grid = ("stimulus", "whisker")
     frames = scenes[0].frames
     wrench = np.stack([_to_world(scene, row) for scene, row in zip(scenes, traces, strict=True)])
@@ -174,10 +174,10 @@ def _assemble(
         coords={
             "stimulus": np.array([scene.label for scene in scenes], dtype=object),
             "time": ("time", frames.times, {"units": "s"}),
-            "whisker": np.array(array.names, dtype=object),
-            "row": ("whisker", [mount.row for mount in array]),
-            "col": ("whisker", [mount.col for mount in array]),
-            "side": ("whisker", np.array([mount.side for mount in array], dtype=object)),
+            "whisker": np.array(names, dtype=object),
+            "row": ("whisker", [mount.row for mount in mounts]),
+            "col": ("whisker", [mount.col for mount in mounts]),
+            "side": ("whisker", np.array([mount.side for mount in mounts], dtype=object)),
             "channel": np.array(CHANNELS, dtype=object),
         },
         attrs={
@@ -208,7 +208,10 @@ def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
     frames = scene.frames
     vectors = np.stack([frames.reduce(trace.wrench) for trace in traces], axis=1)
     vectors = vectors.reshape(frames.count, len(traces), 2, 3)
-    return (vectors @ scene.head.matrix.T).reshape(frames.count, len(traces), 6).astype(np.float32)
+    ends = np.cumsum([len(part.array) for part in scene.split()])[:-1]
+    parts = zip(np.split(vectors, ends, axis=1), scene.split(), strict=True)
+    turned = np.concatenate([own @ part.head.matrix.T for own, part in parts], axis=1)
+    return turned.reshape(frames.count, len(traces), 6).astype(np.float32)
 
 
 def _first(contact: NDArray[np.bool_], times: NDArray[np.float64]) -> float:
@@ -248,26 +251,27 @@ def _array_summary(scenes: Sequence[Scene]) -> dict[str, Any]:
     return {
         "species": array.species,
         "side": array.side,
-        "whiskers": list(array.names),
+        "whiskers": list(scenes[0].names),
         "citation": array.citation,
         # Scenes may differ in material; the hash covers every number of every scene's array.
-        "hash": content_hash([scene.array.mounts for scene in scenes]),
+        "hash": content_hash([scene.mounts for scene in scenes]),
     }
 
 
 def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:
     """Hash what was asked for: equal on every machine, whatever its arithmetic."""
-    arrays = [scene.array.mounts for scene in scenes]
+    arrays = [scene.mounts for scene in scenes]
     return content_hash(backend, fidelity, [scene.config() for scene in scenes], arrays)
 
 
-def _cache_path(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> Path:
+def cache_path(scenes: Sequence[Scene], fidelity: Fidelity, backend: str, *more: Any, folder: str = "stimuli") -> Path:
+    """Return where the cache keeps what these scenes give; ``more`` is whatever else determines it."""
     from importlib import metadata
 
     package = _PACKAGES.get(backend)
     engine = metadata.version(package) if package else ""
-    key = content_hash(_config_hash(scenes, fidelity, backend), engine, _code_hash(), length=24)
-    return cache_dir("stimuli") / f"{key}.h5"
+    key = content_hash(_config_hash(scenes, fidelity, backend), engine, _code_hash(), *more, length=24)
+    return cache_dir(folder) / f"{key}.h5"
 
 
 @functools.cache
