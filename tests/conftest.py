@@ -11,6 +11,8 @@ import pytest
 # Processes that a test spawns inherit this path and find the test's module; at the end, so that the installed
 # package is the one under test.
 sys.path.append(str(Path(__file__).parents[1]))
+# Idle OpenMP threads would otherwise spin and slow each other down on a busy machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 REFERENCE = Path(os.environ.get("BRAINBENCH_REFERENCE", Path(__file__).parents[2] / "shared" / "reference"))
 

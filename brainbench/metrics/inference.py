@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from brainbench.errors import UsageError
 from brainbench.metrics._pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
 from brainbench.metrics.compare import check_comparison, compare_all
+from brainbench.types import Status
 
 EXACT_STIMULI = 8
 """Up to this many stimuli all orders are taken (8! = 40,320)."""
@@ -48,6 +49,11 @@ class PermutationTest:
     """[count] statistics, first the observed one."""
     reason: str = ""
     """Why p is undefined."""
+
+    @property
+    def status(self) -> Status:
+        """``undefined`` without a p (the reason says why), else ``ok``."""
+        return "undefined" if math.isnan(self.p) else "ok"
 
     @property
     def method(self) -> str:
