@@ -10,8 +10,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_SWEEPS = 5000
+MOST_SWEEPS = 3000
 """Gauss–Seidel sweeps over the contacts of one step before they count as unsolved."""
+SWEEPS = 12
+"""Sweeps between two attempts to finish by Newton's method, which needs to know what touches and what slides."""
+MOST_ITERATIONS = 12
+"""Newton iterations of one attempt."""
 TOLERANCE = 1e-9
 """Relative change of the forces in one sweep at which they count as solved."""
 
@@ -48,13 +52,24 @@ def solve_contacts(
         free: gaps and slips [3m] without contact forces.
         friction: Coulomb coefficient of each contact [m].
     """
-    force, moved = np.zeros(len(free)), free.copy()
-    diagonal = yielding.diagonal()
-    for _ in range(MOST_SWEEPS):
+    force = np.zeros(len(free))
+    for _ in range(MOST_SWEEPS // SWEEPS):
+        if _sweep(yielding, free, friction, force):
+            return force, True
+        finished = _finish(yielding, free, friction, force)
+        if finished is not None:
+            return finished, True
+    return force, False
+
+
+def _sweep(yielding: NDArray, free: NDArray, friction: NDArray, force: NDArray) -> bool:
+    """Improve ``force`` in place, one contact after the other; return whether it is solved."""
+    moved = free + yielding @ force
+    for _ in range(SWEEPS):
         change = 0.0
-        for contact, limit in enumerate(friction):
+        for contact, limit in enumerate(friction.tolist()):
             n = 3 * contact
-            step = max(-force[n], -moved[n] / diagonal[n])
+            step = max(-force[n], -moved[n] / yielding[n, n])
             if step:
                 force[n] += step
                 moved += yielding[:, n] * step
@@ -70,8 +85,54 @@ def solve_contacts(
                 moved += yielding[:, tangents] @ difference
                 change = max(change, float(np.abs(difference).max()))
         if change <= TOLERANCE * np.abs(force).max():
-            return force, True
-    return force, False
+            return True
+    return False
+
+
+def _finish(yielding: NDArray, free: NDArray, friction: NDArray, start: NDArray) -> NDArray[np.float64] | None:
+    """Solve by a semi-smooth Newton method from ``start``; None when it does not converge.
+
+    The unknown zero is f − P(f − w/ρ), P being the projection on Coulomb's cone taken row by row (Alart and
+    Curnier 1991), written as w = 0 where a contact holds and as the law of its force elsewhere.
+    """
+    force, scale = start.copy(), 1 / yielding.diagonal()
+    for _ in range(MOST_ITERATIONS):
+        moved = free + yielding @ force
+        residual, slope = force.copy(), np.eye(len(force))
+        missed = 0.0
+        for contact, limit in enumerate(friction.tolist()):
+            n, tangents = 3 * contact, slice(3 * contact + 1, 3 * contact + 3)
+            pressed = force[n] - scale[n] * moved[n]
+            missed = max(missed, abs(force[n] - max(pressed, 0.0)))
+            if pressed <= 0:
+                missed = max(missed, float(np.abs(force[tangents]).max()))
+                continue
+            residual[n], slope[n] = moved[n], yielding[n]
+            if not limit:
+                continue
+            rate = float(scale[tangents].min())
+            pushed = force[tangents] - rate * moved[tangents]
+            size, most = float(np.hypot(*pushed)), limit * max(force[n], 0.0)
+            if size <= most:
+                residual[tangents], slope[tangents] = moved[tangents], yielding[tangents]
+                missed = max(missed, rate * float(np.abs(moved[tangents]).max()))
+                continue
+            way = pushed / size
+            residual[tangents] = force[tangents] - most * way
+            missed = max(missed, float(np.abs(residual[tangents]).max()))
+            across = most / size * (np.eye(2) - np.outer(way, way))
+            slope[tangents] += rate * across @ yielding[tangents]
+            slope[tangents, tangents] -= across
+            slope[tangents, n] -= limit * way
+        if missed <= TOLERANCE * np.abs(force).max():
+            return force
+        try:
+            force -= np.linalg.solve(slope, residual)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(force).all():
+            return None
+    return None
 
 
 def hold_or_slide(yielding: NDArray[np.float64], slip: NDArray[np.float64], most: float) -> NDArray[np.float64]:

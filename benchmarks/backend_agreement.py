@@ -1,0 +1,100 @@
+"""Run the same scenes on both engines and measure how far they disagree, and what each costs.
+
+Run from the repository root: ``python benchmarks/backend_agreement.py [--fidelity balanced]``. Whiskers C0–C3 of
+the mouse, .2 s at 1 kHz. Per scene and whisker: the peak moment on ``mujoco``; how much the peaks of force and
+moment differ on ``bullet``; the root-mean-square difference of force and of moment over the peak on ``mujoco``;
+the largest overlap of whisker and object on each; processor seconds per simulated second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from brainbench.stimuli import (
+    Fidelity,
+    Frames,
+    PlacedObject,
+    Scene,
+    Still,
+    Translation,
+    WhiskerArray,
+    Whisking,
+    get_backend,
+    get_recipe,
+)
+from brainbench.stimuli.backends.protocol import Trace
+from brainbench.stimuli.objects import box, cylinder, sphere
+
+DURATION = 0.2
+FRAMES = Frames(0.001, 0.001, round(DURATION * 1e3) - 1)
+WHISKERS = "C0-C3"
+
+
+def scenes() -> Iterator[Scene]:
+    mouse = WhiskerArray.mouse(whiskers=WHISKERS)
+    slow = Whisking(frequency=10.0)
+    yield Scene("free air", mouse, whisking=Whisking(), frames=FRAMES)
+    for friction in (0.0, 0.48):
+        pole = PlacedObject(cylinder(1e-3, 0.02), position=(0.0115, 0.0065, 0.0), friction=friction)
+        yield Scene(f"pole, friction {friction:g}", mouse, (pole,), slow, frames=FRAMES)
+    ball = PlacedObject(sphere(5e-3), (0.016, -0.02, 0.0), motion=Translation((0.0, 0.15, 0.0)), friction=0.3)
+    yield Scene("ball passing at 150 mm/s", mouse, (ball,), Still(), frames=FRAMES)
+    edge = PlacedObject(
+        box((0.01, 0.01, 0.02)),
+        (0.0145, -0.02, 0.0),
+        (0.0, 0.0, math.pi / 6),
+        motion=Translation((0.0, 0.1, 0.0)),
+        friction=0.3,
+    )
+    yield Scene("box edge passing at 100 mm/s", mouse, (edge,), Still(), frames=FRAMES)
+    for scene in get_recipe("rodgers", whiskers=WHISKERS).scenes:
+        if scene.label in ("convex-close", "concave-close"):
+            yield Scene(f"rodgers {scene.label}", scene.array, scene.objects, scene.whisking, scene.head, FRAMES)
+
+
+def compare(scene: Scene, fidelity: Fidelity) -> list[str]:
+    jobs = scene.jobs()
+    ours, theirs = (get_backend(name).run(jobs, fidelity, workers=1) for name in ("bullet", "mujoco"))
+    rows = []
+    for mount, bullet, mujoco in zip(scene.array, ours, theirs, strict=True):
+        if "unstable" in (bullet.status, mujoco.status):
+            rows.append(f"| {scene.label} | {mount.name} | bullet {bullet.reason}, mujoco {mujoco.reason} | | | | | |")
+            continue
+        (peak_f, peak_m), (other_f, other_m) = _peaks(mujoco), _peaks(bullet)
+        gap = (bullet.wrench - mujoco.wrench).reshape(-1, 2, 3)
+        rms = np.sqrt(np.mean(np.sum(gap**2, axis=2), axis=0)) / (peak_f, peak_m)
+        touched = f"{mujoco.contact.mean():.0%} / {bullet.contact.mean():.0%}"
+        rows.append(
+            f"| {scene.label} | {mount.name} | {peak_m * 1e6:.3g} | {other_f / peak_f - 1:+.1%}, "
+            f"{other_m / peak_m - 1:+.1%} | {rms[0]:.1%}, {rms[1]:.1%} | {touched} | "
+            f"{mujoco.penetration * 1e6:.2g} / {bullet.penetration * 1e6:.2g} | "
+            f"{mujoco.seconds / DURATION:.2g} / {bullet.seconds / DURATION:.2g} |"
+        )
+    return rows
+
+
+def _peaks(trace: Trace) -> tuple[float, float]:
+    force, moment = np.linalg.norm(trace.wrench.reshape(-1, 2, 3), axis=2).max(axis=0)
+    return float(force), float(moment)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--fidelity", default="balanced")
+    fidelity = Fidelity.preset(parser.parse_args().fidelity)
+    print(
+        "| scene | whisker | peak moment, µN·m | peak force, moment: bullet against mujoco | rms difference of force, "
+        "moment | in contact, mujoco / bullet | overlap µm, mujoco / bullet | cost, mujoco / bullet |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for scene in scenes():
+        for row in compare(scene, fidelity):
+            print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()
