@@ -17,7 +17,8 @@ OPTIONAL = {
     "pybullet": ("bullet", "nothing yet: the WHISKiT-compatible backend of a later version (Python < 3.12)"),
     "warp-lang": ("gpu", "nothing yet: the batched whisker solver of a later version"),
     "mujoco-warp": ("gpu", "nothing yet: robot hands on CUDA in a later version"),
-    "matplotlib": ("report", "nothing yet: vector figures for papers in a later version"),
+    "matplotlib": ("report", "pictures and plots of stimuli (brainbench stimuli render | plot)"),
+    "imageio-ffmpeg": ("report", "films of stimuli as MP4 (GIF needs matplotlib alone)"),
 }
 
 

@@ -1,0 +1,155 @@
+"""``brainbench stimuli render`` and ``plot``: pictures and films of scenes, traces of forces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, progress_bar
+from brainbench.cli.stimuli._options import (
+    BackendOption,
+    FidelityOption,
+    StimulusOption,
+    WhiskersOption,
+    choose_scene,
+    numbers,
+    open_recipe,
+)
+from brainbench.errors import UsageError
+
+
+def render(
+    source: Annotated[str, typer.Argument(help="A recipe name or a scene file (.toml).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write: .png for one instant, .mp4 or .gif.")],
+    stimulus: StimulusOption = None,
+    at: Annotated[
+        float | None, typer.Option(help="Instant of a picture, ms. [default: first full protraction]")
+    ] = None,
+    start: Annotated[float, typer.Option(help="First instant of a film, ms.")] = 0.0,
+    stop: Annotated[
+        float | None, typer.Option(help="Last instant of a film, ms. [default: 150 ms after start]")
+    ] = None,
+    step: Annotated[float, typer.Option(help="Time between the frames of a film, ms.")] = 2.0,
+    fps: Annotated[float, typer.Option(help="Frames per second of a film.")] = 25.0,
+    view: Annotated[
+        str, typer.Option(help="top, bottom, side, left, front, back, oblique, or a direction x,y,z to the camera.")
+    ] = "oblique",
+    projection: Annotated[str, typer.Option(help="perspective or orthographic.")] = "perspective",
+    look_at: Annotated[str | None, typer.Option(help="Point x,y,z in the middle, mm. [default: all in view]")] = None,
+    width: Annotated[float | None, typer.Option(help="Width of the picture at that point, mm.")] = None,
+    color: Annotated[str, typer.Option(help="Colour whiskers by row or by bending moment: row or moment.")] = "row",
+    moment_limit: Annotated[float | None, typer.Option(help="Moment at the end of the colours, µN·m.")] = None,
+    thickness: Annotated[float, typer.Option(help="Draw whiskers so many times as thick as they are.")] = 2.0,
+    opacity: Annotated[float, typer.Option(help="Opacity of objects, 0 to 1.")] = 1.0,
+    size: Annotated[str | None, typer.Option(help="Pixels. [default: 1280x960, a film 800x600]")] = None,
+    whiskers: WhiskersOption = "all",
+    fidelity: FidelityOption = "balanced",
+    backend: BackendOption = "mujoco",
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
+    from brainbench.stimuli import render as drawing
+    from brainbench.stimuli._figure import check_format
+    from brainbench.stimuli.camera import Camera
+
+    suffix = check_format(out, drawing.FORMATS)
+    scene = choose_scene(open_recipe(source, whiskers), stimulus)
+    times = [_instant(scene, at)] if suffix == ".png" else _film(scene, at, start, stop, step)
+    target = None if look_at is None else numbers(look_at, 3, "--look-at")
+    camera = Camera(
+        view=view if view.replace("-", "").isalpha() else numbers(view, 3, "--view"),  # type: ignore[arg-type]
+        projection=projection,  # type: ignore[arg-type]
+        target=None if target is None else (target[0] * 1e-3, target[1] * 1e-3, target[2] * 1e-3),
+        width=None if width is None else width * 1e-3,
+    )
+    usual = drawing.Style().size if suffix == ".png" else drawing.FILM_SIZE
+    pixels = usual if size is None else tuple(map(int, numbers(size, 2, "--size")))
+    style = drawing.Style(
+        color=color,  # type: ignore[arg-type]
+        moment_limit=None if moment_limit is None else moment_limit * 1e-6,
+        thickness=thickness,
+        opacity=opacity,
+        size=(pixels[0], pixels[1]),
+        frames_per_second=fps,
+    )
+    with progress_bar() as progress:
+        path = drawing.render(
+            scene,
+            out,
+            times=times,
+            camera=camera,
+            style=style,
+            fidelity=fidelity,
+            backend=backend,
+            progress=progress,
+        )
+    data = {"path": path, "stimulus": scene.label, "times_s": times, "camera": camera, "style": style}
+    what = (
+        f"{times[0] * 1e3:g} ms"
+        if len(times) == 1
+        else f"{len(times)} frames, {times[0] * 1e3:g}–{times[-1] * 1e3:g} ms"
+    )
+    emit(data, f"{scene.label} ({what})  {path}", as_json=as_json)
+
+
+def plot(
+    source: Annotated[str, typer.Argument(help="A recipe name, a scene file (.toml) or a stimulus-set file (.h5).")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="File to write (.png, .svg, .pdf); several stimuli make one file each.")
+    ],
+    channel: Annotated[
+        str, typer.Option(help="Fxyz, Mxyz (three components), F, M (magnitude), Fx, Fy, Fz, Mx, My or Mz.")
+    ] = "Fxyz",
+    stimulus: Annotated[
+        str | None, typer.Option("--stimulus", "-s", help="Draw only the stimulus of this label.")
+    ] = None,
+    start: Annotated[float | None, typer.Option(help="First time shown, ms.")] = None,
+    stop: Annotated[float | None, typer.Option(help="Last time shown, ms.")] = None,
+    size: Annotated[str, typer.Option(help="Pixels.")] = "1600x960",
+    whiskers: WhiskersOption = "all",
+    fidelity: FidelityOption = "balanced",
+    backend: BackendOption = "mujoco",
+    as_json: JsonOption = False,
+) -> None:
+    """Plot forces or moments of every whisker on the 5 × 7 layout, to one scale, contacts shaded."""
+    import math
+
+    from brainbench.stimuli import load_stimuli
+    from brainbench.stimuli._figure import check_format
+    from brainbench.stimuli.plot import FORMATS, check_channel
+    from brainbench.stimuli.plot import plot as draw
+
+    check_format(out, FORMATS)
+    check_channel(channel)
+    with progress_bar() as progress:
+        stimuli = load_stimuli(source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress)
+    if stimuli.dataset is None:
+        raise UsageError(f"{source!r} holds arrays, not forces of whiskers; there is nothing to plot.")
+    low = -math.inf if start is None else start * 1e-3
+    high = math.inf if stop is None else stop * 1e-3
+    pixels = numbers(size, 2, "--size")
+    paths = draw(
+        stimuli.dataset,
+        out,
+        channel=channel,
+        stimulus=stimulus,
+        window=(low, high),
+        size=(int(pixels[0]), int(pixels[1])),
+    )
+    emit({"paths": paths, "channel": channel}, "\n".join(map(str, paths)), as_json=as_json)
+
+
+def _instant(scene: Any, at: float | None) -> float:
+    from brainbench.stimuli.render import still_time
+
+    return still_time(scene) if at is None else at * 1e-3
+
+
+def _film(scene: Any, at: float | None, start: float, stop: float | None, step: float) -> list[float]:
+    from brainbench.stimuli.render import film_times
+
+    if at is not None:
+        raise UsageError("--at chooses the instant of a .png; a film takes --start, --stop and --step.")
+    return list(film_times(scene, start * 1e-3, None if stop is None else stop * 1e-3, step * 1e-3))

@@ -1,0 +1,156 @@
+"""``brainbench stimuli list`` and ``show``: which recipes there are, and what stands in a scene."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli.stimuli._options import StimulusOption, choose_scene, open_recipe
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from brainbench.stimuli import Recipe, Scene
+
+_SHOWN = 20
+"""Scenes that are printed in full; any number is written as JSON."""
+
+
+def list_(as_json: JsonOption = False) -> None:
+    """List the stimulus recipes."""
+    from brainbench.stimuli import describe_recipe, list_recipes
+
+    recipes = {name: describe_recipe(name).strip() for name in list_recipes()}
+    emit(recipes, table("", ["recipe", ""], [[name, text] for name, text in recipes.items()]), as_json=as_json)
+
+
+def show(
+    source: Annotated[str, typer.Argument(help="A recipe name, a scene file (.toml) or a stimulus-set file (.h5).")],
+    stimulus: StimulusOption = None,
+    whiskers: Annotated[str, typer.Option(help="Show the scenes with these whiskers only.")] = "all",
+    as_json: JsonOption = False,
+) -> None:
+    """Print what stands in the scenes: whiskers, objects, poses, motion and frames."""
+    if Path(source).suffix in (".h5", ".hdf5", ".nc"):
+        from brainbench.stimuli import read_stimulus_set
+
+        data = _of_file(read_stimulus_set(source), stimulus)
+    else:
+        recipe = open_recipe(source, whiskers)
+        data = _of_recipe(recipe, list(recipe.scenes) if stimulus is None else [choose_scene(recipe, stimulus)])
+    emit(data, _text(data), as_json=as_json)
+
+
+def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:
+    array = scenes[0].array
+    described = []
+    for scene in scenes:
+        config = scene.config()
+        for item, written in zip(scene.objects, config["objects"], strict=True):
+            low, high = item.solid.bounds
+            written["solid"]["size"] = (high - low).tolist()
+        described.append(config)
+    return {
+        "name": recipe.name,
+        "description": recipe.description.strip(),
+        "array": {"species": array.species, "side": array.side, "whiskers": list(array.names)},
+        "scenes": described,
+    }
+
+
+def _of_file(dataset: xr.Dataset, stimulus: str | None) -> dict[str, Any]:
+    import json
+
+    from brainbench.errors import unknown_name
+
+    scenes = json.loads(dataset.attrs["scene"])
+    labels = [scene["label"] for scene in scenes]
+    if stimulus is not None:
+        if stimulus not in labels:
+            raise unknown_name("stimulus", stimulus, labels)
+        scenes = [scenes[labels.index(stimulus)]]
+    made = {name: dataset.attrs[name] for name in ("backend", "version", "content_hash")}
+    return {
+        "name": "stimulus set",
+        "description": f"simulated by {made['backend']}, brainbench {made['version']}",
+        "array": json.loads(dataset.attrs["array"]),
+        "scenes": scenes,
+        "fidelity": json.loads(dataset.attrs["fidelity"]),
+        **made,
+    }
+
+
+def _text(data: dict[str, Any]) -> str:
+    array, scenes = data["array"], data["scenes"]
+    frames = scenes[0]["frames"]
+    readings = "instantaneous" if frames["average"] == 1 else f"each the mean of {frames['average']} readings"
+    span = f"{frames['count']} from {_milli(frames['first'])} ms every {_milli(frames['interval'])} ms"
+    lines = [
+        f"{data['name']}: {data['description']}",
+        "",
+        f"whiskers  {array['species']}, {array['side']}: {len(array['whiskers'])} ({', '.join(array['whiskers'])})",
+        f"frames    {span}, {readings}",
+    ]
+    if "fidelity" in data:
+        lines.append("fidelity  " + ", ".join(f"{name} {value}" for name, value in data["fidelity"].items()))
+    rows = [row for scene in scenes[:_SHOWN] for row in _rows(scene)]
+    lines += ["", table("", ["scene", "", "position mm", "rotation °", "motion", ""], rows)]
+    if len(scenes) > _SHOWN:
+        lines += ["", f"… and {len(scenes) - _SHOWN} more scenes (all with --json)"]
+    return "\n".join(lines)
+
+
+def _rows(scene: dict[str, Any]) -> list[list[str]]:
+    head = scene["head"]
+    rows = [
+        [scene["label"], "head", _point(head["position"]), _angles(head["rotation"]), _motion(head["motion"]), ""],
+        ["", "whiskers", "", "", _motion(scene["whisking"]), ""],
+    ]
+    for item in scene["objects"]:
+        solid, friction = item["solid"], item["friction"]
+        size = solid.get("size")
+        what = (
+            f"{' × '.join(_milli(value) for value in size)} mm" if size else f"diagonal {_milli(solid['diagonal'])} mm"
+        )
+        notes = [f"{solid['parts']} convex part{'s' if solid['parts'] > 1 else ''}", what]
+        notes += [] if friction is None else [f"friction {friction:g}"]
+        notes += solid["notes"]
+        place = _point(item["position"]), _angles(item["rotation"])
+        rows.append(["", solid["name"], *place, _motion(item["motion"]), "; ".join(notes)])
+    return rows
+
+
+def _motion(config: dict[str, Any]) -> str:
+    """Say in words how something moves."""
+    kind = config["kind"]
+    if kind == "still":
+        return "still"
+    if kind == "whisking":
+        forth, back = (math.degrees(config[name]) for name in ("protraction", "retraction"))
+        rotations = config["rotations"]["name"]
+        return f"{config['frequency']:g} Hz, +{forth:g}° to −{back:g}°, onset {_milli(config['onset'])} ms, {rotations}"
+    if kind == "translation":
+        velocity = ", ".join(_milli(value) for value in config["velocity"])
+        return f"({velocity}) mm/s, onset {_milli(config['onset'])} ms"
+    rest = ", ".join(f"{name} {value}" for name, value in config.items() if name != "kind" and not _long(value))
+    return f"{kind} {rest}".rstrip()
+
+
+def _long(value: Any) -> bool:
+    return isinstance(value, (list, dict)) and len(value) > 4
+
+
+def _milli(value: float) -> str:
+    return f"{value * 1e3:.6g}"
+
+
+def _point(values: list[float]) -> str:
+    return ", ".join(f"{value * 1e3:.4g}" for value in values)
+
+
+def _angles(values: list[float]) -> str:
+    return ", ".join(f"{math.degrees(value):.4g}" for value in values)

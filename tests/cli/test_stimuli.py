@@ -1,0 +1,113 @@
+import json
+
+import pytest
+
+SCENE = """
+description = "A pole before two whiskers"
+[array]
+whiskers = "C1,C2"
+[frames]
+first_ms = 1
+interval_ms = 5
+count = 10
+[[object]]
+shape = "cylinder"
+radius_mm = 1
+height_mm = 10
+position_mm = [12, 8, 3]
+velocity_mm_s = [0, -30, 0]
+friction = 0.3
+[[scene]]
+label = "whisking"
+[[scene]]
+label = "still"
+[scene.whisking]
+kind = "still"
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "pole.toml"
+    path.write_text(SCENE)
+    return str(path)
+
+
+@pytest.mark.parametrize("command", ["list", "show", "simulate", "render", "plot"])
+def test_every_command_explains_itself(run, command):
+    result = run("stimuli", command, "--help")
+    assert result.status == 0
+    assert "Usage" in result.out
+    assert "--json" in result.out
+
+
+def test_show_prints_poses_and_motion_in_millimetres_and_degrees(run, scene):
+    out = run("stimuli", "show", scene).out
+    for words in ("A pole before two whiskers", "C1, C2", "12, 8, 3", "(0, -30, 0) mm/s", "20 Hz", "friction 0.3"):
+        assert words in out
+    assert "10 from 1 ms every 5 ms" in out
+
+
+def test_show_as_json_is_si(run, scene):
+    data = json.loads(run("stimuli", "show", scene, "--stimulus", "still", "--json").out)
+    (only,) = data["scenes"]
+    assert only["whisking"] == {"kind": "still"}
+    assert only["objects"][0]["position"] == [0.012, 0.008, 0.003]
+    assert only["objects"][0]["solid"]["size"] == pytest.approx([0.002, 0.002, 0.01])
+    assert data["array"]["whiskers"] == ["C1", "C2"]
+
+
+def test_simulate_explains_what_it_left_out_and_show_reads_the_file(run, scene, tmp_path):
+    file = tmp_path / "set.h5"
+    result = run("stimuli", "simulate", scene, "--fidelity", "fast", "--out", str(file), "--explain", "--json")
+    assert result.status == 0, result.err
+    data = json.loads(result.out)
+    assert data["explanation"]["simulated"] == 4
+    assert data["explanation"]["out_of_reach"] == {"still": [], "whisking": []}
+    assert [item["stimulus"] for item in data["stimuli"]] == ["whisking", "still"]
+    text = run("stimuli", "simulate", scene, "--fidelity", "fast", "--explain").out
+    assert "2 stimuli × 2 whiskers = 4 runs of 6 links" in text
+    assert "earlier, read from" in text
+    shown = run("stimuli", "show", str(file)).out
+    assert "simulated by mujoco" in shown
+    assert "whisking" in shown
+
+
+def test_render_writes_a_picture_and_says_where(run, scene, tmp_path):
+    out = tmp_path / "a.png"
+    options = ["--fidelity", "fast", "--size", "160x120", "--view", "1,-1,0.5", "--look-at", "10,5,3", "--width", "30"]
+    result = run("stimuli", "render", scene, "--out", str(out), "--stimulus", "still", "--at", "20", *options, "--json")
+    assert result.status == 0, result.err
+    data = json.loads(result.out)
+    assert data["times_s"] == [0.02]
+    assert data["camera"]["target"] == pytest.approx([0.01, 0.005, 0.003])
+    assert out.stat().st_size > 1000
+
+
+def test_plot_writes_one_file_per_stimulus(run, scene, tmp_path):
+    options = ["--fidelity", "fast", "--channel", "M", "--size", "400x240", "--stop", "30"]
+    result = run("stimuli", "plot", scene, "--out", str(tmp_path / "t.svg"), *options)
+    assert result.status == 0, result.err
+    assert sorted(path.name for path in tmp_path.glob("*.svg")) == ["t-still.svg", "t-whisking.svg"]
+    assert "t-still.svg" in result.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["render", "{scene}", "-o", "a.png"], "choose with --stimulus (whisking, still)"),
+        (["render", "{scene}", "-o", "a.png", "-s", "stil"], "did you mean 'still'"),
+        (["render", "{scene}", "-o", "a.png", "-s", "still", "--view", "1,2"], "--view takes 3 numbers"),
+        (["render", "{scene}", "-o", "a.gif", "-s", "still", "--at", "5"], "--start, --stop and --step"),
+        (["render", "set.h5", "-o", "a.png"], "file of forces"),
+        (["render", "rogers", "-o", "a.png"], "did you mean 'rodgers'"),
+        (["plot", "{scene}", "-o", "a.bmp"], "Allowed: '.png', '.svg', '.pdf'"),
+        (["plot", "{scene}", "-o", "a.png", "--channel", "Gx"], "Unknown channel"),
+        (["show", "{scene}", "-s", "x"], "Unknown stimulus"),
+    ],
+)
+def test_wrong_requests_end_with_status_two_and_one_line(run, scene, arguments, message):
+    result = run("stimuli", *(item.format(scene=scene) for item in arguments))
+    assert result.status == 2
+    assert message in result.err
+    assert result.out == ""
