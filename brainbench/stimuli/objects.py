@@ -5,6 +5,7 @@ A :class:`Solid` stands in its own frame; :class:`PlacedObject` puts it into a s
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import os
@@ -20,7 +21,7 @@ from brainbench.stimuli.motion import Still, Translation
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere, rotation_matrix
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -88,12 +89,10 @@ class Solid:
         """Plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
         from brainbench.files import content_hash, to_plain
 
-        if self.origin is not None:
-            stated = {"name": self.name, "diagonal": self.diagonal, "notes": list(self.notes)}
-            return {**stated, "hash": content_hash(self.origin, round(self.diagonal, 12))}
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
-        return {**summary, "hash": content_hash(parts)}
+        named = content_hash(parts) if self.origin is None else content_hash(self.origin, round(self.diagonal, 12))
+        return {**summary, "hash": named}
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,11 +248,11 @@ def shape_solid(
         MissingDependencyError: the decomposition needs a package that is not installed.
     """
     if collision is None:
-        collision = "exact" if shape.parts else "hull"
+        collision = "exact" if shape.part_points else "hull"
     _check_collision(collision)
     name = f"{shape.label}-{shape.seed}"
     mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, name)
-    if collision != "exact" or not shape.parts:
+    if collision != "exact" or not shape.part_points:
         return _touchable(mesh, collision, decomposition).to_diagonal(diagonal)
     notes: tuple[str, ...] = ()
     if len(shape.parts) > 1:
@@ -265,6 +264,39 @@ def shape_solid(
     parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
     origin = {"mesh": mesh.content_hash, "collision": "exact"}
     return Solid(name, parts, mesh, notes, origin).to_diagonal(diagonal)
+
+
+def shape_solids(
+    families: Iterable[str] | None = None,
+    *,
+    members: int = 1,
+    diagonal: float = 0.04,
+    detail: int = 4_000,
+    collision: str | None = None,
+) -> dict[str, Callable[[], Solid]]:
+    """Return, by name (``torus-0``), functions that make procedural solids when they are needed, as sweeps take them.
+
+    Args:
+        families: names from :func:`brainbench.stimuli.shapes.list_families`; all of them when None.
+        members: shapes of each family, with the seeds 0, 1, ….
+        diagonal, collision: as for :func:`shape_solid`.
+        detail: as for :func:`brainbench.stimuli.shapes.make`.
+
+    Raises:
+        UsageError: a family is unknown, or there is less than one member.
+    """
+    from brainbench.stimuli import shapes
+
+    if members < 1:
+        raise UsageError(f"A family needs at least one member; received {members!r}.")
+    chosen = shapes.list_families() if families is None else tuple(families)
+    for family in chosen:
+        shapes.describe_family(family)
+
+    def load(family: str, seed: int) -> Solid:
+        return shape_solid(shapes.make(family, seed, detail=detail), diagonal=diagonal, collision=collision)
+
+    return {f"{family}-{seed}": functools.partial(load, family, seed) for family in chosen for seed in range(members)}
 
 
 def _check_collision(collision: str) -> None:

@@ -7,7 +7,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from brainbench.errors import DataError, UsageError
-from brainbench.geometry import load_mesh
+from brainbench.geometry import DecompositionSettings, load_mesh
+from brainbench.stimuli import shapes
 from brainbench.stimuli.motion import Translation
 from brainbench.stimuli.objects import (
     RODGERS_CONTROL,
@@ -19,6 +20,8 @@ from brainbench.stimuli.objects import (
     mesh_solid,
     move_part,
     rodgers_solid,
+    shape_solid,
+    shape_solids,
     sphere,
 )
 from brainbench.stimuli.obstacle import rotation_matrix
@@ -156,6 +159,71 @@ def test_an_open_mesh_says_so(tmp_path):
     cube = trimesh.creation.box()
     trimesh.Trimesh(cube.vertices, cube.faces[:-2]).export(path)
     assert any("not watertight" in note for note in mesh_solid(path, unit="mm").notes)
+
+
+def test_repairs_of_a_file_are_noted_and_reach_the_configuration(tmp_path):
+    path = tmp_path / "flipped.obj"
+    cube = trimesh.creation.box()
+    trimesh.Trimesh(cube.vertices, cube.faces[:, ::-1], process=False).export(path)
+    solid = mesh_solid(path, unit="mm")
+    assert solid.mesh.volume == pytest.approx(1e-9)
+    assert solid.config()["notes"] == ["the surface was inside out and was turned"]
+
+
+def test_an_exact_surface_is_possible_for_convex_meshes_only(tmp_path):
+    cube, crescent = tmp_path / "cube.stl", tmp_path / "crescent.stl"
+    trimesh.creation.box().export(cube)
+    rodgers_solid().mesh.to_trimesh().export(crescent)
+    (part,) = mesh_solid(cube, unit="mm", collision="exact").parts
+    assert ConvexHull(part.vertices).volume == pytest.approx(1e-9)
+    with pytest.raises(UsageError, match=r"'crescent' is not convex.*collision = 'decomposition'.*or 'hull'"):
+        mesh_solid(crescent, unit="m", collision="exact")
+
+
+def test_a_decomposition_keeps_the_concave_face_and_states_its_deviation(tmp_path):
+    path = tmp_path / "crescent.stl"
+    rodgers_solid(segments=6).mesh.to_trimesh().export(path)
+    settings = DecompositionSettings(threshold=0.05)
+    solid = mesh_solid(path, unit="m", diagonal=0.03, collision="decomposition", decomposition=settings)
+    assert solid.diagonal == pytest.approx(0.03)
+    volume = sum(ConvexHull(part.vertices).volume for part in solid.parts)
+    whole = solid.mesh.volume
+    assert volume == pytest.approx(whole, rel=0.2)
+    assert solid.mesh.hull().volume > 2 * whole
+    assert "% of its diagonal (sampled)" in solid.notes[0]
+    again = mesh_solid(path, unit="m", diagonal=0.03, collision="decomposition", decomposition=settings)
+    assert again.config() == solid.config()
+    assert again.to_diagonal(0.04).config()["hash"] != solid.config()["hash"]
+
+
+def test_a_procedural_torus_keeps_its_hole_and_a_hull_fills_it():
+    shape = shapes.make("torus", 0, detail=2000)
+    solid, hull = shape_solid(shape), shape_solid(shape, collision="hull")
+    assert solid.name == "torus-0"
+    assert solid.diagonal == pytest.approx(0.04)
+    centre = np.zeros(3)
+    assert not any((ConvexHull(part.vertices).equations @ [*centre, 1] < 0).all() for part in solid.parts)
+    assert (ConvexHull(hull.parts[0].vertices).equations @ [*centre, 1] < 0).all()
+    assert "convex parts" in solid.notes[0]
+    assert "concavities are filled" in hull.notes[0]
+
+
+def test_a_shape_without_known_parts_refuses_to_be_exact_and_else_falls_back_to_its_hull():
+    shape = shapes.make("bumpy", 0)
+    assert len(shape_solid(shape).parts) == 1
+    with pytest.raises(UsageError, match="'bumpy-0' is not convex"):
+        shape_solid(shape, collision="exact")
+
+
+def test_labelled_sets_of_shapes_are_made_on_demand():
+    loaders = shape_solids(["brick", "cone"], members=2, detail=2000)
+    assert list(loaders) == ["brick-0", "brick-1", "cone-0", "cone-1"]
+    assert loaders["cone-1"]().name == "cone-1"
+    assert len(shape_solids()) >= 24
+    with pytest.raises(UsageError, match="did you mean 'brick'"):
+        shape_solids(["brik"])
+    with pytest.raises(UsageError, match="at least one member"):
+        shape_solids(members=0)
 
 
 def test_a_flat_mesh_cannot_be_touched(tmp_path):

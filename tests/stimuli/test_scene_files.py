@@ -97,6 +97,33 @@ def test_a_mesh_is_found_beside_the_file(tmp_path):
     assert scene.objects[0].solid.diagonal == pytest.approx(0.02)
 
 
+def test_a_procedural_shape_is_named_by_family_and_seed(tmp_path):
+    path = _write(
+        tmp_path,
+        '[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "family:torus"\nseed = 3\ndetail = 2000\n'
+        '[[scene.object]]\nshape = "family:brick"\ndiagonal_mm = 20\ncollision = "hull"\n',
+    )
+    torus, brick = (item.solid for item in load_scene(path).scenes[0].objects)
+    assert torus.name == "torus-3"
+    assert torus.diagonal == pytest.approx(0.04)
+    assert brick.diagonal == pytest.approx(0.02)
+    path.write_text('[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "family:torsu"\n')
+    with pytest.raises(UsageError, match="did you mean 'torus'"):
+        load_scene(path)
+
+
+def test_a_mesh_can_be_decomposed_by_keys_of_its_table(tmp_path):
+    trimesh.creation.annulus(1, 2, 1, segment=[[0, 0, 0], [0, 0, 1]]).export(tmp_path / "ring.stl")
+    text = (
+        '[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "mesh"\npath = "ring.stl"\nunit = "mm"\n'
+        'collision = "decomposition"\nthreshold = 0.3\n'
+    )
+    solid = load_scene(_write(tmp_path, text)).scenes[0].objects[0].solid
+    assert len(solid.parts) > 1
+    with pytest.raises(UsageError, match="threshold of a decomposition lies between 0.01 and 1"):
+        load_scene(_write(tmp_path, text.replace("0.3", "3")))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -23,6 +23,7 @@ from brainbench.stimuli.shapes._build import Body, Draw
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
+    from numpy.typing import NDArray
 
 DETAIL = (2_000, 20_000)
 """Fewest and most triangles of a shape."""
@@ -46,8 +47,13 @@ class Shape:
     parameters: Mapping[str, float | int | str]
     """The proportions that were drawn, in the family's own unit."""
     seed: int
-    parts: tuple[Mesh, ...]
-    """Convex meshes that together fill the shape; empty where none are known (see ``decompose``)."""
+    part_points: tuple[NDArray[np.float64], ...] = ()
+    """Points [n, 3] of convex bodies that together fill the shape; empty where none are known."""
+
+    @functools.cached_property
+    def parts(self) -> tuple[Mesh, ...]:
+        """The convex bodies as meshes; empty where none are known (then use ``geometry.decompose``)."""
+        return tuple(convex_hull(points, self.label) for points in self.part_points)
 
 
 def list_families() -> tuple[str, ...]:
@@ -101,9 +107,8 @@ def _make(family: str, build: Callable[[Draw, int], Body], seed: int, detail: in
         # Rounded, so that the last digit of a sine on another processor does not change the hash.
         return np.round((vertices - centre) / size, 9) + 0.0
 
-    parts = tuple(convex_hull(unit(part), family) for part in body.parts or ())
     mesh = Mesh(unit(points), np.array(data.tri_verts, dtype=np.int64), family)
-    return Shape(mesh, family, dict(draw.drawn), seed, parts)
+    return Shape(mesh, family, dict(draw.drawn), seed, tuple(unit(part) for part in body.parts or ()))
 
 
 def _refined(solid: Manifold, detail: int) -> Manifold:
