@@ -125,6 +125,8 @@ def _finish(yielding: NDArray, free: NDArray, friction: NDArray, start: NDArray)
             slope[tangents, tangents] -= across
             slope[tangents, n] -= limit * way
         if missed <= TOLERANCE * np.abs(force).max():
+            rows = force.reshape(-1, 3)
+            rows[rows[:, 0] <= 0] = 0.0
             return force
         try:
             force -= np.linalg.solve(slope, residual)
