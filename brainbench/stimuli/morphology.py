@@ -1,4 +1,4 @@
-"""Whisker arrays of the mouse and the rat, from published morphology.
+"""Whisker arrays of the mouse and the rat, from published measurements or from the equations fitted to them.
 
 Array frame: origin at the mean of all base points of both sides, x to the animal's right, y rostral,
 z dorsal; metres. The tables under ``data/`` hold the published numbers (mm, rad) with their sources.
@@ -8,20 +8,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.errors import unknown_name
+from brainbench.errors import UsageError, unknown_name
 from brainbench.stimuli.selection import match_whiskers
 from brainbench.stimuli.whisker import Whisker
 from brainbench.types import GRID_SHAPE
 
 Side = Literal["right", "left", "both"]
+Source = Literal["average", "model"]
 SPECIES = ("mouse", "rat")
 SIDES = ("right", "left", "both")
+SOURCES = ("average", "model")
 
 _MM = 1e-3
 
@@ -67,19 +70,33 @@ class WhiskerArray:
     citation: str = ""
 
     @classmethod
-    def mouse(cls, *, side: Side = "right", whiskers: str = "all") -> WhiskerArray:
+    def mouse(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
         """Return the average mouse (Bresee et al. 2023): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E0–E5.
 
         Args:
             side: ``right`` (published), ``left`` (its exact mirror image) or ``both``.
             whiskers: a selection as :meth:`select` takes it.
+            source: ``average``; there is no ``model`` of the mouse here.
+
+        Raises:
+            UsageError: a name is unknown, or the model equations of the mouse are asked for.
         """
-        return _published("mouse").on_side(side).select(whiskers)
+        return _array("mouse", source).on_side(side).select(whiskers)
 
     @classmethod
-    def rat(cls, *, side: Side = "right", whiskers: str = "all") -> WhiskerArray:
-        """Return the average rat (Belli et al. 2018): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E1–E6."""
-        return _published("rat").on_side(side).select(whiskers)
+    def rat(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
+        """Return the rat (Belli et al. 2018): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E1–E6.
+
+        Args:
+            side: ``right`` (published), ``left`` (its exact mirror image) or ``both``.
+            whiskers: a selection as :meth:`select` takes it.
+            source: ``average``, the measured means; or ``model``, the equations fitted to them, which give
+                arc length, curvature, base point and angles from row and column alone.
+
+        Raises:
+            UsageError: a name is unknown.
+        """
+        return _array("rat", source).on_side(side).select(whiskers)
 
     def __iter__(self) -> Iterator[MountedWhisker]:
         return iter(self.mounts)
@@ -162,29 +179,96 @@ class WhiskerArray:
         return upper.index(name.upper())
 
 
-@cache
-def _published(species: str) -> WhiskerArray:
-    """Read one species' table: the right side."""
-    text = resources.files("brainbench.stimuli").joinpath("data", f"{species}.json").read_text(encoding="utf-8")
-    table = json.loads(text)
-    mounts = tuple(_mount(dict(zip(table["columns"], row, strict=True)), table) for row in table["whiskers"])
-    return WhiskerArray(species=table["species"], mounts=mounts, citation=table["citation"])
+def published_whisker(arc_length: float, curvature: float, row: int, col: int, *, species: str = "rat") -> Whisker:
+    """Return a whisker with the published rules for its diameters and its material.
 
-
-def _mount(entry: dict[str, Any], table: dict[str, Any]) -> MountedWhisker:
-    base, tip = _radii(entry["arc_length_mm"], entry["row"], entry["column"], table["diameter"])
+    Args:
+        arc_length: mm, as the published tables give it.
+        curvature: A of y = A x² in 1/mm, positive as published.
+        row: 0 for row A.
+        col: column number.
+        species: whose rules; those of ``mouse`` and ``rat`` have the same numbers.
+    """
+    table = _read(species)
+    base, tip = _radii(arc_length, row, col, table["diameter"])
     material = {key: item["value"] for key, item in table["material"].items()}
-    whisker = Whisker(
-        arc_length=entry["arc_length_mm"] * _MM,
+    return Whisker(
+        arc_length=arc_length * _MM,
         base_radius=base * _MM,
         tip_radius=tip * _MM,
         young_modulus=material["young_modulus_pa"],
         density=tuple(material["density_base_tip_kg_m3"]),
         damping_ratio=material["damping_ratio"],
         # The published bend angles are negative: the whisker curves towards local −y.
-        curvature=-entry["curvature_per_mm"] / _MM,
+        curvature=-curvature / _MM,
         friction=material["friction"],
     )
+
+
+def _array(species: str, source: str) -> WhiskerArray:
+    if source not in SOURCES:
+        raise unknown_name("source of an array", source, SOURCES)
+    if source == "average":
+        return _published(species)
+    if "model" not in _read(species):
+        raise UsageError(
+            f"There are no model equations of the {species} here: those of Bresee et al. (2023) are in no source that "
+            "we could read, and the released mouse scripts hold the rat's; use source='average', or the rat's model."
+        )
+    return _modelled(species)
+
+
+@cache
+def _read(species: str) -> dict[str, Any]:
+    text = resources.files("brainbench.stimuli").joinpath("data", f"{species}.json").read_text(encoding="utf-8")
+    return json.loads(text)
+
+
+@cache
+def _published(species: str) -> WhiskerArray:
+    """Build one species' table: the right side."""
+    table = _read(species)
+    entries = (dict(zip(table["columns"], row, strict=True)) for row in table["whiskers"])
+    mounts = tuple(_mount(entry, species) for entry in entries)
+    return WhiskerArray(species=table["species"], mounts=mounts, citation=table["citation"])
+
+
+@cache
+def _modelled(species: str) -> WhiskerArray:
+    """Build the whiskers of one species' table from its model equations: the right side."""
+    model = _read(species)["model"]
+    mounts = []
+    for average in _published(species):
+        known = {"row": float(average.row + 1), "column": float(average.col + 1)}
+        for key in ("theta_bp", "phi_bp", "r_bp"):
+            known[key] = _evaluate(model[key], known)
+        azimuth, elevation = math.radians(known["theta_bp"]), math.radians(known["phi_bp"])
+        radius = known["r_bp"] * _MM
+        theta, phi, zeta = (math.radians(_evaluate(model[key], known)) for key in ("theta", "phi", "zeta"))
+        length, curvature = math.exp(_evaluate(model["log_arc_length"], known)), _evaluate(model["curvature"], known)
+        mounts.append(
+            dataclasses.replace(
+                average,
+                position=(
+                    radius * math.cos(azimuth),
+                    radius * math.sin(azimuth),
+                    radius * math.sin(elevation),
+                ),
+                angles=(theta, phi, zeta),
+                whisker=published_whisker(length, curvature, average.row, average.col, species=species),
+            )
+        )
+    return WhiskerArray(species=species, mounts=tuple(mounts), citation=model["citation"])
+
+
+def _evaluate(terms: dict[str, float], known: dict[str, float]) -> float:
+    """Sum the terms of one equation: a constant and coefficients of known quantities or of their squares."""
+    values = {"constant": 1.0, **known, **{f"{key}_squared": value**2 for key, value in known.items()}}
+    return sum(factor * values[name] for name, factor in terms.items())
+
+
+def _mount(entry: dict[str, Any], species: str) -> MountedWhisker:
+    size = (entry["arc_length_mm"], entry["curvature_per_mm"], entry["row"], entry["column"])
     return MountedWhisker(
         name=entry["name"],
         side="right",
@@ -192,7 +276,7 @@ def _mount(entry: dict[str, Any], table: dict[str, Any]) -> MountedWhisker:
         col=entry["column"],
         position=(entry["x_mm"] * _MM, entry["y_mm"] * _MM, entry["z_mm"] * _MM),
         angles=(entry["theta_rad"], entry["phi_rad"], entry["zeta_rad"]),
-        whisker=whisker,
+        whisker=published_whisker(*size, species=species),
     )
 
 

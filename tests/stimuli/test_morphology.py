@@ -110,3 +110,48 @@ def test_properties_of_selected_whiskers_can_be_replaced():
 
 def test_the_published_angles_are_in_radians():
     assert all(abs(angle) < math.pi for mount in WhiskerArray.rat(side="both") for angle in mount.angles)
+
+
+# Rows A, C and E, columns 0 to 6 of the model rat's tables in SeNSE-lab/whiskitphysics
+# (code/data/whisker_param_model_rat/param_s_a.csv): arc length in mm and curvature in 1/mm depend on the column alone.
+MODEL_RAT = [
+    (53.835, 0.006352),
+    (38.717, 0.009568),
+    (27.845, 0.012784),
+    (20.025, 0.016),
+    (14.402, 0.019216),
+    (10.358, 0.022432),
+    (7.449, 0.025648),
+]
+
+
+def test_the_model_rat_has_the_published_arc_lengths_and_curvatures():
+    model = WhiskerArray.rat(source="model")
+    assert model.names == WhiskerArray.rat().names
+    for mount in model:
+        length, curvature = MODEL_RAT[mount.col]
+        assert mount.whisker.arc_length * 1e3 == pytest.approx(length, abs=6e-4)
+        assert -mount.whisker.curvature / 1e3 == pytest.approx(curvature, abs=1e-9)
+
+
+def test_the_model_rat_lies_close_to_the_average_rat():
+    model, average = WhiskerArray.rat(source="model"), WhiskerArray.rat()
+    gap = [
+        np.linalg.norm(np.subtract(first.position, second.position))
+        for first, second in zip(model, average, strict=True)
+    ]
+    assert np.median(gap) < 1e-3
+    assert max(gap) < 2.5e-3
+    lengths = [
+        (first.whisker.arc_length, second.whisker.arc_length) for first, second in zip(model, average, strict=True)
+    ]
+    assert np.corrcoef(np.log(lengths).T)[0, 1] > 0.95
+    directions = [[base_rotation(mount.angles)[:, 0] for mount in array] for array in (model, average)]
+    assert np.median(np.degrees(np.arccos(np.sum(np.multiply(*directions), axis=1)))) < 20
+
+
+def test_the_mouse_has_no_model_equations_and_says_so():
+    with pytest.raises(UsageError, match="no model equations of the mouse"):
+        WhiskerArray.mouse(source="model")
+    with pytest.raises(UsageError, match="Unknown source of an array 'modell'; did you mean 'model'"):
+        WhiskerArray.rat(source="modell")

@@ -1,0 +1,271 @@
+"""Folders of WHISKiT Physics (Zweifel et al. 2021): parameters read and written, results written.
+
+**Parameters.** Comma-separated tables without headers, one line per whisker, the right side before the left:
+``param_name`` (``RC2``), ``param_side_row_col`` (1 right or 0 left; 1–5 for A–E; column from 0), ``param_s_a``
+(arc length in mm, curvature A of y = A x² in 1/mm), ``param_bp_pos`` (base point in mm), ``param_bp_angles``
+(θ, φ, ζ in rad) and ``param_angles`` (bend of each of 20 links against the one before, rad; the first is 0, so the
+second holds the direction of the second link). They hold no diameters and no material: those come from the
+published rules, as in WHISKiT.
+
+**Results.** One folder per run: ``whisker_ID.csv`` (one name per line); ``dynamics/Fx.csv`` … ``Mz.csv`` (line: time,
+column: whisker); ``kinematics/x|y|z/RC2.csv`` (line: time, columns: base point, then the centre of each link) and
+``kinematics/c/RC2.csv`` (0 or 1 per link: whether it touches). Units there are mN, µN·m and mm. Signs are ours and
+WHISKiT's alike: the action of the whisker on its base, about the base point, in world axes. Time is not written:
+lines follow the frames of the stimulus set. SeNSE-lab's programs end each line with a comma, and its readers drop
+what follows; the thesis's programs write and expect none.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.files import write_text
+from brainbench.stimuli.morphology import MountedWhisker, WhiskerArray, published_whisker
+from brainbench.stimuli.selection import ROWS
+from brainbench.types import CHANNELS
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import ArrayLike, NDArray
+
+BENDS = 20
+"""Links in WHISKiT's table of bends."""
+DIALECTS = ("sense-lab", "thesis")
+
+_MILLI = 1e3
+
+
+def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit") -> WhiskerArray:
+    """Read the whiskers of a parameter folder; see the module for the files.
+
+    Diameters, taper, density, stiffness, damping and friction follow the published rules that the mouse and
+    rat arrays use. ``param_angles`` is not needed: the whole curvature is kept by any number of links.
+
+    Args:
+        folder: holds ``param_name.csv`` and the other tables.
+        species: name given to the array.
+
+    Raises:
+        DataError: a file is missing, or the tables do not fit together.
+    """
+    root = Path(folder)
+    names = _names(root)
+    grid = _table(root, "param_side_row_col", len(names), 3)
+    shape = _table(root, "param_s_a", len(names), 2)
+    position = _table(root, "param_bp_pos", len(names), 3)
+    angles = _table(root, "param_bp_angles", len(names), 3)
+    mounts = []
+    for name, (side, row, col), (length, curvature), place, turn in zip(
+        names, grid.astype(int), shape, position, angles, strict=True
+    ):
+        expected = f"{'R' if side == 1 else 'L'}{ROWS[row - 1] if 1 <= row <= len(ROWS) else '?'}{col}"
+        if name != expected:
+            raise DataError(
+                f"{os.fspath(root)!r}: param_name says {name!r} where param_side_row_col says {expected!r}; the tables "
+                "do not list the same whiskers in the same order."
+            )
+        mounts.append(
+            MountedWhisker(
+                name=name[1:],
+                side="right" if side == 1 else "left",
+                row=int(row) - 1,
+                col=int(col),
+                position=_triple(place * 1e-3),
+                angles=_triple(turn),
+                whisker=published_whisker(float(length), float(curvature), int(row) - 1, int(col)),
+            )
+        )
+    return WhiskerArray(species, tuple(mounts), f"WHISKiT parameter folder {root.name}")
+
+
+def load_bends(folder: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """Read ``param_angles``: the bend [whisker, link] (rad) of each link against the one before.
+
+    Raises:
+        DataError: the file is missing or does not fit the names.
+    """
+    return _table(Path(folder), "param_angles", len(_names(Path(folder))), None)
+
+
+def bends(array: WhiskerArray, links: int = BENDS) -> NDArray[np.float64]:
+    """Return the bends [whisker, link] (rad) that ``param_angles`` holds, from the exact parabola.
+
+    WHISKiT's own table is computed from an approximate arc length and differs by up to 2 %.
+    """
+    found = np.zeros((len(array), links))
+    for index, mount in enumerate(array):
+        points = mount.whisker.centre_line(np.linspace(0.0, mount.whisker.arc_length, links + 1))
+        directions = np.arctan2(*np.diff(points, axis=0).T[::-1])
+        found[index, 1:] = np.diff(directions, prepend=0.0)[1:]
+        found[index, 1] += directions[0]
+    return found
+
+
+def save_parameters(
+    array: WhiskerArray, folder: str | os.PathLike[str], *, bends_table: ArrayLike | None = None
+) -> Path:
+    """Write an array as a parameter folder that WHISKiT reads; existing tables are replaced.
+
+    Diameters and material have no place there and are not written.
+
+    Args:
+        array: one side or both.
+        folder: created when missing.
+        bends_table: [whisker, link] (rad), such as :func:`load_bends` read; :func:`bends` of the array when None.
+
+    Raises:
+        UsageError: the bends do not fit the array.
+    """
+    table = bends(array) if bends_table is None else np.asarray(bends_table, dtype=float)
+    if table.ndim != 2 or len(table) != len(array):
+        raise UsageError(
+            f"The bends of {len(array)} whiskers have shape [{len(array)}, links]; received {table.shape}."
+        )
+    root = Path(folder)
+    mounts = array.mounts
+    rows: dict[str, list[list[str]]] = {
+        "param_name": [[_full_name(mount)] for mount in mounts],
+        "param_side_row_col": [[str(int(m.side == "right")), str(m.row + 1), str(m.col)] for m in mounts],
+        "param_s_a": [[_text(m.whisker.arc_length * _MILLI), _text(-m.whisker.curvature / _MILLI)] for m in mounts],
+        "param_bp_pos": [[_text(value * _MILLI) for value in m.position] for m in mounts],
+        "param_bp_angles": [[_text(value) for value in m.angles] for m in mounts],
+        "param_angles": [[_text(value) for value in line] for line in table],
+    }
+    for name, lines in rows.items():
+        write_text(root / f"{name}.csv", "".join(",".join(line) + "\n" for line in lines))
+    return root
+
+
+def save_run(
+    dataset: xr.Dataset,
+    folder: str | os.PathLike[str],
+    *,
+    stimulus: str | None = None,
+    shapes: Sequence[ArrayLike] | None = None,
+    dialect: Literal["sense-lab", "thesis"] = "sense-lab",
+) -> Path:
+    """Write one stimulus of a stimulus set in WHISKiT's output layout; see the module for files, units and signs.
+
+    Args:
+        dataset: a stimulus set in world axes.
+        folder: created when missing.
+        stimulus: label of the stimulus; may be None when the set has one.
+        shapes: joints and tip of each whisker [time, links + 1, 3] (m, world), in the order of the whiskers, as a
+            backend records them; without them no ``kinematics`` are written.
+        dialect: ``sense-lab`` ends lines with a comma, ``thesis`` does not.
+
+    Raises:
+        UsageError: the stimulus is unknown or not said, whiskers lack a side, or the shapes do not fit.
+    """
+    from brainbench.types import check_stimulus_set
+
+    check_stimulus_set(dataset)
+    if dialect not in DIALECTS:
+        raise unknown_name("dialect", dialect, DIALECTS)
+    labels = [str(label) for label in dataset["stimulus"].values]
+    if stimulus is None and len(labels) > 1:
+        raise UsageError(f"The stimulus set has {len(labels)} stimuli; say which one to write: {labels[0]!r}, …")
+    chosen = labels[0] if stimulus is None else stimulus
+    if chosen not in labels:
+        raise unknown_name("stimulus", chosen, labels)
+    if not str(dataset.attrs.get("frame", "world")).startswith("world"):
+        raise UsageError("WHISKiT's results are in world axes; read the stimulus set in world axes to write them.")
+    one = dataset.isel(stimulus=labels.index(chosen))
+    names = _run_names(one)
+    end = ",\n" if dialect == "sense-lab" else "\n"
+    root = Path(folder)
+    write_text(root / "whisker_ID.csv", "".join(name + end for name in names))
+    wrench = one["wrench"].values.astype(float) * np.repeat([1e3, 1e6], 3)
+    for index, channel in enumerate(CHANNELS):
+        _write(root / "dynamics" / f"{channel}.csv", wrench[:, :, index], end)
+    if shapes is not None:
+        _write_kinematics(one, root / "kinematics", names, shapes, end)
+    return root
+
+
+def _write_kinematics(one: xr.Dataset, root: Path, names: Sequence[str], shapes: Sequence[ArrayLike], end: str) -> None:
+    times = one.sizes["time"]
+    if len(shapes) != len(names):
+        raise UsageError(f"{len(names)} whiskers need as many shapes; received {len(shapes)}.")
+    arcs, touches = one["contact_arc"].values, one["contact"].values
+    for index, (name, shape) in enumerate(zip(names, shapes, strict=True)):
+        joints = np.asarray(shape, dtype=float)
+        if joints.ndim != 3 or joints.shape[0] != times or joints.shape[1] < 2 or joints.shape[2] != 3:
+            raise UsageError(f"The shape of {name} is [{times}, links + 1, 3]; received {joints.shape}.")
+        links = joints.shape[1] - 1
+        points = np.concatenate([joints[:, :1], (joints[:, :-1] + joints[:, 1:]) / 2], axis=1) * _MILLI
+        for axis, letter in enumerate("xyz"):
+            _write(root / letter / f"{name}.csv", points[:, :, axis], end)
+        flags = np.zeros((times, links), dtype=int)
+        when = np.flatnonzero(touches[:, index] & np.isfinite(arcs[:, index]))
+        # Links do not stretch, so their chords in any frame tell the arc length.
+        length = np.linalg.norm(np.diff(joints[0], axis=0), axis=1).sum()
+        link = np.clip((arcs[when, index] / length * links).astype(int), 0, links - 1)
+        flags[when, link] = 1
+        write_text(root / "c" / f"{name}.csv", "".join(",".join(map(str, line)) + end for line in flags.tolist()))
+
+
+def _run_names(one: xr.Dataset) -> list[str]:
+    """Names with their side: ``RC2``."""
+    if "side" not in one.coords:
+        raise UsageError("The stimulus set does not say on which side its whiskers are; WHISKiT's names need it.")
+    sides = [str(side)[0].upper() for side in one["side"].values]
+    rows, cols = one["row"].values.astype(int), one["col"].values.astype(int)
+    names = [f"{side}{ROWS[row]}{col}" for side, row, col in zip(sides, rows, cols, strict=True)]
+    if len(set(names)) < len(names):
+        raise UsageError("The stimulus set has several animals; a WHISKiT run has one: select its whiskers first.")
+    return names
+
+
+def _write(path: Path, values: NDArray[np.float64], end: str) -> None:
+    lines = (",".join(f"{value:.7g}" for value in line) for line in values.tolist())
+    write_text(path, "".join(line + end for line in lines))
+
+
+def _names(root: Path) -> list[str]:
+    text = _read(root / "param_name.csv")
+    return [line.strip().rstrip(",") for line in text.splitlines() if line.strip()]
+
+
+def _table(root: Path, name: str, lines: int, columns: int | None) -> NDArray[np.float64]:
+    path = root / f"{name}.csv"
+    text = _read(path)
+    try:
+        rows = [[float(cell) for cell in line.rstrip(", ").split(",")] for line in text.splitlines() if line.strip()]
+        table = np.array(rows, dtype=float)
+    except ValueError as error:
+        raise DataError(f"{os.fspath(path)!r} is not a table of numbers ({error}).") from error
+    if table.ndim != 2 or len(table) != lines or (columns is not None and table.shape[1] != columns):
+        raise DataError(
+            f"{os.fspath(path)!r} has shape {list(table.shape)}; {lines} names need [{lines}, {columns or 'links'}]."
+        )
+    return table
+
+
+def _read(path: Path) -> str:
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}; a WHISKiT parameter folder has one.")
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
+
+
+def _full_name(mount: MountedWhisker) -> str:
+    return mount.side[0].upper() + mount.name
+
+
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _text(value: float) -> str:
+    """Enough digits for any published table, and none that only changing the unit brought in."""
+    return f"{value:.12g}"
