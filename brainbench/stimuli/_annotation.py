@@ -39,8 +39,9 @@ class Annotation:
         self._edge = 36 * self._unit
         scene = picture.recording.scene
         self._text(self._edge, self._edge, scene.label, size=26, weight="bold", va="top")
-        count, thick = len(scene.array), picture.style.thickness
-        caption = f"{scene.array.species}, {count} whisker{'s' if count > 1 else ''}"
+        count, thick = len(scene.mounts), picture.style.thickness
+        animals = f"{len(scene.split())} animals" if scene.others else scene.array.species
+        caption = f"{animals}, {count} whisker{'s' if count > 1 else ''}"
         caption += "" if thick == 1 else f" drawn {thick:g}× as thick"
         self._text(self._edge, self._edge + 38 * self._unit, caption, size=15, color=PALE, va="top")
         self._time = self._text(self.width - self._edge, self._edge, "", size=22, ha="right", va="top")
@@ -112,7 +113,7 @@ class Annotation:
             self._text(*place, name, size=14, color=PALE, ha=side, va=height)
 
     def _row_key(self) -> None:
-        rows = sorted({mount.row for mount in self.picture.recording.scene.array})
+        rows = sorted({mount.row for mount in self.picture.recording.scene.mounts})
         top = self._edge + 84 * self._unit
         for place, row in enumerate(rows):
             y = top + 26 * self._unit * place

@@ -154,7 +154,9 @@ def _figure(stimulus: xr.Dataset, label: str, channel: str, limit: float, size: 
     panels[0, 0].set(xlim=(times[0], times[-1]), ylim=(lower - 0.04 * limit, 1.04 * limit))
     panels[0, 0].set_yticks([lower, 0, limit] if lower else [0, limit / 2, limit])
     panels[0, 0].locator_params(axis="x", nbins=4)
-    _legend(figure, label, channel, points)
+    # The attribute begins with the axes, "world axes; …" or "follicle axes; …".
+    axes = str(stimulus.attrs.get("frame", "world")).split()[0]
+    _legend(figure, label, channel, axes, points)
     return figure
 
 
@@ -182,7 +184,7 @@ def _panel(panel: Axes, whisker: xr.Dataset, values: NDArray[np.float64], name: 
         panel.spines[side].set(color=PALE, linewidth=0.8 * points)
 
 
-def _legend(figure: Figure, label: str, channel: str, points: float) -> None:
+def _legend(figure: Figure, label: str, channel: str, axes: str, points: float) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -193,7 +195,7 @@ def _legend(figure: Figure, label: str, channel: str, points: float) -> None:
     figure.text(
         0.02,
         0.92,
-        f"{kind} of the whisker on its base, {what} ({unit}), world axes",
+        f"{kind} of the whisker on its base, {what} ({unit}), {axes} axes",
         fontsize=16 * points,
         color=PALE,
         va="center",

@@ -44,7 +44,7 @@ class Recording:
     @property
     def unstable(self) -> tuple[str, ...]:
         """Names of the whiskers whose shape is not known at every instant."""
-        pairs = zip(self.scene.array.names, self.joints, strict=True)
+        pairs = zip(self.scene.names, self.joints, strict=True)
         return tuple(name for name, points in pairs if not np.isfinite(points).all())
 
 
@@ -84,8 +84,10 @@ def record(
         if path is not None:
             _write(path, local)
     moments = tuple(bending_moments(job, points) for job, points in zip(jobs, local, strict=True))
-    # Jobs stand in the array frame as it was at t = 0.
-    joints = tuple(points @ scene.head.matrix.T + np.asarray(scene.head.position) for points in local)
+    # Jobs stand in the frame of their array as it was at t = 0.
+    origins = [part.head.position for part in scene.split() for _ in part.array]
+    places = zip(local, scene.axes, origins, strict=True)
+    joints = tuple(points @ axes.T + np.asarray(origin) for points, axes, origin in places)
     return Recording(scene, times, joints, moments)
 
 

@@ -143,7 +143,7 @@ class Picture:
     def _whiskers(self, index: int, lens: Lens) -> Triangles:
         found = []
         recording = self.recording
-        for mount, joints, moments in zip(recording.scene.array, recording.joints, recording.moments, strict=True):
+        for mount, joints, moments in zip(recording.scene.mounts, recording.joints, recording.moments, strict=True):
             points = joints[index]
             if not np.isfinite(points).all():
                 continue

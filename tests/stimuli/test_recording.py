@@ -1,5 +1,6 @@
 import dataclasses
 import logging
+import math
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ from brainbench.stimuli.backends.mujoco import MujocoBackend
 from brainbench.stimuli.backends.protocol import base_rotation
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import Still, Whisking
+from brainbench.stimuli.motion import Still, Translation, Whisking
 from brainbench.stimuli.objects import euler_matrix
 from brainbench.stimuli.recording import record
-from brainbench.stimuli.scene import Frames, Head, Scene
+from brainbench.stimuli.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 
 from .fakes import FakeBackend
@@ -98,3 +99,21 @@ def test_a_backend_without_shapes_is_refused_in_words():
 def test_times_must_increase():
     with pytest.raises(UsageError, match="increasing"):
         _record(Scene("air", ARRAY), [0.02, 0.01])
+
+
+def test_every_animal_is_drawn_where_it_stands():
+    far = Animal("b", ARRAY, Still(), Head((0.05, 0.0, 0.0), (0.0, 0.0, math.pi)))
+    scene = Scene("two", ARRAY, whisking=Still(), others=(far,))
+    shown = _record(scene, [0.001])
+    assert len(shown.joints) == len(scene.names) == 4
+    turned = shown.joints[0] @ euler_matrix((0.0, 0.0, math.pi)).T + [0.05, 0.0, 0.0]
+    np.testing.assert_allclose(shown.joints[2], turned, atol=1e-9)
+
+
+def test_shapes_travel_with_the_head():
+    head = Head(motion=Translation((0.1, 0.0, 0.0), 0.0))
+    shown = _record(Scene("travelling", ARRAY, whisking=Still(), head=head), [0.0, 0.1])
+    for joints in shown.joints:
+        np.testing.assert_allclose(joints[1, 0] - joints[0, 0], [0.01, 0.0, 0.0], atol=1e-9)
+        # In steady motion nothing bends any more.
+        np.testing.assert_allclose(joints[1] - joints[0], np.tile([0.01, 0.0, 0.0], (len(joints[0]), 1)), atol=1e-5)

@@ -57,7 +57,7 @@ def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:
     return {
         "name": recipe.name,
         "description": recipe.description.strip(),
-        "array": {"species": array.species, "side": array.side, "whiskers": list(array.names)},
+        "array": {"species": array.species, "side": array.side, "whiskers": list(scenes[0].names)},
         "scenes": described,
     }
 
@@ -88,6 +88,9 @@ def _text(data: dict[str, Any]) -> str:
     array, scenes = data["array"], data["scenes"]
     frames = scenes[0]["frames"]
     readings = "instantaneous" if frames["average"] == 1 else f"each the mean of {frames['average']} readings"
+    readings += f", low-pass {frames['lowpass']:g} Hz" if frames.get("lowpass") else ""
+    readings += f", clipped to ±{frames['clip']:g} N" if frames.get("clip") else ""
+    readings += f", {frames['axes']} axes" if frames.get("axes", "world") != "world" else ""
     span = f"{frames['count']} from {_milli(frames['first'])} ms every {_milli(frames['interval'])} ms"
     lines = [
         f"{data['name']}: {data['description']}",
@@ -110,6 +113,10 @@ def _rows(scene: dict[str, Any]) -> list[list[str]]:
         [scene["label"], "head", _point(head["position"]), _angles(head["rotation"]), _motion(head["motion"]), ""],
         ["", "whiskers", "", "", _motion(scene["whisking"]), ""],
     ]
+    for other in scene.get("others", ()):
+        place = _point(other["head"]["position"]), _angles(other["head"]["rotation"])
+        rows.append(["", f"head of {other['animal']}", *place, _motion(other["head"]["motion"]), ""])
+        rows.append(["", f"whiskers of {other['animal']}", "", "", _motion(other["whisking"]), ""])
     for item in scene["objects"]:
         solid, friction = item["solid"], item["friction"]
         size = solid.get("size")
@@ -136,12 +143,11 @@ def _motion(config: dict[str, Any]) -> str:
     if kind == "translation":
         velocity = ", ".join(_milli(value) for value in config["velocity"])
         return f"({velocity}) mm/s, onset {_milli(config['onset'])} ms"
-    rest = ", ".join(f"{name} {value}" for name, value in config.items() if name != "kind" and not _long(value))
-    return f"{kind} {rest}".rstrip()
-
-
-def _long(value: Any) -> bool:
-    return isinstance(value, (list, dict)) and len(value) > 4
+    if kind == "recorded":
+        return f"recorded for {config['duration']:g} s, from {config['start']:g} s, trajectory {config['trajectory']}"
+    if kind == "path":
+        return f"path of {len(config['times'])} keyframes in {config['times'][-1]:g} s"
+    return str(kind)
 
 
 def _milli(value: float) -> str:
