@@ -69,6 +69,14 @@ class Chain:
         )
         return 1 / np.sqrt(inverse[::-1])
 
+    def mode_shape(self, mode: int) -> NDArray[np.float64]:
+        """Bend of each joint [N] (rad, largest 1) in one undamped mode of small planar motion, 0 for the first."""
+        from scipy.linalg import eigh
+
+        index = self.links - 1 - mode
+        _, shapes = eigh(self._planar_mass(), np.diag(self.stiffness), subset_by_index=[index, index])
+        return shapes[:, 0] / np.abs(shapes[:, 0]).max()
+
     def damping(self, time_step: float) -> NDArray[np.float64]:
         """Damping of each hinge [N] (N·m·s/rad) that gives the first mode the whisker's damping ratio.
 
@@ -134,8 +142,9 @@ def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
             total[i - 1] += flexibility @ (s / cell - i) ** 2
             continue
         if whisker.radius(low) > _STEEPEST * whisker.radius(high):
-            # Across such a steep cell a parabola would take more from a neighbour than that has; keep it whole.
-            total[i] += flexibility.sum()
+            # Across such a steep cell a parabola would take more from a neighbour than that has; keep it whole, with
+            # a moment that falls towards the tip as under loads spread along a cone.
+            total[i] += flexibility @ ((whisker.arc_length - s) / (whisker.arc_length - i * cell)) ** 3
             continue
         middle = max(i, 1)
         x = s / cell - middle

@@ -144,13 +144,14 @@ def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[f
     return contact.point[0] + gap * math.sin(contact.slope), contact.point[1] - gap * math.cos(contact.slope)
 
 
-def slip_off_offset(whisker: Whisker, at: float, *, side: int = 1) -> float:
-    """Offset [m] at which a frictionless point peg at distance ``at`` [m] loses the whisker.
+def slip_off_offset(whisker: Whisker, at: float, *, side: int = 1, peg_radius: float | None = None) -> float:
+    """Offset [m] at which a frictionless peg at distance ``at`` [m] loses the whisker.
 
-    Beyond it no equilibrium exists: the contact has run to the tip, or the rod yields without limit.
+    Beyond it no equilibrium exists: the contact has run to the tip, or the rod yields without limit. The offset
+    is that of the centre-line point at the contact of a point peg, or of the axis of a round peg of ``peg_radius`` [m].
     """
     _check_at(whisker, at)
-    return _Branch(whisker, at, side).limit()
+    return _Branch(whisker, at, side, peg_radius).limit()
 
 
 class _Branch:
@@ -217,7 +218,8 @@ class _Branch:
         rest = math.atan(2 * self.curvature * self.at)
         slope, previous = rest, None
         guess = np.array([0.0, self._rest_arc()])
-        while slope < math.pi / 2 + rest:
+        # Near the fold the rod turns back over the peg: slopes beyond 90° are equilibria too.
+        while slope < math.pi + rest:
             settled = self._settle(slope, guess)
             height = self._height(slope, settled)
             if not self._valid(settled):

@@ -17,6 +17,7 @@ from brainbench.errors import DataError, UsageError
 from brainbench.stimuli import references
 from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.backends.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.obstacle import Capsule, Obstacle
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.stimuli.backends.protocol import Trace
+    from brainbench.stimuli.obstacle import RigidMotion
     from brainbench.stimuli.whisker import Whisker
 
 
@@ -71,6 +73,12 @@ class Ringdown:
     """Measured damping ratio of the first mode."""
     reference_frequency: float
     """Euler-Bernoulli frequency of the first mode (Hz)."""
+    frequencies: NDArray[np.float64]
+    """[m] measured undamped frequencies of the lowest modes (Hz); the first is :attr:`frequency`."""
+    damping_ratios: NDArray[np.float64]
+    """[m] their measured damping ratios; the first is :attr:`damping_ratio`, the others were set to .05."""
+    reference_frequencies: NDArray[np.float64]
+    """[m] Euler-Bernoulli frequencies (Hz)."""
     times: NDArray[np.float64]
     """[n] time since the release (s)."""
     wrench: NDArray[np.float64]
@@ -80,6 +88,28 @@ class Ringdown:
     def frequency_error(self) -> float:
         """Relative error of the frequency (signed)."""
         return self.frequency / self.reference_frequency - 1
+
+    @property
+    def frequency_errors(self) -> NDArray[np.float64]:
+        """[m] relative errors of the frequencies (signed)."""
+        return self.frequencies / self.reference_frequencies - 1
+
+
+@dataclass(frozen=True, eq=False)
+class SlipOff:
+    """A peg raised until the whisker slips off."""
+
+    depth: float
+    """Measured travel of the peg from first touch to losing the whisker (m)."""
+    reference_depth: float
+    """Travel at which the elastica has no equilibrium any more (m)."""
+    trace: Trace
+    """The whole simulation."""
+
+    @property
+    def error(self) -> float:
+        """Relative error of the depth (signed)."""
+        return self.depth / self.reference_depth - 1
 
 
 def point_load(
@@ -140,12 +170,9 @@ def peg(
         UsageError: the whisker is curved, the offset is zero, or the whisker would slip off the peg.
         DataError: the simulation was unstable.
     """
-    if whisker.curvature:
-        raise UsageError(f"The peg test takes a straight whisker; this one has curvature {whisker.curvature:g} 1/m.")
+    _check_peg(whisker, peg_radius)
     if offset == 0:
         raise UsageError("The peg test needs an offset other than zero.")
-    if not peg_radius > 0:
-        raise UsageError(f"peg_radius must be positive (m); received {peg_radius!r}.")
     contact = references.elastica(whisker, at, offset)
     fidelity = _fidelity(fidelity)
     end = np.array(references.peg_centre(whisker, contact, peg_radius))
@@ -160,39 +187,93 @@ def peg(
         position[:, :2] = start + (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * (end - start)
         return position, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
 
-    half = whisker.arc_length
-    rod = Obstacle((Capsule((0.0, 0.0, -half), (0.0, 0.0, half), peg_radius),), motion, friction=0.0)
     # Critical damping changes only how soon the end state is reached.
     critical = replace(whisker, damping_ratio=1.0)
+    rod = _peg_obstacle(whisker, peg_radius, motion)
     trace = _run(backend, Job(critical, StillFollicle(), (rod,), np.array([duration + settling])), fidelity)
     return BenchTest(trace.wrench[-1], contact.wrench, float(trace.contact_arc[-1]), trace)
+
+
+def slip_off(
+    whisker: Whisker,
+    at: float,
+    *,
+    peg_radius: float = 2.5e-4,
+    backend: str = "mujoco",
+    fidelity: Fidelity | str = "balanced",
+) -> SlipOff:
+    """Raise a frictionless round peg at distance ``at`` (m) from the base until the whisker slips off it.
+
+    The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity.
+
+    Raises:
+        UsageError: the whisker is curved, or ``at`` lies beyond it.
+        DataError: the simulation was unstable, or the whisker was still held an eighth beyond the reference depth.
+    """
+    _check_peg(whisker, peg_radius)
+    fidelity = _fidelity(fidelity)
+    touch = -(peg_radius + float(whisker.radius(at)))
+    expected = references.slip_off_offset(whisker, at, peg_radius=peg_radius) - touch
+    settling = _settling_time(whisker)
+    # Near the end it creeps, because the last fold takes the longer the nearer it is to equilibrium.
+    duration, approach = 70 * settling, 10 * settling
+
+    def depth(times: NDArray[np.float64]) -> NDArray[np.float64]:
+        return expected * np.interp(times, [0.0, approach, duration], [0.0, 0.94, 1.12])
+
+    def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        position = np.zeros((len(times), 3))
+        position[:, 0] = at
+        position[:, 1] = touch + depth(times)
+        return position, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+
+    times = np.linspace(0, duration, 2001)[1:]
+    critical = replace(whisker, damping_ratio=1.0)
+    rod = _peg_obstacle(whisker, peg_radius, motion)
+    trace = _run(backend, Job(critical, StillFollicle(), (rod,), times), fidelity)
+    held = np.flatnonzero(trace.contact)
+    if not len(held) or held[-1] == len(times) - 1:
+        raise DataError(
+            f"The whisker did not slip off the peg at {at:g} m within 1.12 times the depth of the elastica "
+            f"({expected:.4g} m)."
+        )
+    return SlipOff(float(depth(times[held[-1] + 1])), float(expected), trace)
 
 
 def ringdown(
     whisker: Whisker,
     *,
+    modes: int = 3,
     deflection: float = 1e-3,
     backend: str = "mujoco",
     fidelity: Fidelity | str = "accurate",
 ) -> Ringdown:
-    """Let a bent whisker go and fit its first mode.
+    """Let a bent whisker go and fit its lowest modes.
 
-    A tip load bends it by ``deflection`` (fraction of the arc length, small), settles, and vanishes; a
-    decaying sinusoid is fitted to the base moment after the higher modes have died.
+    First mode, with the whisker's damping and the fidelity's time step: a tip load bends it by ``deflection``
+    (fraction of the arc length, small), settles, and vanishes; a decaying sinusoid is fitted to the base moment
+    after the higher modes have died. Modes 2 … ``modes`` would not ring with the whisker's own damping, which is
+    proportional to stiffness, and the presets' steps are not made for them. Each is rung alone, by loads
+    that bend the chain in its shape, with damping ratio .05 and at most 1/100 of its period per step, and read
+    at the tip: these frequencies test the chain of links, not the time step.
 
     Raises:
-        UsageError: the whisker is curved or its damping ratio is not between 0 and 1, so nothing rings.
+        UsageError: the whisker is curved, its damping ratio is not between 0 and 1, so nothing rings, or ``modes``
+            is not between 1 and 5.
         DataError: the simulation was unstable, or nothing rang: the time step overdamps the whisker.
     """
     if not 0 < whisker.damping_ratio < 1:
         raise UsageError(
             f"A ring-down needs a damping ratio between 0 and 1; this whisker has {whisker.damping_ratio:g}."
         )
+    if not 1 <= modes <= 5:
+        raise UsageError(f"modes of a ring-down must lie between 1 and 5; received {modes!r}.")
     fidelity = _fidelity(fidelity)
-    expected = float(references.natural_frequencies(whisker, 1)[0])
+    references_hz = references.natural_frequencies(whisker, modes)
+    expected = float(references_hz[0])
     force = deflection * whisker.arc_length / references.point_load_deflection(whisker, 1.0, whisker.arc_length)
     release = 8 / (whisker.damping_ratio * 2 * math.pi * expected)
-    step = fidelity.time_step
+    step = fidelity.step(expected)
     release = math.ceil(release / step) * step
     times = release + np.arange(1.0, math.ceil(10 / (whisker.damping_ratio * 2 * math.pi * expected) / step)) * step
     job = Job(
@@ -204,17 +285,66 @@ def ringdown(
     )
     trace = _run(backend, job, fidelity)
     times = times - release
-    frequency, ratio = _fit_decay(times, trace.wrench[:, 5], expected, whisker.damping_ratio)
-    return Ringdown(frequency, ratio, expected, times, trace.wrench)
+    # Stiffness-proportional damping kills the second mode much sooner: one period is enough.
+    kept = times > 1 / expected
+    fits = [_fit_decay(times[kept], trace.wrench[kept, 5], expected, whisker.damping_ratio)]
+    fits += [_ring_mode(whisker, mode, references_hz, backend, fidelity) for mode in range(1, modes)]
+    frequencies, ratios = np.array(fits).T
+    return Ringdown(
+        frequency=fits[0][0],
+        damping_ratio=fits[0][1],
+        reference_frequency=expected,
+        frequencies=frequencies,
+        damping_ratios=ratios,
+        reference_frequencies=references_hz,
+        times=times,
+        wrench=trace.wrench,
+    )
+
+
+def _ring_mode(whisker: Whisker, mode: int, expected: NDArray, backend: str, fidelity: Fidelity) -> tuple[float, float]:
+    """Frequency (Hz) and damping ratio of one mode (0 = first), rung alone by a constant load in its shape."""
+    ratio, period = 0.05, 1 / float(expected[mode])
+    chain = build_chain(whisker, fidelity.link_count(whisker.arc_length))
+    if mode >= chain.links:
+        raise UsageError(f"A chain of {chain.links} links has no mode {mode + 1}; ask for fewer modes or more links.")
+    # Torque of a load at node i about joint j is its lever; solve for the loads that bend the joints as the mode does.
+    bends = chain.mode_shape(mode)
+    levers = np.triu(chain.nodes[None, 1:] - chain.nodes[:-1, None])
+    bends = bends * (1e-3 * whisker.arc_length / np.abs(levers.T @ bends).max())
+    forces = np.linalg.solve(levers, chain.stiffness * bends)
+    fine = replace(fidelity, time_step=min(fidelity.time_step, period / 100), steps_per_period=None)
+    # Damping proportional to stiffness grows with frequency.
+    light = replace(whisker, damping_ratio=ratio * float(expected[0] / expected[mode]))
+    times = np.asarray(np.arange(1, 1201) * (period / 100), dtype=np.float64)
+    loads = tuple(
+        Load(float(arc), (0.0, float(force), 0.0)) for arc, force in zip(chain.nodes[1:], forces, strict=True)
+    )
+    trace = _run(backend, Job(light, StillFollicle(), (), times, loads=loads), fine)
+    assert trace.link_positions is not None
+    # The mode swings about its static bend under the loads.
+    tip = trace.link_positions[:, -1, 1] - float(levers[:, -1] @ bends)
+    return _fit_decay(times, tip, 1 / period, ratio)
+
+
+def _peg_obstacle(whisker: Whisker, radius: float, motion: RigidMotion) -> Obstacle:
+    """Return a frictionless round rod along z, longer than the whisker."""
+    half = whisker.arc_length
+    return Obstacle((Capsule((0.0, 0.0, -half), (0.0, 0.0, half), radius),), motion, friction=0.0)
+
+
+def _check_peg(whisker: Whisker, peg_radius: float) -> None:
+    if whisker.curvature:
+        raise UsageError(f"The peg test takes a straight whisker; this one has curvature {whisker.curvature:g} 1/m.")
+    if not peg_radius > 0:
+        raise UsageError(f"peg_radius must be positive (m); received {peg_radius!r}.")
 
 
 def _fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) -> tuple[float, float]:
     """Undamped frequency (Hz) and damping ratio of a decaying sinusoid."""
     from scipy.optimize import curve_fit
 
-    # Stiffness-proportional damping kills the second mode much sooner: one period is enough.
-    kept = times > 1 / frequency
-    scale = float(np.abs(signal[kept]).max())
+    scale = float(np.abs(signal).max())
 
     def model(t: NDArray, omega: float, zeta: float, a: float, b: float) -> NDArray:
         ringing = omega * math.sqrt(max(1 - zeta**2, 1e-12)) * t
@@ -222,9 +352,7 @@ def _fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) 
 
     start = (2 * math.pi * frequency, ratio, 1.0, 0.0)
     try:
-        found, _ = curve_fit(
-            model, times[kept], signal[kept] / scale, p0=start, bounds=((0, 0, -1e6, -1e6), (np.inf, 1, 1e6, 1e6))
-        )
+        found, _ = curve_fit(model, times, signal / scale, p0=start, bounds=((0, 0, -1e6, -1e6), (np.inf, 1, 1e6, 1e6)))
     except (RuntimeError, ValueError) as error:
         raise DataError(
             f"No decaying oscillation could be fitted to the ring-down ({error}); choose a smaller time step."

@@ -42,12 +42,20 @@ def test_links_per_mm_give_long_whiskers_more_links():
         Fidelity(links_per_mm=10).link_count(0.05)
 
 
+def test_stiff_whiskers_get_shorter_steps():
+    fidelity = Fidelity(time_step=1e-4, steps_per_period=25)
+    assert fidelity.step(100.0) == 1e-4
+    assert fidelity.step(1000.0) == pytest.approx(4e-5)
+    assert Fidelity(time_step=1e-4).step(1000.0) == 1e-4
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"links": 1}, "links must lie between 2 and 100"),
         ({"links_per_mm": 0.0}, "links_per_mm must be positive"),
         ({"time_step": 0.1}, "time_step must lie between"),
+        ({"steps_per_period": 1}, "steps_per_period must lie between"),
     ],
 )
 def test_impossible_settings_are_refused(values, message):

@@ -114,6 +114,22 @@ def test_beyond_the_slip_off_offset_there_is_no_equilibrium():
         references.elastica(C2, at, 1.01 * limit)
 
 
+def test_near_the_base_a_whisker_turns_back_over_the_peg_before_it_slips_off():
+    at = 0.3 * C2.arc_length
+    limit = references.slip_off_offset(C2, at)
+    last = references.elastica(C2, at, 0.999 * limit)
+    assert math.pi / 2 < last.slope < math.pi
+    lever = last.point[0] * last.force[1] - last.point[1] * last.force[0]
+    assert last.moment == pytest.approx(lever, rel=1e-9)
+
+
+def test_the_slip_off_depth_of_a_round_peg_tends_to_that_of_a_point_on_a_thin_rod():
+    thin = replace(C2, base_radius=4.8e-8, tip_radius=8.8e-9)
+    at = 0.5 * thin.arc_length
+    point = references.slip_off_offset(thin, at)
+    assert references.slip_off_offset(thin, at, peg_radius=1e-8) == pytest.approx(point, rel=1e-4)
+
+
 def test_a_peg_beyond_the_tip_is_refused():
     with pytest.raises(UsageError, match=r"0 < at ≤ 0\.015265 m"):
         references.elastica(C2, 0.02, 1e-3)

@@ -52,6 +52,11 @@ contact rise by about μ times the slip of one step; at 1 a whisker that sweeps 
 hops (moments several times too large at steps of .1 ms), at .02 it slides, and Coulomb's law is
 approached from below as the step shrinks."""
 
+CONE_SIDES = 8
+"""Sides of the cone inside a tapered link."""
+LEAST_TAPER = 1e-6
+"""Difference of the radii of a link's ends (mm) below which it is a capsule."""
+
 _NOTHING = {"mass": "1e-12", "diaginertia": "1e-14 1e-14 1e-14"}
 
 
@@ -69,6 +74,8 @@ class WhiskerModel:
     """[n, 3, 3] base frame to world before every step."""
     loads: tuple[int, ...]
     """Body on which each load of the job acts."""
+    margins: NDArray[np.float64]
+    """[N] thickness (mm) of each link beyond the core from which contact distances are counted."""
 
 
 def engine() -> Any:
@@ -119,7 +126,7 @@ def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: N
     if path.shape[1]:
         drives.append(drive_scalars(path, step))
     _add(base, "site", name="base", size=1e-3)
-    _add_links(base, job, chain, chain.damping(time_step), reach.nearest)
+    _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest)
     sensors = _add(root, "sensor")
     _add(sensors, "force", site="base")
     _add(sensors, "torque", site="base")
@@ -132,6 +139,7 @@ def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: N
         base=position[:-1],
         rotation=base_rotation(euler)[:-1],
         loads=tuple(model.body(f"load{index}").id for index in range(len(job.loads))),
+        margins=np.array([_thickness(chain, link)[1] for link in range(chain.links)]),
     )
 
 
@@ -163,7 +171,7 @@ def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[El
     return _add(body, "body", name="base"), np.reshape(paths, (len(paths), len(position))).T
 
 
-def _add_links(base: Element, job: Job, chain: Chain, damping: NDArray, nearest: float) -> None:
+def _add_links(base: Element, assets: Element, job: Job, chain: Chain, damping: NDArray, nearest: float) -> None:
     body, end = base, 0.0
     for i in range(chain.links):
         body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
@@ -186,21 +194,38 @@ def _add_links(base: Element, job: Job, chain: Chain, damping: NDArray, nearest:
             mass=chain.masses[i] * MICRO,
             diaginertia=(axial, transverse, transverse),
         )
-        if chain.nodes[i + 1] + chain.radii[i] >= nearest:
-            _add(
-                body,
-                "geom",
-                type="capsule",
-                fromto=(0, 0, 0, end, 0, 0),
-                size=chain.radii[i] * MILLI,
-                contype=1,
-                conaffinity=0,
-            )
+        thickest = float(chain.whisker.radius(chain.nodes[i : i + 2]).max())
+        if chain.nodes[i + 1] + thickest >= nearest:
+            _add(body, "geom", **_segment(chain, i, end, assets), contype=1, conaffinity=0)
         for index, load in enumerate(job.loads):
             if chain.nodes[i] < load.arc <= chain.nodes[i + 1]:
                 share = (load.arc - chain.nodes[i]) / (chain.nodes[i + 1] - chain.nodes[i])
                 point = _add(body, "body", name=f"load{index}", pos=(share * end, 0, 0))
                 _add(point, "inertial", pos="0 0 0", **_NOTHING)
+
+
+def _segment(chain: Chain, link: int, length: float, assets: Element) -> dict[str, object]:
+    """Collision geometry of one link: all points within the thin end's radius of a slim cone of the rest.
+
+    A staircase of capsules would turn the force of a peg that sits on a step dr by up to √(2 dr/R). The cone has
+    the taper as its surface and the margin rounds it, so its facets are smaller than dr and do not matter.
+    """
+    core, margin = _thickness(chain, link)
+    radii = chain.whisker.radius(chain.nodes[link : link + 2])
+    if core == 0:
+        return {"type": "capsule", "fromto": (0, 0, 0, length, 0, 0), "size": radii[0] * MILLI}
+    angle = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
+    wide, apex = (0.0, length) if radii[0] > radii[1] else (length, 0.0)
+    ring = np.stack([np.full(CONE_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)
+    _add(assets, "mesh", name=f"link{link}", vertex=np.append(ring.ravel(), (apex, 0.0, 0.0)), inertia="shell")
+    return {"type": "mesh", "mesh": f"link{link}", "margin": margin, "mass": 0}
+
+
+def _thickness(chain: Chain, link: int) -> tuple[float, float]:
+    """Largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule."""
+    first, last = chain.whisker.radius(chain.nodes[link : link + 2]) * MILLI
+    core = float(abs(first - last))
+    return (core, float(min(first, last))) if core >= LEAST_TAPER else (0.0, 0.0)
 
 
 def _add_obstacles(

@@ -97,7 +97,8 @@ def _processors() -> int:
 
 def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     started = time.thread_time()
-    step = fidelity.time_step
+    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
+    step = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi))
     # Frame f lies at the (fractional) step where; linear interpolation between the two steps around it.
     where = (job.times - job.start) / step
     where = np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
@@ -106,7 +107,6 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     times = job.start + step * np.arange(after[-1] + 2)
     position, _ = job.follicle.pose(times)
     reach = reachable(job.whisker, np.asarray(position, dtype=float), job.obstacles, times)
-    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
     built = build_model(job, chain, reach, step, times)
     still = not built.drives and not job.loads and not np.any(job.gravity)
     if still and not reach.obstacles:
@@ -133,7 +133,7 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
         wrench=np.where(good[:, None], wrench, np.nan),
         contact=contact & good,
         contact_arc=np.where(good, arc, np.nan),
-        penetration=_penetration(sensors[:failed, 6:]),
+        penetration=_penetration(sensors[:failed, 6:], hinges[:failed], built, chain),
         status="unstable" if reason else "ok",
         reason=reason,
         steps=min(failed, len(sensors)),
@@ -253,11 +253,21 @@ def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.
     return chain.nodes[link] + share * np.diff(chain.nodes)[link]
 
 
-def _penetration(slots: NDArray) -> float:
-    """Deepest overlap (m) of whisker and obstacle over all steps."""
-    if not slots.size:
-        return 0.0
-    return max(0.0, -float(slots.reshape(len(slots), -1, SLOT_WIDTH)[..., 4].min())) / MILLI
+def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Chain) -> float:
+    """Deepest overlap (m) of whisker and obstacle over all steps.
+
+    MuJoCo reports the distance from the core of a link, so the link's margin is added back.
+    """
+    slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
+    touching = np.flatnonzero((slots[..., 0] > 0).any(axis=1))
+    deepest = 0.0
+    for steps in np.array_split(touching, len(touching) // CHUNK + 1):
+        found = slots[steps]
+        arcs = _nearest_arcs(found[..., 5:8], _shape(built, chain, hinges[steps], steps), chain)
+        link = np.clip(np.searchsorted(chain.nodes, arcs, side="right") - 1, 0, chain.links - 1)
+        overlap = np.where(found[..., 0] > 0, built.margins[link] - found[..., 4], 0.0)
+        deepest = max(deepest, float(overlap.max(initial=0.0)))
+    return deepest / MILLI
 
 
 def _reason(hinges: NDArray, warned: list[str], moment: float) -> str:
@@ -275,7 +285,8 @@ def _warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:
     """Say when the time step alone damps a whisker at least twice as much as it should be damped."""
     worst, wanted = 0.0, 0.0
     for whisker in {job.whisker for job in jobs}:
-        ratio = build_chain(whisker, 8).achieved_damping_ratio(fidelity.time_step)
+        chain = build_chain(whisker, 8)
+        ratio = chain.achieved_damping_ratio(fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi)))
         if ratio > 2 * whisker.damping_ratio and ratio > worst:
             worst, wanted = ratio, whisker.damping_ratio
     if worst:

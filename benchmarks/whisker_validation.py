@@ -1,0 +1,148 @@
+"""Measure every preset against the elastica, the slip-off depth and the Euler-Bernoulli frequencies.
+
+Run from the repository root: ``python benchmarks/whisker_validation.py``; it rewrites its section of RESULTS.md.
+The gates (base moment/force of pegs, slip-off, frequencies, damping ratio) are those of :data:`GATES`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from results import table, write_section
+
+from brainbench.errors import BrainbenchError
+from brainbench.stimuli import references, validation
+from brainbench.stimuli.fidelity import Fidelity, list_presets
+from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.stimuli.whisker import Whisker
+
+ARCS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+OFFSETS = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
+GATES = {
+    "accurate": {"moment": 0.01, "force": 0.02, "slip": 0.03, "frequency": 0.01, "damping": 0.05},
+    "balanced": dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.05),
+    "fast": dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.15),
+}
+"""Largest relative errors allowed where the contact slope is at most 60° and the depth at most .9 of slip-off."""
+
+
+def subjects() -> dict[str, Whisker]:
+    """Straightened published whiskers and two synthetic rods."""
+    mouse, rat = WhiskerArray.mouse(), WhiskerArray.rat()
+    whiskers = {f"mouse {name}": replace(mouse[name].whisker, curvature=0.0) for name in ("C2", "A4", "E5")}
+    whiskers["rat C1"] = replace(rat["C1"].whisker, curvature=0.0)
+    whiskers["uniform"] = Whisker(0.015, 30e-6, 30e-6, young_modulus=5e9, density=1300.0, damping_ratio=0.32)
+    whiskers["taper 20:1"] = Whisker(0.020, 60e-6, 3e-6, young_modulus=3e9, density=1300.0, damping_ratio=0.32)
+    return whiskers
+
+
+def measure(name: str) -> dict[str, dict[str, object]]:
+    """Run all bench tests of one whisker at every preset."""
+    whisker = subjects()[name]
+    length = whisker.arc_length
+    result: dict[str, dict[str, object]] = {
+        preset: {"pegs": {}, "slips": {}, "seconds": 0.0, "time": 0.0} for preset in list_presets()
+    }
+    for at in ARCS:
+        limit = references.slip_off_offset(whisker, at * length)
+        for offset in OFFSETS:
+            if offset * length >= limit:
+                continue
+            contact = references.elastica(whisker, at * length, offset * length)
+            gated = abs(contact.slope) <= math.radians(60) and offset * length <= 0.9 * limit
+            for preset, out in result.items():
+                try:
+                    test = validation.peg(whisker, at * length, offset * length, fidelity=preset)
+                    cell = (test.moment_error, test.force_error, gated)
+                    out["seconds"] += test.trace.seconds
+                    out["time"] += test.trace.steps * step(whisker, preset)
+                except BrainbenchError as error:
+                    cell = (math.inf, math.inf, gated, str(error))
+                out["pegs"][at, offset] = cell
+        for preset, out in result.items():
+            if at in (0.3, 0.5, 0.8):
+                try:
+                    out["slips"][at] = validation.slip_off(whisker, at * length, fidelity=preset).error
+                except BrainbenchError:
+                    out["slips"][at] = math.inf
+    for preset, out in result.items():
+        out["ring"] = validation.ringdown(whisker, fidelity=preset)
+    return result
+
+
+def step(whisker: Whisker, preset: str) -> float:
+    return Fidelity.preset(preset).step(float(references.natural_frequencies(whisker, 1)[0]))
+
+
+def report(results: dict[str, dict]) -> tuple[str, list[str]]:
+    """Return the tables and the broken gates."""
+    text, broken = [], []
+    for preset in list_presets():
+        gate = GATES[preset]
+        fidelity = Fidelity.preset(preset)
+        text.append(
+            f"### {preset}\n\n`{fidelity}`\n\nPegs of radius .25 mm: error of base moment / force in %; in brackets"
+            " where the contact slope exceeds 60° or the depth .9 of slip-off (not gated); — beyond slip-off.\n"
+        )
+        rows = []
+        for name, result in results.items():
+            pegs = result[preset]["pegs"]
+            for at in ARCS:
+                cells = []
+                for offset in OFFSETS:
+                    if (at, offset) not in pegs:
+                        cells.append("—")
+                        continue
+                    moment, force, gated, *_ = pegs[at, offset]
+                    body = f"{100 * moment:.2f} / {100 * force:.2f}"
+                    cells.append(body if gated else f"({body})")
+                    if gated and (moment > gate["moment"] or force > gate["force"]):
+                        broken.append(f"{preset} {name} peg {at} {offset}: {body}")
+                rows.append([name, f"{at:g}", *cells])
+        text += [table(["whisker", "a/L", *(f"d/L {offset:g}" for offset in OFFSETS)], rows), ""]
+        rows = []
+        for name, result in results.items():
+            out = result[preset]
+            ring, wanted = out["ring"], subjects()[name].damping_ratio
+            ratio = ring.damping_ratio / wanted - 1
+            rows.append(
+                [
+                    name,
+                    *(f"{100 * out['slips'][at]:+.2f}" for at in (0.3, 0.5, 0.8)),
+                    *(f"{100 * error:+.2f}" for error in ring.frequency_errors),
+                    f"{ring.damping_ratio:.4f}",
+                    f"{1e6 * step(subjects()[name], preset):.1f}",
+                    f"{out['seconds'] / out['time']:.3f}",
+                ]
+            )
+            broken += [
+                f"{preset} {name} slip {at}: {e}" for at, e in out["slips"].items() if not abs(e) <= gate["slip"]
+            ]
+            if np.abs(ring.frequency_errors).max() > gate["frequency"]:
+                broken.append(f"{preset} {name} frequencies: {ring.frequency_errors}")
+            if abs(ratio) > gate["damping"]:
+                broken.append(f"{preset} {name} damping: {ring.damping_ratio}")
+        columns = ["whisker", "slip-off a/L .3 %", ".5", ".8", "f1 %", "f2 %", "f3 %", "ζ₁ (.32 wanted)"]
+        text += [table([*columns, "step µs", "processor s / whisker-s"], rows), ""]
+    text.append("Broken gates: " + ("none." if not broken else "\n\n" + "\n".join(f"- {line}" for line in broken)))
+    return "\n".join(text), broken
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--workers", type=int, default=2)
+    workers = parser.parse_args().workers
+    with ProcessPoolExecutor(workers) as pool:
+        results = dict(zip(subjects(), pool.map(measure, subjects()), strict=True))
+    text, broken = report(results)
+    write_section("Whisker presets against mechanics", "python benchmarks/whisker_validation.py", text)
+    print(text)
+    raise SystemExit(bool(broken))
+
+
+if __name__ == "__main__":
+    main()
