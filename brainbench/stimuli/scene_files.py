@@ -13,6 +13,7 @@
     [head]                       # the array frame in the world; rotation about x, then y, then z
     position_mm = [0, 0, 0]
     rotation_deg = [0, 0, 0]
+    velocity_mm_s = [0, 10, 0]   # optional; or keyframes since t = 0: times_ms, path_mm and path_deg, a list each
 
     [whisking]                   # kind = "sinusoid" | "still" | "recorded"
     frequency_hz = 20
@@ -29,6 +30,9 @@
     average = 18                 # readings per frame; 1 = instantaneous
     # instead of interval_ms: rate_hz = 1000. lowpass_hz = 50 filters the readings instead of averaging them;
     # phase = "zero" | "causal". axes = "world" | "follicle". clip_newton = 1 (moments: 1 mm times that)
+
+    [[animal]]                   # optional: more animals, then whiskers are named "a:C2", "b:C2"
+    name = "b"                   # with [animal.array], [animal.head] and [animal.whisking] as above
 
     [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
     label = "pole"
@@ -63,6 +67,7 @@ from brainbench.stimuli import shapes
 from brainbench.stimuli.frames import Frames
 from brainbench.stimuli.morphology import SPECIES, WhiskerArray
 from brainbench.stimuli.motion import ROTATIONS, Still, Translation, Whisking
+from brainbench.stimuli.motion import Path as HeadPath
 from brainbench.stimuli.objects import (
     PlacedObject,
     Solid,
@@ -74,7 +79,7 @@ from brainbench.stimuli.objects import (
     shape_solid,
     sphere,
 )
-from brainbench.stimuli.scene import Head, Scene
+from brainbench.stimuli.scene import Animal, Head, Scene
 from brainbench.stimuli.sweeps import SweepScenes
 
 if TYPE_CHECKING:
@@ -129,14 +134,15 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
 def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
     top = _Table("the scene file", data)
     description = top.take("description", _text, "")
-    array = _array(top.table("array")).select(whiskers)
+    array = _array(top.table("array"))
+    others = tuple(_animal(_Table("[[animal]]", item), path.parent) for item in top.take("animal", _tables, []))
     shared = {name: top.take(name, _mapping, _NOTHING) for name in ("head", "whisking", "frames")}
     common = top.take("object", _tables, [])
     entries = top.take("scene", _tables, [])
     top.finish()
     if not entries:
         raise UsageError("the file has no [[scene]].")
-    scenes = [_scene(entry, array, shared, common, path.parent) for entry in entries]
+    scenes = [_scene(entry, array, others, shared, common, path.parent).select(whiskers) for entry in entries]
     repeated = sorted({scene.label for scene in scenes if [s.label for s in scenes].count(scene.label) > 1})
     if repeated:
         raise UsageError(f"several scenes have the label {repeated[0]!r}; labels must differ.")
@@ -146,6 +152,7 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
 def _scene(
     entry: Mapping[str, Any],
     array: WhiskerArray,
+    others: tuple[Animal, ...],
     shared: Mapping[str, Mapping[str, Any]],
     common: list[Mapping[str, Any]],
     folder: Path,
@@ -162,7 +169,19 @@ def _scene(
         whisking=_whisking(_Table("[whisking]", merged["whisking"]), folder),
         head=_head(_Table("[head]", merged["head"])),
         frames=_frames(_Table("[frames]", shared["frames"])),
+        others=others,
     )
+
+
+def _animal(table: _Table, folder: Path) -> Animal:
+    animal = Animal(
+        name=table.take("name", _text),
+        array=_array(table.table("array")),
+        whisking=_whisking(table.table("whisking"), folder),
+        head=_head(table.table("head")),
+    )
+    table.finish()
+    return animal
 
 
 def _array(table: _Table) -> WhiskerArray:
@@ -182,10 +201,24 @@ def _head(table: _Table) -> Head:
     head = Head(
         position=table.take("position_mm", _vector(_MM), (0.0, 0.0, 0.0)),
         rotation=table.take("rotation_deg", _vector(math.pi / 180), (0.0, 0.0, 0.0)),
-        motion=_motion(table),
+        motion=_path(table) or _motion(table),
     )
     table.finish()
     return head
+
+
+def _path(table: _Table) -> HeadPath | None:
+    """Keyframes of a head; None when it has none."""
+    keys = ("times_ms", "path_mm", "path_deg")
+    times = table.take(keys[0], _list(_number(_MM)), None)
+    places = table.take(keys[1], _list(_vector(_MM)), None)
+    turns = table.take(keys[2], _list(_vector(math.pi / 180)), None)
+    if times is None:
+        if places is None and turns is None:
+            return None
+        raise UsageError(f"{table.name} needs the key {keys[0]!r} beside its path.")
+    still = ((0.0, 0.0, 0.0),) * len(times)
+    return HeadPath(times, still if places is None else places, still if turns is None else turns)
 
 
 def _whisking(table: _Table, folder: Path) -> Still | Whisking | Recorded:
@@ -361,6 +394,15 @@ def _number(factor: float) -> Callable[[Any], float]:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise TypeError("a finite number")
         return value * factor
+
+    return convert
+
+
+def _list(item: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, ...]]:
+    def convert(value: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list):
+            raise TypeError("a list")
+        return tuple(map(item, value))
 
     return convert
 

@@ -120,7 +120,7 @@ def test_a_mesh_can_be_decomposed_by_keys_of_its_table(tmp_path):
     )
     solid = load_scene(_write(tmp_path, text)).scenes[0].objects[0].solid
     assert len(solid.parts) > 1
-    with pytest.raises(UsageError, match="threshold of a decomposition lies between 0.01 and 1"):
+    with pytest.raises(UsageError, match=r"threshold of a decomposition lies between 0\.01 and 1"):
         load_scene(_write(tmp_path, text.replace("0.3", "3")))
 
 
@@ -198,3 +198,52 @@ def test_the_frames_table_sets_rate_filter_axes_and_clip(tmp_path):
         load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "rate_hz = 0")))
     with pytest.raises(UsageError, match="did you mean 'lowpass_hz'"):
         load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "lowpas_hz = 40")))
+
+
+MOVING = """
+[array]
+whiskers = "C1,C2"
+[head]
+times_ms = [0, 100, 2000]
+path_mm = [[0, 0, 0], [1, 0, 0], [1, 2, 0]]
+path_deg = [[0, 0, 0], [0, 0, 90], [0, 0, 90]]
+[[animal]]
+name = "b"
+[animal.array]
+species = "rat"
+whiskers = "C*"
+[animal.head]
+position_mm = [50, 0, 0]
+[animal.whisking]
+kind = "still"
+[[scene]]
+label = "crowd"
+"""
+
+
+def test_a_scene_file_moves_heads_and_holds_several_animals(tmp_path):
+    (scene,) = load_scene(_write(tmp_path, MOVING)).scenes
+    assert scene.names[:3] == ("a:C1", "a:C2", "b:C0")
+    assert scene.head.motion.times == pytest.approx((0, 0.1, 2))
+    assert scene.head.motion.displacements[2] == pytest.approx((1e-3, 2e-3, 0))
+    assert scene.head.motion.rotations[1] == pytest.approx((0, 0, math.pi / 2))
+    (other,) = scene.others
+    assert other.head.position == pytest.approx((0.05, 0, 0))
+    assert other.whisking == Still()
+    assert load_scene(_write(tmp_path, MOVING), whiskers="C1").scenes[0].names == ("a:C1", "b:C1")
+    assert load_scene(_write(tmp_path, MOVING), whiskers="b:C3").scenes[0].names == ("C3",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("times_ms = [0, 100, 2000]\n", "", r"\[head\] needs the key 'times_ms' beside its path"),
+        ("times_ms = [0, 100, 2000]", "times_ms = 3", "'times_ms' of .* must be a list"),
+        ("[1, 2, 0]]", "[1, 2]]", "'path_mm' of .* must be three numbers in brackets"),
+        ('name = "b"\n', "", r"\[\[animal\]\] needs the key 'name'"),
+        ('name = "b"', 'name = "a"', "need different names"),
+    ],
+)
+def test_mistakes_in_moving_scenes_are_named(tmp_path, old, new, message):
+    with pytest.raises(UsageError, match=message):
+        load_scene(_write(tmp_path, MOVING.replace(old, new)))
