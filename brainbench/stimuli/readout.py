@@ -31,13 +31,13 @@ def to_grid(
     sub-steps of 5 give [K, 22, 30, 5, 7].
 
     Args:
-        dataset: stimulus set with whiskers of one side.
+        dataset: stimulus set with whiskers of one side of one animal.
         substeps: frames S that make one time step.
         unstable: what to do with whiskers whose simulation became unstable (their numbers are NaN):
             refuse, or read them as zero.
 
     Raises:
-        UsageError: the frames do not divide into sub-steps, or two whiskers share a cell.
+        UsageError: the frames do not divide into sub-steps, there are several animals, or two whiskers share a cell.
         DataError: a number is not finite.
     """
     check_stimulus_set(dataset)
@@ -46,6 +46,12 @@ def to_grid(
         raise UsageError(f"{frames} frames do not divide into time steps of {substeps} sub-steps.")
     rows, cols = dataset["row"].values.astype(int), dataset["col"].values.astype(int)
     cells = rows * GRID_SHAPE[1] + cols
+    animals = dict.fromkeys(name.partition(":")[0] for name in map(str, dataset["whisker"].values) if ":" in name)
+    if len(animals) > 1:
+        raise UsageError(
+            f"The stimulus set has {len(animals)} animals and a grid holds one; select its whiskers first: "
+            f"{' or '.join(repr(f'{animal}:*') for animal in animals)}."
+        )
     if len(set(cells)) < whiskers:
         raise UsageError("The stimulus set has two whiskers in one cell (both sides); select one side first.")
     wrench = dataset["wrench"].values

@@ -13,6 +13,7 @@ from brainbench.stimuli.motion import Path, Still, Translation, Whisking
 from brainbench.stimuli.objects import PlacedObject, euler_matrix, sphere
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scene import Animal, Frames, Head, Scene
+from brainbench.stimuli.sets import load_stimuli
 from brainbench.stimuli.simulation import simulate
 
 from .fakes import FakeBackend
@@ -168,12 +169,15 @@ def test_whiskers_of_animals_are_chosen_by_name():
         scene.select("c:C1")
 
 
-def test_the_grid_refuses_several_animals_and_takes_one():
+def test_the_grid_refuses_several_animals_even_in_different_cells_and_takes_one():
     dataset = simulate(_crowd(), backend=FakeBackend())
-    with pytest.raises(UsageError, match="two whiskers in one cell"):
+    with pytest.raises(UsageError, match=r"2 animals and a grid holds one; select .*: 'a:\*' or 'b:\*'"):
         to_grid(dataset)
-    one = dataset.isel(whisker=[name.startswith("b:") for name in dataset["whisker"].values])
-    assert to_grid(one).shape[-2:] == (5, 7)
+    apart = dataset.isel(whisker=[0, 3])
+    with pytest.raises(UsageError, match="2 animals"):
+        to_grid(apart)
+    assert load_stimuli(dataset, whiskers="b:*").input.shape[-2:] == (5, 7)
+    assert list(load_stimuli(dataset, whiskers="b:*").dataset["whisker"].values) == ["b:C1", "b:D2"]
 
 
 def test_animals_count_in_the_configuration_and_single_ones_change_nothing():
