@@ -85,14 +85,15 @@ class BulletBackend:
 
 def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     started = time.thread_time()
+    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
+    step = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi))
     # Frame f lies at the (fractional) step where; linear interpolation between the two steps around it.
-    where = (job.times - job.start) / fidelity.time_step
+    where = (job.times - job.start) / step
     where = np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
     before, after = np.floor(where).astype(int), np.ceil(where).astype(int)
-    times = job.start + fidelity.time_step * np.arange(after[-1] + 2)
+    times = job.start + step * np.arange(after[-1] + 2)
     position, _ = job.follicle.pose(times)
     reach = reachable(job.whisker, np.asarray(position, dtype=float), job.obstacles, times)
-    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
     nearest = np.where(where - before < 0.5, before, after)
     with BulletWorld(chain, reach.obstacles, reach.nearest, np.asarray(job.gravity, dtype=float)) as world:
         run = _Run(job, chain, reach, world, times, frozenset(nearest.tolist()) if record_shape else frozenset())
