@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from brainbench.geometry._decomposition import Decomposition, DecompositionSettings, decompose
 from brainbench.geometry._distance import Deviation, deviation, hausdorff, winding_number
-from brainbench.geometry._mesh import UNITS, Diagnosis, Mesh, convex_hull, load_mesh
+from brainbench.geometry._mesh import UNITS, Diagnosis, Mesh, convex_hull, load_mesh, save_mesh
 from brainbench.geometry._repair import Repair, repair
 
 __all__ = [
@@ -21,5 +21,6 @@ __all__ = [
     "hausdorff",
     "load_mesh",
     "repair",
+    "save_mesh",
     "winding_number",
 ]

@@ -20,6 +20,10 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 """Length units of mesh files in metres."""
 
 
+WRITABLE = (".obj", ".stl", ".ply", ".glb", ".off")
+"""Mesh formats that :func:`save_mesh` writes; :func:`load_mesh` reads more."""
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """What is wrong with a mesh as a solid."""
@@ -221,3 +225,21 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
     # Exactly equal vertices only: a tolerance would depend on the unit.
     vertices, merged = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_inverse=True)
     return Mesh(vertices * UNITS[unit], merged.reshape(-1)[np.asarray(loaded.faces)], path.stem)
+
+
+def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
+    """Write a mesh file in the format that its suffix names, so that readers see all of it or nothing.
+
+    Raises:
+        UsageError: the unit or the format is unknown.
+    """
+    from brainbench.files import atomic_path
+
+    if unit not in UNITS:
+        raise unknown_name("length unit", unit, UNITS)
+    path = Path(path)
+    if path.suffix.lower() not in WRITABLE:
+        raise unknown_name("mesh format", path.suffix or path.name, WRITABLE, hint="The suffix of the file chooses it.")
+    with atomic_path(path) as temporary:
+        mesh.scaled(1 / UNITS[unit]).to_trimesh().export(temporary, file_type=path.suffix[1:].lower())
+    return path

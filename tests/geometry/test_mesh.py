@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from brainbench.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.geometry import Mesh, load_mesh
+from brainbench.geometry import Mesh, load_mesh, save_mesh
 
 
 def _cube_file(tmp_path, name="cube.obj"):
@@ -116,3 +116,26 @@ def test_a_file_without_triangles_is_refused(tmp_path, name, content):
     path.write_bytes(content)
     with pytest.raises(DataError, match=name.replace(".", r"\.")):
         load_mesh(path, unit="m")
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "glb", "off"])
+def test_a_saved_mesh_comes_back(tmp_path, suffix):
+    mesh = load_mesh(_cube_file(tmp_path), unit="mm")
+    path = save_mesh(tmp_path / f"saved.{suffix}", mesh, unit="cm")
+    back = load_mesh(path, unit="cm")
+    np.testing.assert_allclose(back.bounds, mesh.bounds, rtol=1e-6)
+    assert back.diagnosis.watertight
+    assert back.volume == pytest.approx(mesh.volume, rel=1e-6)
+
+
+def test_an_unknown_mesh_format_is_refused_before_anything_is_written(tmp_path):
+    mesh = load_mesh(_cube_file(tmp_path), unit="mm")
+    with pytest.raises(UsageError, match=r"Unknown mesh format '\.objj'; did you mean '\.obj'"):
+        save_mesh(tmp_path / "out.objj", mesh, unit="m")
+    assert not (tmp_path / "out.objj").exists()
+
+
+def test_the_volume_of_a_closed_mesh_is_signed():
+    box = trimesh.creation.box(extents=(1, 2, 3))
+    assert Mesh(box.vertices + 10, box.faces).volume == pytest.approx(6)
+    assert Mesh(box.vertices, box.faces[:, ::-1]).volume == pytest.approx(-6)

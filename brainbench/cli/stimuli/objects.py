@@ -1,0 +1,159 @@
+"""``brainbench stimuli objects``: shape families, mesh files and ShapeNet folders, and what whiskers touch of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, table
+
+if TYPE_CHECKING:
+    from brainbench.geometry import DecompositionSettings, Mesh
+    from brainbench.stimuli import Solid
+
+_MILLI = 1e3
+
+
+def objects(
+    source: Annotated[
+        str | None, typer.Argument(help="A shape family, a mesh file or a ShapeNet folder; all families without.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Which member of the family.")] = 0,
+    detail: Annotated[int, typer.Option(help="About how many triangles a family's member has, 2000 to 20000.")] = 4_000,
+    unit: Annotated[str | None, typer.Option(help="Length unit of a mesh file: m, cm, mm, um or in.")] = None,
+    diagonal_mm: Annotated[
+        float | None, typer.Option(help="Scale to this bounding-box diagonal; families have 40 mm by default.")
+    ] = None,
+    collision: Annotated[
+        str | None,
+        typer.Option(help="What whiskers touch: exact, hull, pieces or decomposition; default as in scene files."),
+    ] = None,
+    method: Annotated[str, typer.Option(help="Of a decomposition: coacd or vhacd.")] = "coacd",
+    threshold: Annotated[float, typer.Option(help="Concavity that a decomposition may leave, 0.01 to 1.")] = 0.05,
+    ids: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: file of synset/model names.")] = None,
+    categories: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: CSV or JSON of labels.")] = None,
+    export: Annotated[
+        Path | None, typer.Option(help="Write the repaired mesh, in mm (.obj .stl .ply .glb .off).")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the shape families, or describe one object: its size, its faults, and what whiskers touch of it."""
+    from brainbench.errors import UsageError
+    from brainbench.geometry import DecompositionSettings
+
+    settings = DecompositionSettings(method=method, threshold=threshold)  # type: ignore[arg-type]
+    diagonal = None if diagonal_mm is None else diagonal_mm / _MILLI
+    if source is None or Path(source).is_dir():
+        if export is not None:
+            raise UsageError("--export writes one object: name a family or a mesh file.")
+        data, text = _families() if source is None else _folder(source, ids, categories)
+        emit(data, text, as_json=as_json)
+        return
+    if Path(source).is_file():
+        data, solid = _file(source, unit, diagonal, collision or "hull", settings)
+    else:
+        data, solid = _member(source, seed, detail, diagonal, collision, settings)
+    mesh = solid.mesh
+    if export is not None and mesh is not None:
+        from brainbench.geometry import save_mesh
+
+        data["export"] = save_mesh(export, mesh, unit="mm")
+    emit(data, _text(data), as_json=as_json)
+
+
+def _families() -> tuple[dict[str, Any], str]:
+    from brainbench.stimuli import shapes
+
+    data = {family: shapes.describe_family(family) for family in shapes.list_families()}
+    hint = (
+        '\n\nin scene files: shape = "family:NAME", seed, diagonal_mm; one in detail: brainbench stimuli objects NAME'
+    )
+    return data, table("", ["family", ""], [[name, text] for name, text in data.items()]) + hint
+
+
+def _folder(source: str, ids: Path | None, categories: Path | None) -> tuple[dict[str, Any], str]:
+    from brainbench.stimuli.shapenet import load_shapenet
+
+    found = load_shapenet(source, ids=ids, categories=categories)
+    data = {"models": len(found), "labels": found.counts, "missing": list(found.missing)}
+    text = table("", ["label", "models"], [[label, str(n)] for label, n in found.counts.items()], right=(1,))
+    return data, f"{len(found)} models of {len(found.labels)} labels, {len(found.missing)} missing\n\n{text}"
+
+
+def _member(
+    name: str,
+    seed: int,
+    detail: int,
+    diagonal: float | None,
+    collision: str | None,
+    settings: DecompositionSettings,
+) -> tuple[dict[str, Any], Solid]:
+    from brainbench.errors import unknown_name
+    from brainbench.stimuli import shapes
+    from brainbench.stimuli.objects import shape_solid
+
+    family = name.removeprefix("family:")
+    if family not in shapes.list_families():
+        hint = "Or the path of a mesh file or of a ShapeNet folder."
+        raise unknown_name("object", name, shapes.list_families(), hint=hint)
+    shape = shapes.make(family, seed, detail=detail)
+    solid = shape_solid(shape, diagonal=diagonal or 0.04, collision=collision, decomposition=settings)
+    about = {"family": family, "description": shapes.describe_family(family), "seed": seed}
+    mesh = solid.mesh or shape.mesh
+    return {**about, "parameters": dict(shape.parameters), **_measures(mesh, solid)}, solid
+
+
+def _file(
+    source: str, unit: str | None, diagonal: float | None, collision: str, settings: DecompositionSettings
+) -> tuple[dict[str, Any], Solid]:
+    from brainbench.errors import UsageError
+    from brainbench.geometry import UNITS, load_mesh
+    from brainbench.stimuli.objects import mesh_solid
+
+    if unit is None:
+        raise UsageError(f"Mesh files carry no unit; say what the numbers in {source!r} are: --unit {'|'.join(UNITS)}.")
+    as_read = load_mesh(source, unit=unit)
+    solid = mesh_solid(source, unit=unit, diagonal=diagonal, collision=collision, decomposition=settings)
+    return {"file": source, "as_read": str(as_read.diagnosis), **_measures(solid.mesh or as_read, solid)}, solid
+
+
+def _measures(mesh: Mesh, solid: Solid) -> dict[str, Any]:
+    low, high = mesh.bounds
+    return {
+        "name": solid.name,
+        "size_mm": ((high - low) * _MILLI).tolist(),
+        "diagonal_mm": mesh.diagonal * _MILLI,
+        "volume_mm3": mesh.volume * _MILLI**3 if mesh.diagnosis.watertight else None,
+        "triangles": len(mesh.faces),
+        "diagnosis": str(mesh.diagnosis),
+        "content_hash": mesh.content_hash,
+        "convex_parts": len(solid.parts),
+        "notes": list(solid.notes),
+    }
+
+
+def _text(data: dict[str, Any]) -> str:
+    size = " × ".join(f"{value:.4g}" for value in data["size_mm"])
+    volume = "unknown: not closed" if data["volume_mm3"] is None else f"{data['volume_mm3']:.4g} mm³"
+    rows = [["object", f"{data['name']}: {data['description']}" if "description" in data else data["name"]]]
+    if "parameters" in data:
+        drawn = [
+            f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}"
+            for key, value in data["parameters"].items()
+        ]
+        rows.append(["drawn", ", ".join(drawn)])
+    if "as_read" in data:
+        rows.append(["as read", data["as_read"]])
+    rows += [
+        ["surface", f"{data['diagnosis']}, {data['triangles']:,} triangles"],
+        ["size", f"{size} mm, diagonal {data['diagonal_mm']:.4g} mm"],
+        ["volume", volume],
+        ["touched", f"{data['convex_parts']} convex part{'' if data['convex_parts'] == 1 else 's'}"],
+        *([["note" if i == 0 else "", note] for i, note in enumerate(data["notes"])]),
+        ["hash", data["content_hash"]],
+    ]
+    if "export" in data:
+        rows.append(["written", f"{data['export']} (mm)"])
+    return table("", ["", ""], rows)
