@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import MissingDependencyError, UsageError, missing_dependency
-from brainbench.stimuli.backends._mujoco_model import MICRO, MILLI
+from brainbench.stimuli.backends._mujoco_model import CONE_SIDES, MICRO, MILLI, _thickness
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere
 
 if TYPE_CHECKING:
@@ -82,6 +82,10 @@ class BulletWorld:
                 "backend 'mujoco'."
             )
         self.bullet = engine()
+        thickness = np.array([_thickness(self.chain, link) for link in range(self.chain.links)])
+        self._cores = thickness[:, 0]
+        # Bullet's own margin of a hull is part of the link's.
+        self._margins = np.where(self._cores > 0, thickness[:, 1] - HULL_MARGIN, 0.0)
 
     def __enter__(self) -> BulletWorld:
         self.client = self.bullet.connect(self.bullet.DIRECT)
@@ -121,15 +125,18 @@ class BulletWorld:
     def closest(self, margin: float) -> Iterator[tuple[int, int, NDArray, NDArray, float]]:
         """Yield link, obstacle, point on the whisker [3], normal into the whisker [3] and distance (mm).
 
-        Only pairs nearer than ``margin`` (mm) are found; negative distances are overlaps.
+        Only pairs nearer than ``margin`` (mm) are found; negative distances are overlaps. Bullet measures from the
+        cores of the links; what surrounds a core is everywhere as thick, so it only shifts distance and point.
         """
+        margin += float(self._margins.max())
         for number, bodies in enumerate(self.parts):
             for body, part in zip(bodies, self.obstacles[number].parts, strict=True):
                 extra = HULL_MARGIN if isinstance(part, ConvexPart) else 0.0
                 found = self.bullet.getClosestPoints(self.whisker, body, distance=margin, physicsClientId=self.client)
                 for point in found:
-                    link = (point[3] - FOLLICLE) // 2
-                    yield link, number, np.array(point[5]), np.array(point[7]), point[8] + extra
+                    link, normal = (point[3] - FOLLICLE) // 2, np.array(point[7])
+                    around = float(self._margins[link])
+                    yield link, number, np.array(point[5]) - around * normal, normal, point[8] + extra - around
 
     def jacobian(self, link: int, q: Sequence[float]) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Start of a link [3], its axis [3], and how joint rates move the start [3, 6 + 2N] and turn the link."""
@@ -174,10 +181,9 @@ class BulletWorld:
             masses[second] = chain.masses[i] * MICRO
             axial, transverse = chain.inertias[i] * MICRO * MILLI**2
             inertias[second] = (axial, transverse, transverse)
-            if chain.nodes[i + 1] + chain.radii[i] >= self.nearest:
-                shapes[second] = self._capsule(
-                    np.zeros(3), np.array([chain.lengths[i] * MILLI, 0, 0]), chain.radii[i] * MILLI
-                )
+            thickest = float(chain.whisker.radius(chain.nodes[i : i + 2]).max())
+            if chain.nodes[i + 1] + thickest >= self.nearest:
+                shapes[second] = self._link(i)
         body = bullet.createMultiBody(
             baseMass=0,
             linkMasses=masses,
@@ -196,6 +202,19 @@ class BulletWorld:
             # Bullet would derive the inertia from the collision shape.
             bullet.changeDynamics(body, joint, localInertiaDiagonal=inertia, physicsClientId=self.client)
         return body
+
+    def _link(self, link: int) -> int:
+        """Add the collision shape of a link, less its margin: the slim cone inside a tapered link, or a capsule."""
+        core, length = self._cores[link], self.chain.lengths[link] * MILLI
+        if core == 0:
+            return self._capsule(np.zeros(3), np.array([length, 0, 0]), self.chain.radii[link] * MILLI)
+        radii = self.chain.whisker.radius(self.chain.nodes[link : link + 2])
+        angle = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
+        wide, apex = (0.0, length) if radii[0] > radii[1] else (length, 0.0)
+        ring = np.stack([np.full(CONE_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)
+        return self.bullet.createCollisionShape(
+            self.bullet.GEOM_MESH, vertices=[*ring.tolist(), [apex, 0.0, 0.0]], physicsClientId=self.client
+        )
 
     def _add_part(self, part: Part) -> int:
         return self.bullet.createMultiBody(0, self._shape(part), physicsClientId=self.client)
