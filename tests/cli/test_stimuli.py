@@ -111,3 +111,14 @@ def test_wrong_requests_end_with_status_two_and_one_line(run, scene, arguments, 
     assert result.status == 2
     assert message in result.err
     assert result.out == ""
+
+
+def test_show_tells_where_recorded_whisking_starts(run, tmp_path):
+    path = tmp_path / "whisking.csv"
+    path.write_text("\n".join([",".join(["0"] * 3000)] * 62))
+    out = run("stimuli", "show", f"rodgers-recorded {path}", "--stimulus", "convex-far", "--json").out
+    (scene,) = json.loads(out)["scenes"]
+    assert scene["whisking"]["kind"] == "recorded"
+    text = run("stimuli", "show", f"rodgers-recorded {path}", "--stimulus", "convex-far").out
+    assert "azimuth" in text
+    assert "-10°" in text

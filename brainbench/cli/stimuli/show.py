@@ -144,7 +144,8 @@ def _motion(config: dict[str, Any]) -> str:
         velocity = ", ".join(_milli(value) for value in config["velocity"])
         return f"({velocity}) mm/s, onset {_milli(config['onset'])} ms"
     if kind == "recorded":
-        return f"recorded for {config['duration']:g} s, from {config['start']:g} s, trajectory {config['trajectory']}"
+        start = f"from azimuth {math.degrees(config['start']):g}°"
+        return f"recorded for {config['duration']:g} s, {start}, trajectory {config['trajectory']}"
     if kind == "path":
         return f"path of {len(config['times'])} keyframes in {config['times'][-1]:g} s"
     return str(kind)
