@@ -21,7 +21,7 @@ _LAZY = {
     "Solid": "objects",
     "Still": "motion",
     "Stimuli": "sets",
-    "SweepGrid": "sweeps",
+    "SweepGrid": "sweep_grid",
     "Translation": "motion",
     "Whisker": "whisker",
     "WhiskerArray": "morphology",
@@ -86,7 +86,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.sets import Stimuli, load_stimuli
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.storage import read_stimulus_set, write_stimulus_set
-    from brainbench.stimuli.sweeps import SweepGrid
+    from brainbench.stimuli.sweep_grid import SweepGrid
     from brainbench.stimuli.trajectory import Recorded, load_trajectory
     from brainbench.stimuli.whisker import Whisker
 

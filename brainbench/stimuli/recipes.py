@@ -111,7 +111,7 @@ def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, wh
     from brainbench.stimuli.objects import PlacedObject
     from brainbench.stimuli.scene import Head, Scene
     from brainbench.stimuli.scene_files import Recipe
-    from brainbench.stimuli.sweeps import default_array
+    from brainbench.stimuli.sweep_grid import default_array
     from brainbench.stimuli.trajectory import Recorded, load_trajectory
 
     if trajectory is None:

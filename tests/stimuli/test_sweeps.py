@@ -16,7 +16,8 @@ from brainbench.stimuli.objects import box, capsule, cylinder, rodgers_solid, sp
 from brainbench.stimuli.recipes import describe_recipe, get_recipe
 from brainbench.stimuli.scene import Frames, Head
 from brainbench.stimuli.simulation import simulate
-from brainbench.stimuli.sweeps import GRIDS, Span, SweepGrid, SweepScenes, counts
+from brainbench.stimuli.sweep_grid import Span, SweepGrid
+from brainbench.stimuli.sweeps import GRIDS, SweepScenes, counts
 
 SOLIDS = [sphere(1.0), box((1.0, 2.0, 3.0)), cylinder(0.3, 1.0), capsule(0.3, 1.0), rodgers_solid()]
 
