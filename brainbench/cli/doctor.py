@@ -9,12 +9,26 @@ from typing import Any
 
 from brainbench.cli._shared import JsonOption, emit, table
 
-REQUIRED = ("torch", "mujoco-core", "numpy", "scipy", "xarray", "h5py", "h5netcdf", "trimesh", "typer", "rich")
+REQUIRED = (
+    "torch",
+    "mujoco-core",
+    "numpy",
+    "scipy",
+    "xarray",
+    "h5py",
+    "h5netcdf",
+    "trimesh",
+    "manifold3d",
+    "typer",
+    "rich",
+)
 
 OPTIONAL = {
     "pynwb": ("nwb", "checking NWB files against the schema"),
     "nwbinspector": ("nwb", "best-practice checks of NWB files"),
-    "pybullet": ("bullet", "nothing yet: the WHISKiT-compatible backend of a later version (Python < 3.12)"),
+    "pybullet": ("bullet", "the whisker engine of WHISKiT as a second backend (Python < 3.12)"),
+    "coacd": ("mesh", "convex decomposition of concave objects"),
+    "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),
     "warp-lang": ("gpu", "nothing yet: the batched whisker solver of a later version"),
     "mujoco-warp": ("gpu", "nothing yet: robot hands on CUDA in a later version"),
     "matplotlib": ("report", "pictures and plots of stimuli (brainbench stimuli render | plot)"),

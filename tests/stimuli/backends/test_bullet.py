@@ -89,11 +89,11 @@ def test_a_peg_reproduces_the_elastica(at, offset, radius):
 
 @needs_bullet
 @pytest.mark.slow
-@pytest.mark.parametrize("offset", [0.05, 0.1, 0.2])
-@pytest.mark.parametrize("at", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize(
+    ("at", "offset"),
+    [(0.3, 0.05), (0.3, 0.1), (0.5, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.05), (0.7, 0.1), (0.7, 0.2)],
+)
 def test_at_preset_accurate_the_moment_is_within_1_and_the_force_within_2_percent(at, offset):
-    if (at, offset) == (0.3, 0.2):
-        pytest.skip("the contact is steeper than 60 degrees")
     result = validation.peg(C2, at * C2.arc_length, offset * C2.arc_length, backend="bullet", fidelity="accurate")
     assert result.moment_error < 0.01
     assert result.force_error < 0.02
