@@ -31,6 +31,7 @@ _LAZY = {
     "get_recipe": "recipes",
     "list_recipes": "recipes",
     "load_scene": "scene_files",
+    "load_shapenet": "shapenet",
     "load_stimuli": "sets",
     "load_trajectory": "trajectory",
     "read_stimulus_set": "storage",
@@ -63,6 +64,7 @@ __all__ = [
     "get_recipe",
     "list_recipes",
     "load_scene",
+    "load_shapenet",
     "load_stimuli",
     "load_trajectory",
     "read_stimulus_set",
@@ -84,6 +86,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.scene import Animal, Head, Scene
     from brainbench.stimuli.scene_files import Recipe, load_scene
     from brainbench.stimuli.sets import Stimuli, load_stimuli
+    from brainbench.stimuli.shapenet import load_shapenet
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.storage import read_stimulus_set, write_stimulus_set
     from brainbench.stimuli.sweep_grid import SweepGrid
