@@ -12,11 +12,12 @@ from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.frames import Frames, clip_wrenches, low_pass
 from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import ArrayFollicle, Whisking
+from brainbench.stimuli.motion import ArrayFollicle, Path, Still, Whisking
 from brainbench.stimuli.objects import PlacedObject, sphere
 from brainbench.stimuli.readout import to_axes
 from brainbench.stimuli.scene import Head, Scene
 from brainbench.stimuli.simulation import simulate
+from brainbench.stimuli.storage import read_stimulus_set, write_stimulus_set
 
 from .fakes import FakeBackend
 
@@ -152,7 +153,7 @@ def test_poses_that_are_not_in_a_set_cannot_be_invented():
     with pytest.raises(UsageError, match=r"no follicle poses.*Frames.axes='follicle'"):
         to_axes(world, "follicle")
     with pytest.raises(UsageError, match="did you mean 'follicle'"):
-        to_axes(world, "folicle")
+        to_axes(world, "folicle")  # type: ignore[arg-type]
 
 
 def test_clipping_clips_and_counts_each_stimulus():
@@ -230,3 +231,19 @@ def test_what_is_not_used_does_not_change_the_name_of_a_stimulus():
 def test_impossible_frames_are_refused(changes, message):
     with pytest.raises(UsageError, match=message):
         Frames(**changes)
+
+
+def test_a_set_in_follicle_axes_survives_the_disk_with_its_poses(tmp_path):
+    dataset = _simulate(Frames(0.002, 0.007, 12, axes="follicle", clip=1.0), head=TURNED)
+    stored = read_stimulus_set(write_stimulus_set(dataset, tmp_path / "set.h5"))
+    np.testing.assert_array_equal(to_axes(stored, "world")["wrench"], to_axes(dataset, "world")["wrench"])
+    assert stored.attrs["clipped"] == dataset.attrs["clipped"]
+
+
+def test_in_follicle_axes_a_turning_head_changes_nothing_about_where_the_whisker_points():
+    turn = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0))
+    head = Head((0.01, 0.0, 0.0), (0.2, -0.4, 0.7), Path((0.0, 0.1, 0.2), ((0.0, 0.0, 0.0),) * 3, turn))
+    dataset = _simulate(Frames(0.002, 0.007, 12, axes="follicle"), head=head, whisking=Still())
+    np.testing.assert_allclose(dataset["wrench"][..., 3:], np.broadcast_to([1, 0, 0], (1, 12, 2, 3)), atol=1e-6)
+    pointing = to_axes(dataset, "world")["wrench"].values[0, :, 0, 3:]
+    assert np.abs(pointing[-1] - pointing[0]).max() > 0.1
