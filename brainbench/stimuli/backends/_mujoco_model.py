@@ -54,6 +54,8 @@ approached from below as the step shrinks."""
 
 CONE_SIDES = 8
 """Sides of the cone inside a tapered link."""
+SAFE_TRAVEL = 2.0
+"""Margin of a cone in terms of the farthest travel in one step, below which the link is a capsule."""
 LEAST_TAPER = 1e-6
 """Difference of the radii of a link's ends (mm) below which it is a capsule."""
 
@@ -126,7 +128,9 @@ def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: N
     if path.shape[1]:
         drives.append(drive_scalars(path, step))
     _add(base, "site", name="base", size=1e-3)
-    _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest)
+    travel = _travel(job, reach, times, position, euler)
+    cores = [_thickness(chain, link, travel) for link in range(chain.links)]
+    _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest, cores)
     sensors = _add(root, "sensor")
     _add(sensors, "force", site="base")
     _add(sensors, "torque", site="base")
@@ -139,7 +143,7 @@ def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: N
         base=position[:-1],
         rotation=base_rotation(euler)[:-1],
         loads=tuple(model.body(f"load{index}").id for index in range(len(job.loads))),
-        margins=np.array([_thickness(chain, link)[1] for link in range(chain.links)]),
+        margins=np.array([margin for _, margin in cores]),
     )
 
 
@@ -171,7 +175,15 @@ def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[El
     return _add(body, "body", name="base"), np.reshape(paths, (len(paths), len(position))).T
 
 
-def _add_links(base: Element, assets: Element, job: Job, chain: Chain, damping: NDArray, nearest: float) -> None:
+def _add_links(
+    base: Element,
+    assets: Element,
+    job: Job,
+    chain: Chain,
+    damping: NDArray,
+    nearest: float,
+    cores: list[tuple[float, float]],
+) -> None:
     body, end = base, 0.0
     for i in range(chain.links):
         body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
@@ -196,7 +208,7 @@ def _add_links(base: Element, assets: Element, job: Job, chain: Chain, damping: 
         )
         thickest = float(chain.whisker.radius(chain.nodes[i : i + 2]).max())
         if chain.nodes[i + 1] + thickest >= nearest:
-            _add(body, "geom", **_segment(chain, i, end, assets), contype=1, conaffinity=0)
+            _add(body, "geom", **_segment(chain, i, end, assets, cores[i]), contype=1, conaffinity=0)
         for index, load in enumerate(job.loads):
             if chain.nodes[i] < load.arc <= chain.nodes[i + 1]:
                 share = (load.arc - chain.nodes[i]) / (chain.nodes[i + 1] - chain.nodes[i])
@@ -204,16 +216,18 @@ def _add_links(base: Element, assets: Element, job: Job, chain: Chain, damping: 
                 _add(point, "inertial", pos="0 0 0", **_NOTHING)
 
 
-def _segment(chain: Chain, link: int, length: float, assets: Element) -> dict[str, object]:
-    """Collision geometry of one link: all points within the thin end's radius of a slim cone of the rest.
+def _segment(
+    chain: Chain, link: int, length: float, assets: Element, thickness: tuple[float, float]
+) -> dict[str, object]:
+    """Collision geometry of one link: a capsule, or all points within a margin of a slim cone.
 
-    A staircase of capsules would turn the force of a peg that sits on a step dr by up to √(2 dr/R). The cone has
-    the taper as its surface and the margin rounds it, so its facets are smaller than dr and do not matter.
+    A staircase of capsules turns the force of a peg that sits on a step dr by up to √(2 dr/R). The cone has the
+    taper as its surface and the margin rounds it, so its facets are smaller than dr and do not matter.
     """
-    core, margin = _thickness(chain, link)
+    core, margin = thickness
     radii = chain.whisker.radius(chain.nodes[link : link + 2])
     if core == 0:
-        return {"type": "capsule", "fromto": (0, 0, 0, length, 0, 0), "size": radii[0] * MILLI}
+        return {"type": "capsule", "fromto": (0, 0, 0, length, 0, 0), "size": chain.radii[link] * MILLI}
     angle = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
     wide, apex = (0.0, length) if radii[0] > radii[1] else (length, 0.0)
     ring = np.stack([np.full(CONE_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)
@@ -221,11 +235,31 @@ def _segment(chain: Chain, link: int, length: float, assets: Element) -> dict[st
     return {"type": "mesh", "mesh": f"link{link}", "margin": margin, "mass": 0}
 
 
-def _thickness(chain: Chain, link: int) -> tuple[float, float]:
-    """Largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule."""
+def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
+    """Largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule.
+
+    Where a step's ``travel`` (mm) may bury the margin, MuJoCo would find the way out of the cone itself in a wrong
+    direction and the whisker would hook; a capsule is safe to any depth.
+    """
     first, last = chain.whisker.radius(chain.nodes[link : link + 2]) * MILLI
-    core = float(abs(first - last))
-    return (core, float(min(first, last))) if core >= LEAST_TAPER else (0.0, 0.0)
+    core, margin = float(abs(first - last)), float(min(first, last))
+    return (core, margin) if core >= LEAST_TAPER and margin >= SAFE_TRAVEL * travel else (0.0, 0.0)
+
+
+def _travel(job: Job, reach: Reach, times: NDArray, position: NDArray, euler: NDArray) -> float:
+    """Farthest (mm) that a point of the unbent whisker can move against an obstacle in one step."""
+    turn = np.abs(np.diff(euler, axis=0)).sum(axis=1) * job.whisker.arc_length * MILLI
+    own = np.linalg.norm(np.diff(position, axis=0), axis=1) + turn
+    most = 0.0
+    for obstacle in reach.obstacles:
+        other = np.zeros_like(own)
+        if obstacle.motion is not None:
+            places, quaternions = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
+            size = max(float(np.linalg.norm(part.bounds(), axis=1).max()) for part in obstacle.parts)
+            chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
+            other = (np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size) * MILLI
+        most = max(most, float((own + other).max(initial=0.0)))
+    return most
 
 
 def _add_obstacles(
