@@ -98,6 +98,8 @@ class Decomposition:
     notes: tuple[str, ...]
     """What was done and how far it is from the mesh, in words; relative, so scaling keeps them true."""
     settings: DecompositionSettings = field(default_factory=DecompositionSettings)
+    key: str = ""
+    """Names what the pieces were computed from: the shape of the mesh, the settings, the versions of the packages."""
     cached: bool = False
     """Whether the pieces were found in the cache."""
 
@@ -123,7 +125,8 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cach
     centre = mesh.bounds.mean(axis=0)
     # Rounded, so that one shape at two sizes has one name in the cache.
     unit = Mesh(np.round((mesh.vertices - centre) / diagonal, 9), mesh.faces, mesh.name)
-    path = cache_dir("collision") / f"{_key(unit, settings)}.npz" if cache else None
+    key = _key(unit, settings)
+    path = cache_dir("collision") / f"{key}.npz" if cache else None
     found = _read(path, mesh.name)
     pieces, numbers = found or _compute(unit, settings, path)
     outward, inward, samples, decimated = (float(value) for value in numbers)
@@ -133,6 +136,7 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cach
         deviation=Deviation(outward * diagonal, inward * diagonal, int(samples)),
         notes=_notes(unit, settings, len(pieces), (outward, inward, decimated)),
         settings=settings,
+        key=key,
         cached=found is not None,
     )
 

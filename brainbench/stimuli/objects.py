@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
+from brainbench.files import content_hash, to_plain
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.motion import Still, Translation
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere, rotation_matrix
@@ -87,8 +88,6 @@ class Solid:
 
     def config(self) -> dict[str, Any]:
         """Plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
-        from brainbench.files import content_hash, to_plain
-
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
         named = content_hash(parts) if self.origin is None else content_hash(self.origin, round(self.diagonal, 12))
@@ -262,7 +261,7 @@ def shape_solid(
             f" {found.outward:.2%} and fall short of it by at most {found.inward:.2%} of its diagonal (sampled)",
         )
     parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
-    origin = {"mesh": mesh.content_hash, "collision": "exact"}
+    origin = {"mesh": mesh.content_hash, "parts": content_hash([*shape.part_points])}
     return Solid(name, parts, mesh, notes, origin).to_diagonal(diagonal)
 
 
@@ -307,9 +306,8 @@ def _check_collision(collision: str) -> None:
 def _touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
     """Make the parts of a solid from its mesh."""
     if collision == "decomposition":
-        settings = settings or DecompositionSettings()
         cut = decompose(mesh, settings)
-        origin = {"mesh": mesh.content_hash, **settings.config()}
+        origin = {"mesh": mesh.content_hash, "decomposition": cut.key}
         return Solid(mesh.name, tuple(ConvexPart(piece.vertices) for piece in cut.pieces), mesh, cut.notes, origin)
     pieces = mesh.pieces() if collision == "pieces" else (mesh,)
     hulls = [piece.hull() for piece in pieces]

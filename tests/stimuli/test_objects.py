@@ -9,6 +9,9 @@ from scipy.spatial.transform import Rotation
 from brainbench.errors import DataError, UsageError
 from brainbench.geometry import DecompositionSettings, load_mesh
 from brainbench.stimuli import shapes
+from brainbench.stimuli.backends import get_backend
+from brainbench.stimuli.backends.protocol import Job, StillFollicle
+from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.motion import Translation
 from brainbench.stimuli.objects import (
     RODGERS_CONTROL,
@@ -25,6 +28,7 @@ from brainbench.stimuli.objects import (
     sphere,
 )
 from brainbench.stimuli.obstacle import rotation_matrix
+from brainbench.stimuli.whisker import Whisker
 
 SOLIDS = [sphere(2e-3), box((1e-3, 2e-3, 3e-3)), cylinder(1e-3, 5e-3), capsule(1e-3, 4e-3), rodgers_solid(segments=4)]
 
@@ -237,3 +241,16 @@ def test_the_configuration_of_a_solid_changes_with_its_geometry_only():
     assert rodgers_solid().config() == rodgers_solid().config()
     assert rodgers_solid().config() != rodgers_solid(0.05).config()
     assert sphere(1e-3).config() != sphere(2e-3).config()
+
+
+def test_a_whisker_through_the_hole_of_a_torus_feels_it_only_when_the_hole_is_filled():
+    shape = shapes.make("torus", 1, detail=2000)
+    whisker = Whisker(0.02, 60e-6, 6e-6, young_modulus=5e9, density=1260.0, damping_ratio=0.3)
+    touched = {}
+    for collision in ("exact", "hull"):
+        # The axis of the torus lies along the whisker, which points along x.
+        placed = PlacedObject(shape_solid(shape, collision=collision), (0.01, 0.0, 0.0), (0.0, np.pi / 2, 0.0))
+        job = Job(whisker, StillFollicle(), (placed.obstacle(),), np.array([1e-3, 2e-3]))
+        (trace,) = get_backend("mujoco").run([job], Fidelity(links=4, time_step=2e-4))
+        touched[collision] = bool(trace.contact.any()) or trace.status != "ok"
+    assert touched == {"exact": False, "hull": True}
