@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
 
     from brainbench.stimuli.render import Style
     from brainbench.stimuli.simulation import Progress
+
+
+_UNCHANGED = 255
+"""Index of a GIF's palette that means "as in the frame before"; the colours are those below it."""
 
 
 def write_film(
@@ -34,17 +39,28 @@ def write_film(
         frames: pictures of one size.
         count: number of frames, for ``progress``.
         style: size and frames per second.
-        palette_from: frames whose colours the 256 colours of a GIF are chosen from.
+        palette_from: frames whose colours the 255 colours of a GIF are chosen from.
         progress: called as ``progress(done, total, what)`` after each frame.
 
     Raises:
-        MissingDependencyError: a package of the extra ``report`` is missing.
         DataError: the encoder failed.
     """
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with atomic_path(path) as temporary:
         write(temporary, _counted(frames, count, progress), style, palette_from)
     return path
+
+
+def require_writer(suffix: str) -> None:
+    """Raise a :class:`MissingDependencyError` unless pictures of this format (``.png``, …) can be made here."""
+    needed = [("matplotlib", "matplotlib", "Drawing pictures")]
+    if suffix == ".mp4":
+        needed.append(("imageio_ffmpeg", "imageio-ffmpeg", "Writing an MP4"))
+    for module, package, purpose in needed:
+        try:
+            import_module(module)
+        except ImportError as error:
+            raise missing_dependency(package, extra="report", purpose=purpose) from error
 
 
 def _counted(frames: Iterable[Any], count: int, progress: Progress | None) -> Iterator[Any]:
@@ -55,28 +71,39 @@ def _counted(frames: Iterable[Any], count: int, progress: Progress | None) -> It
 
 
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:
-    try:
-        from PIL import GifImagePlugin, Image
-    except ImportError as error:
-        raise missing_dependency("pillow", extra="report", purpose="Writing a GIF") from error
-    palette = Image.fromarray(np.concatenate(palette_from)).quantize(256, kmeans=1, dither=Image.Dither.NONE)
+    from PIL import GifImagePlugin, Image
+
+    palette = Image.fromarray(_distinct_colors(palette_from)).quantize(_UNCHANGED, kmeans=1, dither=Image.Dither.NONE)
     # A GIF counts hundredths of a second, and viewers slow down anything shorter than two.
     duration = 10 * max(2, round(100 / style.frames_per_second))
+    before = None
     with path.open("wb") as file:
-        for index, frame in enumerate(frames):
+        for frame in frames:
             image = Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-            if index == 0:
+            now = np.asarray(image)
+            if before is None:
                 # Pillow's own writer keeps all frames in memory; its parts do not.
                 file.writelines(GifImagePlugin.getheader(image, info={"optimize": False, "loop": 0})[0])
-            file.writelines(GifImagePlugin.getdata(image, duration=duration))
+            else:
+                image = Image.fromarray(np.where(now == before, np.uint8(_UNCHANGED), now))
+            file.writelines(GifImagePlugin.getdata(image, duration=duration, transparency=_UNCHANGED, disposal=1))
+            before = now
         file.write(b";")
 
 
+def _distinct_colors(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Return an image [1, n, 3] of the colours in some frames, rare ones once like frequent ones.
+
+    A scene is mostly white: chosen by area, the palette would have no room for the colours of thin whiskers.
+    """
+    found = np.unique(np.concatenate([frame.reshape(-1, 3) for frame in frames]), axis=0)
+    white = np.full((len(found) // 16 + 1, 3), 255, dtype=np.uint8)
+    return np.concatenate([found, white])[None]
+
+
 def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise missing_dependency("imageio-ffmpeg", extra="report", purpose="Writing an MP4") from error
+    import imageio_ffmpeg
+
     # H.264 stores colour for blocks of two by two pixels.
     width, height = (size - size % 2 for size in style.size)
     writer = imageio_ffmpeg.write_frames(

@@ -16,6 +16,7 @@ import numpy as np
 from brainbench.errors import UsageError, listing, unknown_name
 from brainbench.stimuli._annotation import Annotation
 from brainbench.stimuli._figure import ROW_COLORS, check_format, round_up
+from brainbench.stimuli._film import require_writer, write_film
 from brainbench.stimuli._raster import Layer, Triangles, draw
 from brainbench.stimuli._shading import floor, lamp, paint, shade
 from brainbench.stimuli._surfaces import Surface, ball, object_surface, smoothed, tube
@@ -237,6 +238,7 @@ def render(
     times = np.atleast_1d(np.asarray(times, dtype=float))
     if suffix == ".png" and len(times) != 1:
         raise UsageError(f"A .png shows one instant; received {len(times)}: write a film ({listing(FORMATS[1:])}).")
+    require_writer(suffix)
     recording = record(scene, times, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
     if recording.unstable:
         _LOG.warning("unstable whiskers are not drawn from then on: %s", listing(recording.unstable))
@@ -244,8 +246,6 @@ def render(
     annotation = Annotation(picture)
     if suffix == ".png":
         return annotation.save(path)
-    from brainbench.stimuli._film import write_film
-
     frames = (annotation.frame(index) for index in range(len(times)))
     sample = [annotation.frame(index) for index in {0, len(times) // 2, len(times) - 1}] if suffix == ".gif" else []
     return write_film(path, frames, len(times), style, palette_from=sample, progress=progress)
