@@ -153,7 +153,8 @@ def explain(
             job = plan.jobs[index]
             chain = chains[job.whisker]
             pairs_in_full += chain.links * parts
-            steps_in_full += math.ceil((job.times[-1] - job.start) / fidelity.time_step - 1e-6) + 1
+            step = fidelity.step(float(chain.frequencies()[0]) / (2 * math.pi))
+            steps_in_full += math.ceil((job.times[-1] - job.start) / step - 1e-6) + 1
             if index not in counted and traces[index].steps:
                 pairs += reach.links(chain) * reach.parts
             counted.add(index)
