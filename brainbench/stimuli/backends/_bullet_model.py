@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import MissingDependencyError, UsageError, missing_dependency
-from brainbench.stimuli.backends._mujoco_model import CONE_SIDES, MICRO, MILLI, _thickness
+from brainbench.stimuli.backends._mujoco_model import CONE_SIDES, LEAST_TAPER, MICRO, MILLI
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere
 
 if TYPE_CHECKING:
@@ -82,10 +82,11 @@ class BulletWorld:
                 "backend 'mujoco'."
             )
         self.bullet = engine()
-        thickness = np.array([_thickness(self.chain, link) for link in range(self.chain.links)])
-        self._cores = thickness[:, 0]
+        radii = self.chain.whisker.radius(self.chain.nodes) * MILLI
+        cores, thin = np.abs(np.diff(radii)), np.minimum(radii[:-1], radii[1:])
+        self._cores = np.where(cores >= LEAST_TAPER, cores, 0.0)
         # Bullet's own margin of a hull is part of the link's.
-        self._margins = np.where(self._cores > 0, thickness[:, 1] - HULL_MARGIN, 0.0)
+        self._margins = np.where(self._cores > 0, thin - HULL_MARGIN, 0.0)
 
     def __enter__(self) -> BulletWorld:
         self.client = self.bullet.connect(self.bullet.DIRECT)
