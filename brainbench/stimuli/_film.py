@@ -73,7 +73,7 @@ def _counted(frames: Iterable[Any], count: int, progress: Progress | None) -> It
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:
     from PIL import GifImagePlugin, Image
 
-    palette = Image.fromarray(_distinct_colors(palette_from)).quantize(_UNCHANGED, kmeans=1, dither=Image.Dither.NONE)
+    palette = Image.fromarray(_sampled_colors(palette_from)).quantize(_UNCHANGED, kmeans=1, dither=Image.Dither.NONE)
     # A GIF counts hundredths of a second, and viewers slow down anything shorter than two.
     duration = 10 * max(2, round(100 / style.frames_per_second))
     before = None
@@ -91,14 +91,14 @@ def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, pa
         file.write(b";")
 
 
-def _distinct_colors(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Return an image [1, n, 3] of the colours in some frames, rare ones once like frequent ones.
+def _sampled_colors(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Return an image [1, n, 3] of the colours in some frames: half by area, half every distinct colour once.
 
-    A scene is mostly white: chosen by area, the palette would have no room for the colours of thin whiskers.
+    By area alone the palette would have no room for the colours of thin whiskers, without it objects change hue.
     """
-    found = np.unique(np.concatenate([frame.reshape(-1, 3) for frame in frames]), axis=0)
-    white = np.full((len(found) // 16 + 1, 3), 255, dtype=np.uint8)
-    return np.concatenate([found, white])[None]
+    pixels = np.concatenate([frame.reshape(-1, 3) for frame in frames])
+    distinct = np.unique(pixels, axis=0)
+    return np.concatenate([distinct, pixels[:: max(1, len(pixels) // len(distinct))]])[None]
 
 
 def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:
