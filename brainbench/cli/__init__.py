@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from brainbench import __version__
-from brainbench.cli import doctor, leaderboard, models, recordings, score, stimuli
+from brainbench.cli import doctor, leaderboard, models, recordings, score, stimuli, tradeoff
 from brainbench.errors import BrainbenchError
 
 app = typer.Typer(
@@ -30,6 +30,7 @@ app.command("doctor")(doctor.doctor)
 app.add_typer(models.app, name="models")
 app.add_typer(recordings.app, name="recordings")
 app.add_typer(stimuli.app, name="stimuli")
+app.add_typer(tradeoff.app, name="tradeoff")
 app.add_typer(leaderboard.app, name="leaderboard")
 
 

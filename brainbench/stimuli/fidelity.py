@@ -1,7 +1,7 @@
 """How finely a whisker is simulated: presets, and the cheapest setting for a wanted error.
 
 Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this module is written by
-``benchmarks/whisker_fidelity.py`` and states how.
+``brainbench tradeoff whisker`` (:mod:`brainbench.stimuli.tradeoff`) and states how.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Fidelity:
     def auto(cls, *, error: float = 0.05) -> Fidelity:
         """Return the cheapest measured setting whose relative error is at most ``error``.
 
-        The error is the worst over bench tests of one mouse whisker: pegs against the elastica, and whisking
+        The error is the worst over bench tests of mouse whiskers: pegs against the elastica, ring-downs, and whisking
         against a post, with and without friction. Sharp-edged objects at high speed are harder than that.
 
         Raises:
@@ -119,8 +119,9 @@ def measured() -> tuple[TradeoffPoint, ...]:
     return tuple(
         TradeoffPoint(
             point["error"] if point["error"] is not None else math.inf,
-            point["cost"],
-            {"links": point["links"], "time_step": point["time_step"]},
+            point["cost"] if point["cost"] is not None else math.inf,
+            {name: point.get(name) for name in ("links", "links_per_mm", "time_step", "steps_per_period")},
         )
         for point in json.loads(text)["points"]
+        if point.get("backend", "mujoco") == "mujoco"
     )

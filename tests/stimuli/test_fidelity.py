@@ -6,25 +6,24 @@ from brainbench.errors import UsageError
 from brainbench.stimuli.fidelity import Fidelity, list_presets, measured
 
 
+def _table():
+    return {Fidelity(**point.settings): point for point in measured()}
+
+
 def test_presets_are_on_record_as_accurate_as_they_promise():
-    table = {(p.settings["links"], p.settings["time_step"]): p for p in measured()}
     for name, promise in zip(list_presets(), (0.15, 0.05, 0.03), strict=True):
-        preset = Fidelity.preset(name)
-        assert table[preset.links, preset.time_step].error <= promise
+        assert _table()[Fidelity.preset(name)].error <= promise
 
 
 def test_presets_cost_more_as_they_get_more_accurate():
-    table = {(p.settings["links"], p.settings["time_step"]): p for p in measured()}
-    costs = [table[f.links, f.time_step].cost for f in map(Fidelity.preset, list_presets())]
+    costs = [_table()[Fidelity.preset(name)].cost for name in list_presets()]
     assert costs == sorted(costs)
 
 
 def test_auto_takes_the_cheapest_measured_setting_that_is_good_enough():
-    for error in (0.1, 0.05, 0.02):
-        chosen = Fidelity.auto(error=error)
-        good = [p for p in measured() if p.error <= error]
-        best = min(good, key=lambda p: p.cost)
-        assert (chosen.links, chosen.time_step) == (best.settings["links"], best.settings["time_step"])
+    for error in (0.1, 0.05, 0.03):
+        good = [point for point in measured() if point.error <= error]
+        assert _table()[Fidelity.auto(error=error)].cost == min(point.cost for point in good)
 
 
 def test_auto_refuses_what_was_never_measured():

@@ -1,0 +1,69 @@
+"""``brainbench tradeoff``: measure accuracy against cost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+
+app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
+
+
+@app.callback()
+def _group() -> None:
+    """Keep ``whisker`` a subcommand while it is the only one."""
+
+
+@app.command("whisker")
+def whisker(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Table (.json); points in it are kept.")] = Path(
+        "whisker-tradeoff.json"
+    ),
+    links: Annotated[str, typer.Option(help="Links per whisker, comma-separated; the default grid if empty.")] = "",
+    time_steps: Annotated[str, typer.Option(help="Time steps in ms, comma-separated; the default grid if empty.")] = "",
+    backends: Annotated[str, typer.Option(help="Backends, comma-separated.")] = "mujoco",
+    csv: Annotated[Path | None, typer.Option(help="Also write the table as CSV.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Also draw error against cost (.png, .svg, .pdf).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure error and cost of whisker simulations over links, time step and backend, beside the presets.
+
+    The table that ships with the package (brainbench/stimuli/fidelity_table.json) is made by this command.
+    """
+    from brainbench.errors import UsageError
+    from brainbench.stimuli import tradeoff
+
+    try:
+        counts = tuple(int(item) for item in links.split(",") if item.strip()) or tradeoff.LINKS
+        steps = tuple((float(item) * 1e-3, None) for item in time_steps.split(",") if item.strip())
+    except ValueError as error:
+        raise UsageError(f"--links and --time-steps take numbers separated by commas ({error}).") from error
+    names = tuple(item.strip() for item in backends.split(",") if item.strip())
+    chosen = tradeoff.settings(links=counts, time_steps=steps or tradeoff.TIME_STEPS, backends=names)
+    with progress_bar() as progress:
+        points = tradeoff.measure_tradeoff(out, chosen, progress=progress)
+    if csv is not None:
+        tradeoff.write_csv(points, csv)
+    if plot is not None:
+        tradeoff.plot_tradeoff(points, plot)
+    best = tradeoff.front(points)
+    rows = [
+        [
+            f"{point.error:.2%}",
+            f"{point.cost:.3g}",
+            str(point.settings["links"]),
+            f"{point.settings['time_step'] * 1e3:g}",
+            str(point.settings["backend"]),
+        ]
+        for point in best
+    ]
+    text = table(
+        f"{len(points)} settings measured; those that no other beats in both error and cost:",
+        ["error", "processor s / whisker-s", "links", "step ms", "backend"],
+        rows,
+        right=(0, 1, 2, 3),
+    )
+    emit({"points": points, "front": best, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)

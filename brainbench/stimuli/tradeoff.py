@@ -1,0 +1,277 @@
+"""Measure error and cost of whisker simulations over their settings: the data behind ``Fidelity.auto``.
+
+Subject: mouse whisker C2, straightened; for the ring-down also the stiffest mouse whisker, E5. Per setting:
+
+- ``static_error``: worst of base-moment and base-force errors against the elastica over five frictionless pegs;
+- ``ring_error``: worst error of first frequency and damping ratio of C2 and E5 against what was asked for;
+- ``dynamic_error``: base moment while whisking at 20 Hz against a frictionless post: root-mean-square difference
+  from a converged simulation (:data:`CONVERGED`, of the ``mujoco`` backend) over its root mean square, read every ms;
+- ``sliding_error``: the same with friction .48;
+- ``flick_error``: the same with friction while the whisker sweeps past the post and springs free in every whisk;
+- ``error``: the worst of these five; null when a run failed, with the reason in ``note``;
+- ``cost``: processor seconds per simulated second of one whisker in contact, over the three whisking runs.
+
+A table is a JSON file; points that it holds already are kept, so an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import BrainbenchError, DataError, missing_dependency
+from brainbench.fidelity import TradeoffPoint, pareto_front
+from brainbench.files import atomic_path, read_json, write_json, write_text
+from brainbench.stimuli.backends import get_backend
+from brainbench.stimuli.backends.protocol import Job
+from brainbench.stimuli.fidelity import Fidelity, list_presets
+from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.stimuli.obstacle import Capsule, Obstacle
+from brainbench.stimuli.validation import peg, ringdown
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.backends.protocol import Trace
+    from brainbench.stimuli.whisker import Whisker
+
+PROTOCOL = 2
+"""Counts up when the experiments change, so that points of different experiments never share a table."""
+PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2), (0.8, 0.02))
+"""Centre-line points (a/L, d/L) of the static tests."""
+LINKS = (6, 8, 10, 14, 20, 30)
+TIME_STEPS = ((2e-4, 10.0), (1e-4, 25.0), (5e-5, 120.0), (2e-5, 250.0))
+"""Time step [s] with the least steps per period of the first mode, which short whiskers need."""
+CONVERGED = Fidelity(links=40, time_step=1e-5)
+"""Setting of the dynamic reference."""
+PARTS = ("static_error", "ring_error", "dynamic_error", "sliding_error", "flick_error")
+
+Progress = Callable[[int, int, str], None]
+"""Called with the settings done, the settings in all, and what is being measured."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point of the trade-off."""
+
+    fidelity: Fidelity
+    backend: str = "mujoco"
+
+
+def settings(
+    *,
+    links: Sequence[int] = LINKS,
+    time_steps: Sequence[tuple[float, float | None]] = TIME_STEPS,
+    backends: Sequence[str] = ("mujoco",),
+) -> list[Setting]:
+    """Return every combination (``time_steps`` pairs a step [s] with steps per period), after the presets.
+
+    Raises:
+        UsageError: a value lies outside the range of :class:`Fidelity`.
+    """
+    grid = [
+        Fidelity(links=count, time_step=step, steps_per_period=periods)
+        for count, (step, periods) in itertools.product(links, time_steps)
+    ]
+    presets = [Fidelity.preset(name) for name in list_presets()]
+    return [Setting(fidelity, name) for name in backends for fidelity in dict.fromkeys([*presets, *grid])]
+
+
+def measure_tradeoff(
+    path: str | os.PathLike[str], chosen: Iterable[Setting] | None = None, *, progress: Progress | None = None
+) -> list[dict[str, Any]]:
+    """Measure the settings that the table at ``path`` lacks, writing it (atomically) after each.
+
+    Returns:
+        All points of the table: the fields of the module's text, ``backend`` and the fields of :class:`Fidelity`.
+
+    Raises:
+        DataError: ``path`` holds something else, or points of other experiments or of another MuJoCo.
+        UsageError: a backend is unknown.
+    """
+    wanted = settings() if chosen is None else list(chosen)
+    for name in {setting.backend for setting in wanted}:
+        get_backend(name)
+    head, points = _header(), []
+    if Path(path).exists():
+        table = read_json(path)
+        if not isinstance(table, dict) or any(table.get(key) != head[key] for key in ("protocol", "mujoco")):
+            raise DataError(
+                f"{os.fspath(path)!r} was measured by other experiments or with another MuJoCo than {head['mujoco']}; "
+                "write to another file, or delete it to measure everything again."
+            )
+        points = list(table["points"])
+    known = {_key(point) for point in points}
+    missing = [setting for setting in wanted if _key(_fields(setting)) not in known]
+    # The reference costs more than most points, so it is run only when something is missing.
+    reference = _whisking(Setting(CONVERGED)) if missing else ()
+    for done, setting in enumerate(missing):
+        if progress is not None:
+            progress(done, len(missing), "measuring settings")
+        points.append(_measure(setting, reference))
+        write_json(path, {**head, "points": points})
+    if progress is not None and missing:
+        progress(len(missing), len(missing), "measuring settings")
+    return points
+
+
+def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
+    """Write points as comma-separated values, one row each, atomically; what is not known stays empty."""
+    import csv
+    from io import StringIO
+
+    rows = list(points)
+    text = StringIO()
+    writer = csv.DictWriter(text, fieldnames=sorted({name for row in rows for name in row}), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
+    return write_text(path, text.getvalue())
+
+
+def front(points: Iterable[dict[str, Any]]) -> list[TradeoffPoint]:
+    """Return the points that none beats in both error and cost, cheapest first."""
+    return pareto_front(
+        TradeoffPoint(
+            math.inf if p["error"] is None else p["error"], p["cost"], {n: p[n] for n in (*_NAMES, "backend")}
+        )
+        for p in points
+        if p["cost"] is not None
+    )
+
+
+def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
+    """Draw error against cost with the front and the presets, to an image whose suffix is the format.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed (extra ``report``).
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise missing_dependency("matplotlib", extra="report", purpose="Plotting the trade-off") from error
+    usable = [point for point in points if point["error"] is not None]
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    for steps in sorted({point["time_step"] for point in usable}):
+        some = [point for point in usable if point["time_step"] == steps]
+        axes.scatter([p["cost"] for p in some], [p["error"] for p in some], s=18, label=f"{steps * 1e3:g} ms")
+    best = front(usable)
+    axes.step([p.cost for p in best], [p.error for p in best], where="post", color="0.4", lw=1, zorder=0, label="front")
+    for name in list_presets():
+        fields = _key(_fields(Setting(Fidelity.preset(name))))
+        for point in usable:
+            if _key(point) == fields:
+                axes.annotate(name, (point["cost"], point["error"]), xytext=(5, 5), textcoords="offset points")
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="processor seconds per whisker-second in contact",
+        ylabel="largest relative error",
+    )
+    axes.legend(title="longest step", frameon=False, fontsize="small")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=150)
+    return Path(path)
+
+
+_NAMES = ("links", "links_per_mm", "time_step", "steps_per_period")
+
+
+def _fields(setting: Setting) -> dict[str, Any]:
+    return {**asdict(setting.fidelity), "backend": setting.backend}
+
+
+def _key(point: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(point.get(name) for name in (*_NAMES, "backend"))
+
+
+def _header() -> dict[str, Any]:
+    import platform
+    from importlib import metadata
+
+    return {
+        "made_by": "brainbench tradeoff whisker",
+        "protocol": PROTOCOL,
+        "subject": "mouse whisker C2 (ring-down also E5)",
+        "error": "worst of static (elastica, five pegs), ring-down, dynamic, sliding and flick (whisking on a post)",
+        "cost": "processor seconds per whisker-second in contact",
+        "mujoco": metadata.version("mujoco-core"),
+        "machine": platform.machine(),
+    }
+
+
+def _measure(setting: Setting, reference: Sequence[Trace]) -> dict[str, Any]:
+    fidelity, backend = setting.fidelity, setting.backend
+    values: dict[str, Any] = {**_fields(setting), **dict.fromkeys((*PARTS, "error", "cost")), "note": ""}
+    whisker = _straight("C2")
+    try:
+        pegs = [
+            peg(whisker, at * whisker.arc_length, offset * whisker.arc_length, backend=backend, fidelity=fidelity)
+            for at, offset in PEGS
+        ]
+        values["static_error"] = max(max(test.moment_error, test.force_error) for test in pegs)
+        values["ring_error"] = max(_ring_error(_straight(name), setting) for name in ("C2", "E5"))
+        traces = _whisking(setting)
+        values["cost"] = float(sum(trace.seconds for trace in traces) / (len(traces) * _FRAMES[-1]))
+        for name, trace, other in zip(PARTS[2:], traces, reference, strict=True):
+            values[name] = _difference(trace, other)
+        values["error"] = max(values[name] for name in PARTS)
+    except BrainbenchError as error:
+        values["note"] = str(error)
+    return values
+
+
+def _ring_error(whisker: Whisker, setting: Setting) -> float:
+    ring = ringdown(whisker, modes=1, backend=setting.backend, fidelity=setting.fidelity)
+    return max(abs(ring.frequency_error), abs(ring.damping_ratio / whisker.damping_ratio - 1))
+
+
+def _straight(name: str) -> Whisker:
+    return replace(WhiskerArray.mouse()[name].whisker, curvature=0.0)
+
+
+_FRAMES = np.arange(1.0, 151.0) * 1e-3
+
+
+@dataclass(frozen=True)
+class _Whisk:
+    """Whisking at 20 Hz by ± ``amplitude`` (rad) from a retracted start without a jump."""
+
+    amplitude: float
+
+    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        ramp = np.clip(times / 0.025, 0, 1)
+        swing = self.amplitude * (1 - np.cos(2 * np.pi * 20 * times) * (ramp**3 * (10 - 15 * ramp + 6 * ramp**2)))
+        euler = np.tile([math.pi / 2, 0.0, -math.pi / 2], (len(times), 1))
+        euler[:, 0] += swing - swing[0]
+        return np.zeros((len(times), 3)), euler
+
+
+def _whisking(setting: Setting) -> list[Trace]:
+    """Run smooth, sliding and flicking contact.
+
+    Raises:
+        DataError: one of them was unstable.
+    """
+    whisker = _straight("C2")
+    jobs = []
+    for friction, degrees in ((0.0, 12), (0.48, 12), (0.48, 25)):
+        post = Obstacle((Capsule((0.0107, 0.0012, -0.02), (0.0107, 0.0012, 0.02), 1e-3),), friction=friction)
+        jobs.append(Job(whisker, _Whisk(math.radians(degrees)), (post,), _FRAMES))
+    traces = get_backend(setting.backend).run(jobs, setting.fidelity, workers=1)
+    for trace in traces:
+        if trace.status != "ok":
+            raise DataError(f"The simulation was unstable: {trace.reason}.")
+    return traces
+
+
+def _difference(trace: Trace, reference: Trace) -> float:
+    gap = trace.wrench[:, 3:] - reference.wrench[:, 3:]
+    return float(np.sqrt(np.mean(gap**2) / np.mean(reference.wrench[:, 3:] ** 2)))

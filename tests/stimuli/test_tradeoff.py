@@ -1,0 +1,70 @@
+"""Measuring error against cost: points are kept, tables of other experiments are refused."""
+
+import csv
+import importlib.util
+import json
+
+import pytest
+
+from brainbench.errors import DataError, MissingDependencyError, UsageError
+from brainbench.stimuli import tradeoff
+from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.tradeoff import Setting
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A coarse reference and one peg, so that a point takes a moment."""
+    monkeypatch.setattr(tradeoff, "CONVERGED", Fidelity(links=8, time_step=2e-4, steps_per_period=10))
+    monkeypatch.setattr(tradeoff, "PEGS", ((0.5, 0.1),))
+
+
+COARSE = Setting(Fidelity(links=6, time_step=2e-4, steps_per_period=10))
+FINE = Setting(Fidelity(links=8, time_step=2e-4, steps_per_period=10))
+
+
+def test_a_setting_is_measured_once_and_the_reference_differs_from_itself_by_nothing(quick, tmp_path):
+    path = tmp_path / "table.json"
+    (first,) = tradeoff.measure_tradeoff(path, [FINE])
+    assert first["dynamic_error"] == first["sliding_error"] == first["flick_error"] == 0
+    assert first["error"] == max(first["static_error"], first["ring_error"]) > 0
+    both = tradeoff.measure_tradeoff(path, [FINE, COARSE])
+    # Cost is a measured time, so an equal number means that the point was kept.
+    assert both[0] == first
+    assert both[1]["dynamic_error"] > 0
+    assert json.loads(path.read_text())["points"] == both
+    tradeoff.write_csv(both, tmp_path / "table.csv")
+    with (tmp_path / "table.csv").open() as stream:
+        assert [int(row["links"]) for row in csv.DictReader(stream)] == [8, 6]
+    if importlib.util.find_spec("matplotlib"):
+        assert tradeoff.plot_tradeoff(both, tmp_path / "plot.png").stat().st_size > 1000
+    else:
+        with pytest.raises(MissingDependencyError, match=r"brainbench\[report\]"):
+            tradeoff.plot_tradeoff(both, tmp_path / "plot.png")
+
+
+def test_a_table_of_other_experiments_is_refused(tmp_path):
+    path = tmp_path / "table.json"
+    path.write_text(json.dumps({"protocol": 1, "points": []}))
+    with pytest.raises(DataError, match="measured by other experiments"):
+        tradeoff.measure_tradeoff(path, [COARSE])
+
+
+def test_an_unknown_backend_is_refused_before_anything_is_measured(tmp_path):
+    with pytest.raises(UsageError, match="did you mean 'mujoco'"):
+        tradeoff.measure_tradeoff(tmp_path / "table.json", [Setting(COARSE.fidelity, "mujocco")])
+
+
+def test_the_front_leaves_out_failed_and_beaten_settings():
+    def point(links, error, cost):
+        return {"links": links, "links_per_mm": None, "time_step": 1e-4, "steps_per_period": None,
+                "backend": "mujoco", "error": error, "cost": cost}  # fmt: skip
+
+    points = [point(6, 0.1, 1.0), point(8, 0.2, 2.0), point(10, 0.05, 3.0), point(4, None, None)]
+    assert [best.settings["links"] for best in tradeoff.front(points)] == [6, 10]
+
+
+def test_the_grid_holds_the_presets_and_no_setting_twice():
+    chosen = tradeoff.settings()
+    assert len(set(chosen)) == len(chosen)
+    assert Setting(Fidelity.preset("balanced")) in chosen
