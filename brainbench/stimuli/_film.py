@@ -107,7 +107,12 @@ def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, pa
     # H.264 stores colour for blocks of two by two pixels.
     width, height = (size - size % 2 for size in style.size)
     writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=style.frames_per_second, quality=8, macro_block_size=2, codec="libx264"
+        str(path),
+        (width, height),
+        fps=style.frames_per_second,  # pyright: ignore[reportArgumentType]  # ffmpeg takes fractions too
+        quality=8,
+        macro_block_size=2,
+        codec="libx264",
     )
     try:
         writer.send(None)
