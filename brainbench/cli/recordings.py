@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,12 +38,8 @@ def rdm(
     conditions: Annotated[
         str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] that labels the trials; see 'recordings inspect'.")
     ] = None,
-    select: Annotated[
-        str | None, typer.Option(help="Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name.")
-    ] = None,
-    window: Annotated[
-        str | None, typer.Option(help="Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'.")
-    ] = None,
+    select: SelectOption = None,
+    window: WindowOption = None,
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
     as_json: JsonOption = False,
 ) -> None:

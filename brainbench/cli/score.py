@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
 
 if TYPE_CHECKING:
     from brainbench.types import ResultRecord, Score
@@ -42,12 +42,8 @@ def score(
     match: Annotated[
         Path | None, typer.Option(help="JSON, TOML or CSV file: recording label → stimulus label.")
     ] = None,
-    select: Annotated[
-        str | None, typer.Option(help="Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name.")
-    ] = None,
-    window: Annotated[
-        str | None, typer.Option(help="Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'.")
-    ] = None,
+    select: SelectOption = None,
+    window: WindowOption = None,
     whiskers: Annotated[str, typer.Option(help="Whiskers to simulate: all, C0-C3, C2,D1, …")] = "all",
     fidelity: Annotated[
         str, typer.Option(help="Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs).")
