@@ -17,7 +17,8 @@ import numpy as np
 from results import table, write_section
 
 from brainbench.stimuli.backends import _mujoco_model, get_backend
-from brainbench.stimuli.backends._mujoco_model import ARMATURE, MILLI
+from brainbench.stimuli.backends._engines import MILLI
+from brainbench.stimuli.backends._mujoco_drive import ARMATURE
 from brainbench.stimuli.backends.protocol import Job
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.fidelity import Fidelity

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.types import Progress
+
 if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
     from brainbench.metrics import SubjectRDM
-
-Progress = Callable[[int, int, str], None]
 
 RDM_METHOD = "correlation"
 DEMO_STIMULI = "rodgers"

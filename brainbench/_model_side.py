@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,15 +12,13 @@ import numpy as np
 
 from brainbench._brain_side import RDM_METHOD
 from brainbench.errors import UsageError, unknown_name
-from brainbench.types import CHANNELS, ModelCard
+from brainbench.types import CHANNELS, ModelCard, Progress
 
 if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 
     from brainbench.stimuli import Stimuli
-
-Progress = Callable[[int, int, str], None]
 
 DEFAULT_STIMULI = "rodgers"
 RANDOM_FEATURES = 512

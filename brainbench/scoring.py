@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from brainbench.errors import UsageError
 from brainbench.files import provenance
-from brainbench.types import ResultRecord, Score
+from brainbench.types import Progress, ResultRecord, Score
 
 if TYPE_CHECKING:
     import os
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from brainbench.datasets import Selection, Window
     from brainbench.stimuli import Fidelity
 
-Progress = Callable[[int, int, str], None]
 TimeRule = Literal["mean", "concatenate"]
 
 COMPARISON = "pearson"

@@ -12,7 +12,7 @@ NaN means "not recorded". :func:`check_stimulus_set` and :func:`check_recordings
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -30,6 +30,9 @@ GRID_SHAPE = (5, 7)
 Status = Literal["ok", "unreliable", "undefined"]
 """``ok``: can be trusted; ``unreliable``: computed, but the data are too noisy or too few to trust
 it; ``undefined``: no number exists. The reason stands in words beside it."""
+
+Progress = Callable[[int, int, str], None]
+"""Called with the steps done, the steps in all, and what is being done."""
 
 RECORD_SCHEMA = 1
 """Version of the result-record JSON layout."""

@@ -39,12 +39,10 @@ from brainbench.datasets._demo_session import (
 )
 from brainbench.errors import DataError, UsageError, listing
 from brainbench.files import cache_dir, content_hash, file_hash, read_json, write_json
-from brainbench.types import check_stimulus_set
+from brainbench.types import Progress, check_stimulus_set
 
 if TYPE_CHECKING:
     import xarray as xr
-
-Progress = Callable[[int, int, str], None]
 
 VERSION = 2
 """Raised when the same stimuli give other spikes, so that old caches are not reused."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.stimuli.render import Style
-    from brainbench.stimuli.simulation import Progress
+    from brainbench.types import Progress
 
 
 _UNCHANGED = 255

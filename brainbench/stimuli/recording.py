@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from brainbench.stimuli.backends.protocol import Backend, Job
     from brainbench.stimuli.scene import Scene
-    from brainbench.stimuli.simulation import Progress
+    from brainbench.types import Progress
 
 _LOG = logging.getLogger(__name__)
 

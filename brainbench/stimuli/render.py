@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.camera import Lens
     from brainbench.stimuli.fidelity import Fidelity
     from brainbench.stimuli.scene import Scene
-    from brainbench.stimuli.simulation import Progress
+    from brainbench.types import Progress
 
 _LOG = logging.getLogger(__name__)
 

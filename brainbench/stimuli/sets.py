@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.backends.protocol import Backend
     from brainbench.stimuli.fidelity import Fidelity
     from brainbench.stimuli.scene_files import Recipe
-    from brainbench.stimuli.simulation import Progress
+    from brainbench.types import Progress
 
 _HDF5 = (".h5", ".hdf5", ".nc")
 

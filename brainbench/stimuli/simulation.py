@@ -6,7 +6,7 @@ import functools
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from brainbench.stimuli.frames import clip_wrenches
 from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scene import Scene
 from brainbench.stimuli.storage import hash_stimulus_set, read_stimulus_set, write_stimulus_set
-from brainbench.types import CHANNELS, check_stimulus_set
+from brainbench.types import CHANNELS, Progress, check_stimulus_set
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 _PACKAGES = {"bullet": "pybullet", "mujoco": "mujoco-core"}
-
-Progress = Callable[[int, int, str], None]
-"""Called with the whiskers done, the whiskers in all, and what is being done."""
 
 
 def simulate(

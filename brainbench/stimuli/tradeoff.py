@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from brainbench.stimuli.backends.protocol import Trace
     from brainbench.stimuli.whisker import Whisker
+    from brainbench.types import Progress
 
 PROTOCOL = 2
 """Counts up when the experiments change, so that points of different experiments never share a table."""
@@ -52,9 +53,6 @@ TIME_STEPS = ((2e-4, 10.0), (1e-4, 25.0), (5e-5, 120.0), (2e-5, 250.0))
 CONVERGED = Fidelity(links=40, time_step=1e-5)
 """Setting of the dynamic reference."""
 PARTS = ("static_error", "ring_error", "dynamic_error", "sliding_error", "flick_error")
-
-Progress = Callable[[int, int, str], None]
-"""Called with the settings done, the settings in all, and what is being measured."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import MissingDependencyError, UsageError, missing_dependency
-from brainbench.stimuli.backends._mujoco_model import CONE_SIDES, LEAST_TAPER, MICRO, MILLI
+from brainbench.stimuli.backends._engines import CONE_SIDES, LEAST_TAPER, MICRO, MILLI
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere
 
 if TYPE_CHECKING:

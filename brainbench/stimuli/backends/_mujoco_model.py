@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from brainbench.errors import MissingDependencyError
+from brainbench.stimuli.backends._engines import CONE_SIDES, LEAST_TAPER, MICRO, MILLI
 from brainbench.stimuli.backends._mujoco_drive import ARMATURE, Drive, drive_free, drive_scalars
 from brainbench.stimuli.backends.protocol import base_rotation
 from brainbench.stimuli.obstacle import Box, ConvexPart, Sphere, rotation_matrix
@@ -30,10 +31,6 @@ if TYPE_CHECKING:
     from brainbench.stimuli.chain import Chain
     from brainbench.stimuli.obstacle import Obstacle, Part
 
-MILLI = 1e3
-"""Millimetres in a metre, milliseconds in a second, millinewtons in a newton."""
-MICRO = 1e6
-"""Milligrams in a kilogram, µN·m in a newton metre."""
 
 SLOTS = 6
 """Contacts reported per step, strongest first; any further ones act but are not reported."""
@@ -52,12 +49,8 @@ contact rise by about μ times the slip of one step; at 1 a whisker that sweeps 
 hops (moments several times too large at steps of .1 ms), at .02 it slides, and Coulomb's law is
 approached from below as the step shrinks."""
 
-CONE_SIDES = 8
-"""Sides of the cone inside a tapered link."""
 SAFE_TRAVEL = 2.0
 """Margin of a cone in terms of the farthest travel in one step, below which the link is a capsule."""
-LEAST_TAPER = 1e-6
-"""Difference of the radii of a link's ends (mm) below which it is a capsule."""
 
 _NOTHING = {"mass": "1e-12", "diaginertia": "1e-14 1e-14 1e-14"}
 

@@ -32,10 +32,9 @@ import numpy as np
 from brainbench.errors import UsageError
 from brainbench.stimuli.backends._bullet_contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.backends._bullet_model import FOLLICLE, BulletWorld, engine
+from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, warn_overdamped
 from brainbench.stimuli.backends._mujoco_drive import drive_scalars
-from brainbench.stimuli.backends._mujoco_model import MICRO, MILLI
 from brainbench.stimuli.backends._reach import reachable
-from brainbench.stimuli.backends.mujoco import LARGEST_BEND, _warn_overdamped
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.obstacle import rotation_matrix
@@ -80,7 +79,7 @@ class BulletBackend:
         if workers is not None and workers < 1:
             raise UsageError(f"workers must be at least 1; received {workers}.")
         engine()
-        _warn_overdamped(jobs, fidelity)
+        warn_overdamped(jobs, fidelity)
         traces = []
         for job in jobs:
             traces.append(_simulate(job, fidelity, record_shape))

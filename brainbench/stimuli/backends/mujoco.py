@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.errors import UsageError
+from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, warn_overdamped
 from brainbench.stimuli.backends._mujoco_drive import ARMATURE
-from brainbench.stimuli.backends._mujoco_model import MICRO, MILLI, SLOT_WIDTH, WhiskerModel, build_model, engine
+from brainbench.stimuli.backends._mujoco_model import SLOT_WIDTH, WhiskerModel, build_model, engine
 from brainbench.stimuli.backends._reach import reachable
 from brainbench.stimuli.backends.protocol import Trace
 from brainbench.stimuli.chain import build_chain
@@ -37,8 +38,6 @@ logger = logging.getLogger(__name__)
 
 CHUNK = 250
 """Steps per native call: bounds the memory of a job, and the drift of prescribed joints between resets."""
-LARGEST_BEND = 1.5
-"""Angle between two links (rad) that no intact whisker reaches; beyond it a simulation counts as unstable."""
 
 
 class MujocoBackend:
@@ -62,7 +61,7 @@ class MujocoBackend:
         """
         if workers is not None and workers < 1:
             raise UsageError(f"workers must be at least 1; received {workers}.")
-        _warn_overdamped(jobs, fidelity)
+        warn_overdamped(jobs, fidelity)
         traces: list[Trace | None] = [None] * len(jobs)
         with _quiet(), ThreadPoolExecutor(max_workers=workers or _processors()) as pool:
             futures = {pool.submit(_simulate, job, fidelity, record_shape): i for i, job in enumerate(jobs)}
@@ -283,21 +282,3 @@ def _reason(hinges: NDArray, warned: list[str], moment: float) -> str:
         joint = int(np.abs(hinges).argmax()) // 2
         return f"joint {joint} bent by {bend:.2f} rad {where}, more than a chain of links can represent"
     return f"MuJoCo warned of {', '.join(warned) or 'a non-finite sensor'} {where}"
-
-
-def _warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:
-    """Say when the time step alone damps a whisker at least twice as much as it should be damped."""
-    worst, wanted = 0.0, 0.0
-    for whisker in {job.whisker for job in jobs}:
-        chain = build_chain(whisker, 8)
-        ratio = chain.achieved_damping_ratio(fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi)))
-        if ratio > 2 * whisker.damping_ratio and ratio > worst:
-            worst, wanted = ratio, whisker.damping_ratio
-    if worst:
-        logger.warning(
-            "The time step of %g s damps the first mode of at least one whisker with ratio %.2f instead of %.2f; "
-            "its ringing is lost, slow bending is not; choose a smaller step to keep it.",
-            fidelity.time_step,
-            worst,
-            wanted,
-        )
