@@ -1,4 +1,4 @@
-"""Rigid bodies that whiskers may touch, as convex parts. Lengths in metres, quaternions (w, x, y, z)."""
+"""Rigid bodies that whiskers may touch, as convex parts or closed meshes. Lengths in metres, quaternions (w, x, y, z)."""
 
 from __future__ import annotations
 
@@ -37,6 +37,33 @@ class ConvexPart:
             raise UsageError("The vertices of a convex part lie in one plane; a part needs volume to be touched.")
         points.setflags(write=False)
         object.__setattr__(self, "vertices", points)
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A closed surface of any shape, concavities included: vertices [m, 3] (m) and faces [k, 3], outward by the
+    right-hand rule.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        points, faces = np.array(self.vertices, dtype=float), np.array(self.faces, dtype=np.int32)
+        if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 4 or not np.isfinite(points).all():
+            raise UsageError(f"A triangle mesh needs at least four finite vertices [m, 3]; got shape {points.shape}.")
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or len(faces) < 4:
+            raise UsageError(f"A closed triangle mesh needs at least four faces [k, 3]; got shape {faces.shape}.")
+        if faces.min() < 0 or faces.max() >= len(points):
+            raise UsageError(f"The faces of a triangle mesh must name its {len(points)} vertices, counted from 0.")
+        points.setflags(write=False)
+        faces.setflags(write=False)
+        object.__setattr__(self, "vertices", points)
+        object.__setattr__(self, "faces", faces)
 
     def bounds(self) -> NDArray[np.float64]:
         """Axis-aligned bounds [2, 3]: lowest and highest corner."""
@@ -124,7 +151,7 @@ Part = ConvexPart | Sphere | Capsule | Cylinder | Box
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A rigid body made of convex parts that a whisker may touch.
+    """A rigid body made of parts that a whisker may touch.
 
     Whiskers do not move it: it stands still or follows ``motion`` exactly.
     """
@@ -135,6 +162,9 @@ class Obstacle:
     """Times [n] (s) → position [n, 3] (m) and quaternion [n, 4]; None for an obstacle that stands still."""
     friction: float | None = None
     """Coulomb coefficient of the contact; None takes the whisker's own."""
+    surface: TriangleMesh | None = None
+    """The exact surface of the body. Engines that collide meshes (``rod``) touch it instead of ``parts``; those that
+    collide convex bodies only (``mujoco``, ``bullet``) touch ``parts`` and refuse a surface without parts."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self.parts))
@@ -144,8 +174,8 @@ class Obstacle:
                     "An obstacle is made of ConvexPart, Sphere, Capsule, Cylinder and Box; "
                     f"received {type(part).__name__}."
                 )
-        if not self.parts:
-            raise UsageError("An obstacle needs at least one part.")
+        if not self.parts and self.surface is None:
+            raise UsageError("An obstacle needs at least one part or a surface.")
         if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
             raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
 
