@@ -121,10 +121,7 @@ def _detail(family: str, seed: int) -> int:
 
 
 def _files(pattern: str, unit: str | None, collision: str | None) -> Iterator[NamedObject]:
-    if Path(pattern).is_file():
-        paths = [Path(pattern)]
-    else:
-        paths = [path for path in _match(Path(pattern)) if path.is_file()]
+    paths = [path for path in _match(Path(pattern)) if path.is_file()]
     if not paths:
         raise DataFileNotFoundError(f"No mesh file matches {pattern!r}.")
     if unit is None:
@@ -139,6 +136,8 @@ def _files(pattern: str, unit: str | None, collision: str | None) -> Iterator[Na
 
 def _match(pattern: Path) -> list[Path]:
     """Return what a pattern matches, in alphabetical order; ``**`` stands for any number of folders."""
+    if pattern.is_file():
+        return [pattern]
     return sorted(Path(pattern.anchor or ".").glob(str(pattern.relative_to(pattern.anchor))))
 
 

@@ -1,0 +1,27 @@
+"""Small grids of quick sweeps, with which the machinery around the physics is tested."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from brainbench.stimuli.collections import resolve_objects
+from brainbench.stimuli.frames import Frames
+from brainbench.stimuli.sweeps import GRIDS, SweepScenes
+
+GRID = dataclasses.replace(
+    GRIDS["thesis-low"],
+    speed=(0.060,),
+    height=(-0.002, 0.0),
+    rotation=(0.0, math.pi / 4),
+    distance=(0.005,),
+    start=-0.002,
+    frames=Frames(count=10, interval=0.01),
+    published="",
+)
+"""Four sweeps of .1 s per object, which C2 and C3 feel; from ``start`` = −6 mm some whiskers are hit when they start."""
+
+
+def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):
+    found = resolve_objects(objects, collision="hull")
+    return SweepScenes(grid, {name: item.load for name, item in found.items()}, whiskers=whiskers)
