@@ -31,10 +31,12 @@ class Plan:
     """[scene][whisker] index into ``jobs``."""
     reaches: tuple[tuple[Reach, ...], ...]
     """[scene][whisker] what of its scene the whisker could ever touch."""
+    surfaces: bool = False
+    """Whether the engine touches exact surfaces where there are some, instead of convex parts."""
 
 
-def plan(scenes: Sequence[Scene]) -> Plan:
-    """Find the distinct jobs of ``scenes``."""
+def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> Plan:
+    """Find the distinct jobs of ``scenes``, for an engine that touches exact ``surfaces`` or convex parts."""
     distinct: dict[str, int] = {}
     jobs: list[Job] = []
     places, reaches = [], []
@@ -42,7 +44,7 @@ def plan(scenes: Sequence[Scene]) -> Plan:
         row, near = [], []
         owners = [part for part in scene.split() for _ in part.array]
         for mount, owner, job in zip(scene.mounts, owners, scene.jobs(), strict=True):
-            reach = reach_of(job)
+            reach = reach_of(job, surfaces=surfaces)
             travels = not isinstance(owner.head.motion, Still)
             seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
             key = content_hash(mount, {**seen, "label": None})
@@ -53,11 +55,11 @@ def plan(scenes: Sequence[Scene]) -> Plan:
             near.append(reach)
         places.append(tuple(row))
         reaches.append(tuple(near))
-    return Plan(tuple(jobs), tuple(places), tuple(reaches))
+    return Plan(tuple(jobs), tuple(places), tuple(reaches), surfaces)
 
 
-def reach_of(job: Job) -> Reach:
+def reach_of(job: Job, *, surfaces: bool = False) -> Reach:
     """Return what of its obstacles the whisker of this job could ever touch."""
     duration = job.times[-1] - job.start
     times = np.linspace(job.start, job.times[-1], max(2, math.ceil(duration * SAMPLING)))
-    return reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times)
+    return reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times, surfaces=surfaces)

@@ -56,7 +56,9 @@ def object_surface(item: PlacedObject) -> Surface:
     from brainbench.stimuli.objects import euler_matrix
 
     obstacle = item.obstacle()
-    if item.solid.mesh is None:
+    if item.solid.mesh is None and obstacle.surface is not None:
+        meshes = [Mesh(obstacle.surface.vertices, obstacle.surface.faces.astype(np.int64))]
+    elif item.solid.mesh is None:
         meshes = [part_mesh(part) for part in obstacle.parts]
     else:
         meshes = [item.solid.mesh.transformed(euler_matrix(item.rotation), item.position)]

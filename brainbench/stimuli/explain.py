@@ -1,8 +1,8 @@
 """What a simulation did and what it could leave out: whisker runs, time steps, contact pairs and seconds.
 
 A *run* is one whisker in one stimulus. Runs that cannot differ are simulated once and shared; runs that
-cannot feel anything are not simulated. A contact *pair* is one link of a whisker against one convex part
-of an object: a physics engine looks at every pair that it was given in every step.
+cannot feel anything are not simulated. A contact *pair* is one link of a whisker against one convex part of
+an object, or against one triangle where the engine touches surfaces: what it has to tell apart in every step.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli._plan import Plan
     from brainbench.stimuli.backends.protocol import Trace
     from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.stimuli.objects import Solid
     from brainbench.stimuli.scene import Scene
 
 ATTRIBUTE = "explanation"
@@ -28,6 +29,8 @@ ATTRIBUTE = "explanation"
 SECONDS = "seconds"
 """Key of a stimulus set's ``encoding`` under which this process keeps what took how long."""
 _PASSING = ("seconds", "source")
+_LATER = ("bodies",)
+"""Fields that sets made by earlier versions lack."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class Explanation:
     """Contact pairs of all links of all runs with all parts of their objects."""
     out_of_reach: Mapping[str, tuple[str, ...]]
     """Stimulus → whiskers that its objects cannot touch, whatever these whiskers do."""
+    bodies: str = "convex parts"
+    """What the contact pairs count of an object: ``convex parts``, ``triangles`` or both."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Elapsed time of each part [s]: ``plan``, ``simulate``, ``assemble``, and ``processor``, the processor time of
     ``simulate`` on all threads together; or ``read`` alone. Empty when this process did not make the set."""
@@ -83,13 +88,15 @@ class Explanation:
             raise UsageError("This stimulus set does not say how it was made; simulate it again to have it explained.")
         try:
             data = json.loads(text)
-            data = {item.name: data[item.name] for item in fields(cls) if item.name not in _PASSING}
+            later = {name: data[name] for name in _LATER if name in data}
+            data = {item.name: data[item.name] for item in fields(cls) if item.name not in (*_PASSING, *_LATER)}
         except (TypeError, KeyError, json.JSONDecodeError) as error:
             raise DataError(f"The explanation in this stimulus set is damaged ({error!r}).") from error
         data["links"] = tuple(data["links"])
         data["out_of_reach"] = {label: tuple(names) for label, names in data["out_of_reach"].items()}
         source = dataset.encoding.get("source")
-        return cls(**data, seconds=dataset.encoding.get(SECONDS, {}), source=None if source is None else str(source))
+        seconds = dataset.encoding.get(SECONDS, {})
+        return cls(**data, **later, seconds=seconds, source=None if source is None else str(source))
 
     def to_attribute(self) -> str:
         """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""
@@ -107,7 +114,7 @@ class Explanation:
             ("simulated", f"{self.simulated} runs, {self.steps:,} of {self.steps_in_full:,} time steps"),
             ("shared", f"{self.shared} runs equal to another stimulus's"),
             ("silent", f"{self.silent} runs that can feel nothing: exactly zero without simulation"),
-            ("contact pairs", f"{self.pairs:,} of {self.pairs_in_full:,} (links × convex parts) can ever meet"),
+            ("contact pairs", f"{self.pairs:,} of {self.pairs_in_full:,} (links × {self.bodies}) can ever meet"),
             ("saved", f"{_share(self.steps, self.steps_in_full)} of the steps, {_share(self.pairs, self.pairs_in_full)}"
              " of the contact pairs"),
             ("time", elapsed or "not known: made by another process"),
@@ -146,9 +153,12 @@ def explain(
         for whisker in {job.whisker for job in plan.jobs}
     }
     pairs = pairs_in_full = steps_in_full = 0
+    kinds: set[str] = set()
     counted: set[int] = set()
     for scene, places, reaches in zip(scenes, plan.places, plan.reaches, strict=True):
-        parts = sum(len(item.solid.parts) for item in scene.objects)
+        bodies = [_bodies(item.solid, plan.surfaces) for item in scene.objects]
+        kinds.update(kind for kind, count in bodies if count)
+        parts = sum(count for _, count in bodies)
         for index, reach in zip(places, reaches, strict=True):
             job = plan.jobs[index]
             chain = chains[job.whisker]
@@ -156,7 +166,7 @@ def explain(
             step = fidelity.step(float(chain.frequencies()[0]) / (2 * math.pi))
             steps_in_full += math.ceil((job.times[-1] - job.start) / step - 1e-6) + 1
             if index not in counted and traces[index].steps:
-                pairs += reach.links(chain) * reach.parts
+                pairs += reach.links(chain) * (reach.parts + reach.triangles)
             counted.add(index)
     counts = [chain.links for chain in chains.values()]
     silent = sum(traces[index].steps == 0 for places in plan.places for index in places)
@@ -177,7 +187,15 @@ def explain(
             scene.label: tuple(name for name, reach in zip(scene.names, reaches, strict=True) if not reach)
             for scene, reaches in zip(scenes, plan.reaches, strict=True)
         },
+        bodies=" and ".join(sorted(kinds)) or "convex parts",
     )
+
+
+def _bodies(solid: Solid, surfaces: bool) -> tuple[str, int]:
+    """Return what an engine has to tell apart of a solid, and how many there are."""
+    if solid.surface is not None and (surfaces or not solid.parts):
+        return "triangles", len(solid.surface.faces)
+    return "convex parts", len(solid.parts)
 
 
 def _share(part: int, whole: int) -> str:

@@ -19,7 +19,17 @@ from brainbench.errors import UsageError, unknown_name
 from brainbench.files import content_hash, to_plain
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.motion import Still, Translation
-from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere, rotation_matrix
+from brainbench.stimuli.obstacle import (
+    Box,
+    Capsule,
+    ConvexPart,
+    Cylinder,
+    Obstacle,
+    Part,
+    Sphere,
+    TriangleMesh,
+    rotation_matrix,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -33,10 +43,10 @@ _LOG = logging.getLogger(__name__)
 Vector = tuple[float, float, float]
 
 COLLISIONS = ("exact", "hull", "pieces", "decomposition")
-"""What whiskers touch of a mesh. ``exact``: the surface itself, for convex meshes and for shapes that know their
-convex parts (every backend here collides convex bodies only). ``hull``: the convex hull. ``pieces``: the hull of
-each connected piece, for files that bring a convex decomposition along. ``decomposition``: convex pieces cut by
-CoACD or V-HACD."""
+"""What whiskers touch of a mesh. ``exact``: the surface itself; a concave one without known convex parts can be
+touched by the backend ``rod`` only, because ``mujoco`` and ``bullet`` collide convex bodies. ``hull``: the convex
+hull. ``pieces``: the hull of each connected piece, for files that bring a convex decomposition along.
+``decomposition``: convex pieces cut by CoACD or V-HACD."""
 
 RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))
 """Control points (x, y) of the cubic Bézier curve that is the convex face of the Rodgers solid, in the
@@ -54,20 +64,24 @@ class Solid:
 
     name: str
     parts: tuple[Part, ...]
-    """Convex parts whose union is what whiskers touch [m]."""
+    """Convex parts whose union is what whiskers touch [m]; empty for a concave surface that is not cut into any."""
     mesh: Mesh | None = None
     """Surface for pictures and measurements; None for primitives."""
     notes: tuple[str, ...] = ()
     """What a user should know, such as a concavity lost to the convex hull."""
     origin: Mapping[str, Any] | None = None
     """What the parts were computed from, where their last digits depend on the machine; :meth:`config` has it."""
+    surface: TriangleMesh | None = None
+    """The exact surface [m], for engines that collide meshes; None where the parts are exact by themselves
+    (primitives) or stand for the solid (``pieces``, ``decomposition``)."""
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner [2, 3] (m)."""
         if self.mesh is not None:
             return self.mesh.bounds
-        corners = np.stack([part.bounds() for part in self.parts])
+        bodies = self.parts if self.surface is None else (self.surface,)
+        corners = np.stack([body.bounds() for body in bodies])
         return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
     @property
@@ -80,7 +94,8 @@ class Solid:
         if not (math.isfinite(factor) and factor > 0):
             raise UsageError(f"A solid is scaled by a positive factor; received {factor!r}.")
         parts = tuple(scale_part(part, factor) for part in self.parts)
-        return replace(self, parts=parts, mesh=self.mesh and self.mesh.scaled(factor))
+        surface = self.surface and self.surface.scaled(factor)
+        return replace(self, parts=parts, mesh=self.mesh and self.mesh.scaled(factor), surface=surface)
 
     def to_diagonal(self, diagonal: float) -> Solid:
         """Return the solid scaled about its origin to a bounding-box diagonal [m]."""
@@ -90,8 +105,10 @@ class Solid:
         """Plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
-        named = content_hash(parts) if self.origin is None else content_hash(self.origin, round(self.diagonal, 12))
-        return {**summary, "hash": named}
+        if self.origin is not None:
+            return {**summary, "hash": content_hash(self.origin, round(self.diagonal, 12))}
+        told = () if self.surface is None or _through_corners(self.surface, self.parts) else (self.surface,)
+        return {**summary, "hash": content_hash(parts, *map(to_plain, told))}
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,15 +135,16 @@ class PlacedObject:
         rotation = axes.T @ euler_matrix(self.rotation)
         translation = axes.T @ (np.asarray(self.position) - origin)
         parts = tuple(move_part(part, rotation, translation) for part in self.solid.parts)
+        surface = self.solid.surface and self.solid.surface.moved(rotation, translation)
         if isinstance(self.motion, Still):
-            return Obstacle(parts=parts, friction=self.friction)
+            return Obstacle(parts=parts, friction=self.friction, surface=surface)
         motion = self.motion
 
         def path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             identity = np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
             return motion.displacement(times) @ axes, identity
 
-        return Obstacle(parts=parts, motion=path, friction=self.friction)
+        return Obstacle(parts=parts, motion=path, friction=self.friction, surface=surface)
 
     def config(self) -> dict[str, Any]:
         """Plain values that determine the physics."""
@@ -189,7 +207,7 @@ def rodgers_solid(diagonal: float = 0.055, *, segments: int = 24) -> Solid:
     faces = np.vstack([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]])
     mesh = Mesh(rings.reshape(-1, 3), faces, "rodgers")
     parts = tuple(ConvexPart(np.vstack([rings[i], rings[i + 1]])) for i in range(segments))
-    return Solid("rodgers", parts, mesh).to_diagonal(diagonal)
+    return Solid("rodgers", parts, mesh, surface=_surface(mesh)).to_diagonal(diagonal)
 
 
 def mesh_solid(
@@ -210,7 +228,7 @@ def mesh_solid(
         decomposition: how ``decomposition`` cuts; its defaults when None.
 
     Raises:
-        UsageError: ``collision`` or the unit is unknown, or ``exact`` is asked of a concave mesh.
+        UsageError: ``collision`` or the unit is unknown, or ``exact`` is asked of a mesh that is not closed.
         DataError: the file is missing, unreadable or flat, or the decomposition passed its limits.
         MissingDependencyError: the decomposition needs a package that is not installed.
     """
@@ -242,7 +260,7 @@ def shape_solid(
         decomposition: how ``decomposition`` cuts; its defaults when None.
 
     Raises:
-        UsageError: ``collision`` is unknown, or ``exact`` is asked of a concave shape without known parts.
+        UsageError: ``collision`` is unknown.
         DataError: the decomposition passed its limits.
         MissingDependencyError: the decomposition needs a package that is not installed.
     """
@@ -262,7 +280,7 @@ def shape_solid(
         )
     parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
     origin = {"mesh": mesh.content_hash, "parts": content_hash([*shape.part_points])}
-    return Solid(name, parts, mesh, notes, origin).to_diagonal(diagonal)
+    return Solid(name, parts, mesh, notes, origin, _surface(mesh)).to_diagonal(diagonal)
 
 
 def shape_solids(
@@ -309,19 +327,43 @@ def _touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | Non
         cut = decompose(mesh, settings)
         origin = {"mesh": mesh.content_hash, "decomposition": cut.key}
         return Solid(mesh.name, tuple(ConvexPart(piece.vertices) for piece in cut.pieces), mesh, cut.notes, origin)
+    if collision == "exact":
+        return _exact(mesh)
     pieces = mesh.pieces() if collision == "pieces" else (mesh,)
     hulls = [piece.hull() for piece in pieces]
     notes: tuple[str, ...] = ()
     if any(_is_concave(piece, hull) for piece, hull in zip(pieces, hulls, strict=True)):
-        if collision == "exact":
-            raise UsageError(
-                f"The mesh {mesh.name!r} is not convex, and no backend here collides with a concave surface as it is;"
-                " use collision = 'decomposition' (convex pieces, whose deviation is stated) or 'hull'"
-                " (its concavities filled)."
-            )
         what = "the mesh" if collision == "hull" else "its pieces"
         notes = (f"whiskers touch the convex hull of {what}: concavities are filled",)
-    return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, notes)
+    surface = _surface(hulls[0]) if collision == "hull" else None
+    return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, notes, surface=surface)
+
+
+def _exact(mesh: Mesh) -> Solid:
+    """Make a solid that is touched at its surface, and at its hull by other engines if it is convex."""
+    if not mesh.diagnosis.watertight:
+        raise UsageError(
+            f"The mesh {mesh.name!r} is not closed ({mesh.diagnosis}), so it has no inside to keep whiskers out of; use"
+            " collision = 'hull' (its concavities filled), or close it."
+        )
+    # The parts of a convex mesh do not tell a shallow dent, which the surface has.
+    origin, hull = {"mesh": mesh.content_hash, "collision": "exact"}, mesh.hull()
+    if not _is_concave(mesh, hull):
+        return Solid(mesh.name, (ConvexPart(hull.vertices),), mesh, (), origin, _surface(mesh))
+    notes = (
+        f"whiskers touch the {len(mesh.faces)} triangles of this concave mesh themselves: that takes the backend 'rod'",
+    )
+    return Solid(mesh.name, (), mesh, notes, origin, _surface(mesh))
+
+
+def _surface(mesh: Mesh) -> TriangleMesh:
+    return TriangleMesh(mesh.vertices, mesh.faces.astype(np.int32))
+
+
+def _through_corners(surface: TriangleMesh, parts: tuple[Part, ...]) -> bool:
+    """Whether the surface runs through corners of the convex parts alone, so that the parts tell it."""
+    corners = {tuple(corner) for part in parts if isinstance(part, ConvexPart) for corner in part.vertices.tolist()}
+    return all(tuple(vertex) in corners for vertex in surface.vertices.tolist())
 
 
 def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:

@@ -1,10 +1,11 @@
-"""Rigid bodies that whiskers may touch, as convex parts or closed meshes. Lengths in metres, quaternions (w, x, y, z)."""
+"""Rigid bodies that whiskers may touch: convex parts or closed meshes. Lengths in metres, quaternions (w, x, y, z)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,6 +69,28 @@ class TriangleMesh:
     def bounds(self) -> NDArray[np.float64]:
         """Axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @cached_property
+    def boxes(self) -> NDArray[np.float64]:
+        """Axis-aligned boxes [k, 2, 3] of at most 64 patches of neighbouring triangles: together they hold all of it.
+
+        They follow a concave surface much closer than its bounds do.
+        """
+        corners = self.vertices[self.faces]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        middle = (low + high) / 2
+        patches = [np.arange(len(corners))]
+        while len(patches) < 64 and len(patches[0]) > 1:
+            patches = [half for patch in patches for half in _halves(patch, middle[patch]) if len(half)]
+        return np.array([[low[patch].min(axis=0), high[patch].max(axis=0)] for patch in patches])
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> TriangleMesh:
+        """Return the surface rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        return TriangleMesh(self.vertices @ rotation.T + translation, self.faces)
+
+    def scaled(self, factor: float) -> TriangleMesh:
+        """Return the surface scaled about the origin."""
+        return TriangleMesh(self.vertices * factor, self.faces)
 
 
 @dataclass(frozen=True)
@@ -189,6 +212,12 @@ def rotation_matrix(quaternion: ArrayLike) -> NDArray[np.float64]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _halves(patch: NDArray[np.int64], middle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Split a patch of triangles where its longest side is halved by number."""
+    order = np.argsort(middle[:, np.ptp(middle, axis=0).argmax()], kind="stable")
+    return patch[order[: len(order) // 2]], patch[order[len(order) // 2 :]]
 
 
 def _check_size(shape: str, **sizes: float) -> None:

@@ -113,7 +113,7 @@ def _checked(scenes: Scene | Iterable[Scene]) -> list[Scene]:
 def _simulate(scenes: Sequence[Scene], fidelity: Fidelity, engine: Backend, progress: Progress | None) -> xr.Dataset:
     """Simulate every distinct job once; put the traces together and say what was done."""
     clock = [time.perf_counter()]
-    planned = plan(scenes)
+    planned = plan(scenes, surfaces=getattr(engine, "surfaces", False))
     clock.append(time.perf_counter())
     report = None if progress is None else lambda done, total: progress(done, total, "simulating whiskers")
     traces = engine.run(planned.jobs, fidelity, progress=report)
@@ -274,7 +274,6 @@ def cache_path(scenes: Sequence[Scene], fidelity: Fidelity, backend: str, *more:
 @functools.cache
 def _code_hash() -> str:
     """Hash the source of this package, so that no other version's results are ever taken for its own."""
-    root = resources.files("brainbench.stimuli")
-    sources = [item for folder in (root, root.joinpath("backends")) for item in folder.iterdir()]
-    code = {item.name: item.read_text(encoding="utf-8") for item in sources if item.name.endswith(".py")}
-    return content_hash(__version__, code)
+    with resources.as_file(resources.files("brainbench.stimuli")) as root:
+        code = {path.relative_to(root).as_posix(): path.read_text(encoding="utf-8") for path in root.rglob("*.py")}
+    return content_hash(__version__, dict(sorted(code.items())))

@@ -231,5 +231,7 @@ def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.fl
     """Lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
     if solid.mesh is not None:
         return solid.mesh.transformed(rotation).bounds
+    if solid.surface is not None:
+        return solid.surface.moved(rotation, np.zeros(3)).bounds()
     corners = np.stack([move_part(part, rotation, np.zeros(3)).bounds() for part in solid.parts])
     return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])

@@ -16,6 +16,7 @@ from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.morphology import WhiskerArray
 from brainbench.stimuli.motion import Still, Translation
 from brainbench.stimuli.objects import PlacedObject, box, rodgers_solid, sphere
+from brainbench.stimuli.obstacle import Obstacle, TriangleMesh
 from brainbench.stimuli.recipes import get_recipe
 from brainbench.stimuli.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
@@ -98,6 +99,42 @@ def test_the_pairs_told_are_the_pairs_the_engine_builds():
     told = Explanation.of(dataset)
     assert told.pairs == built > 0
     assert told.pairs_in_full == 3 * FAST.links * 24
+
+
+def test_pairs_of_an_engine_that_touches_surfaces_are_counted_in_triangles():
+    class Touching(FakeBackend):
+        surfaces = True
+
+    crescent = PlacedObject(rodgers_solid(0.055), position=(0.0137, 0.0045, 0.003))
+    far = PlacedObject(rodgers_solid(0.055), position=(1.0, 0.0, 0.0))
+    told = Explanation.of(simulate(_scene("solid", crescent, far, NEAR), fidelity=FAST, backend=Touching()))
+    triangles = len(crescent.solid.surface.faces)
+    assert told.bodies == "convex parts and triangles"
+    assert told.pairs_in_full == 3 * FAST.links * (2 * triangles + 1)
+    assert triangles < told.pairs < 3 * FAST.links * (triangles + 1)
+    assert "(links × convex parts and triangles) can ever meet" in str(told)
+
+
+def test_a_whisker_inside_the_bounds_of_a_surface_but_far_from_its_triangles_does_not_reach_it():
+    # A square ring in the plane of the base, 80 mm wide: its bounds hold the whisker, its bars are too far away.
+    bars = [PlacedObject(box(size), place) for size, place in _RING]
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    faces = np.vstack([quads[:, :3], quads[:, [0, 2, 3]]])
+    vertices = np.concatenate([corners * size + place for size, place in _RING])
+    ring = TriangleMesh(vertices, np.concatenate([faces + 8 * bar for bar in range(4)]))
+    (job,) = _scene("ring", *bars, array=ARRAY.select("C2")).jobs()
+    times = np.array([0.0, 1e-3])
+    base = np.tile(np.zeros(3), (2, 1))
+    for size, hit in ((1.0, False), (0.3, True)):
+        obstacle = Obstacle((), surface=ring.scaled(size))
+        reach = _reach.reachable(job.whisker, base, (obstacle,), times, surfaces=True)
+        assert bool(reach) is hit
+        assert reach.triangles == 48 * hit
+
+
+_RING = [((0.08, 2e-3, 2e-3), (0, side * 0.04, 0)) for side in (-1, 1)]
+_RING += [((2e-3, 0.08, 2e-3), (side * 0.04, 0, 0)) for side in (-1, 1)]
 
 
 def test_reach_is_not_missed_between_two_instants():

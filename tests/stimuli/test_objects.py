@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,7 +9,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from brainbench.errors import DataError, UsageError
-from brainbench.geometry import DecompositionSettings, load_mesh
+from brainbench.geometry import DecompositionSettings, Mesh, load_mesh
 from brainbench.stimuli import shapes
 from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.backends.protocol import Job, StillFollicle
@@ -27,7 +29,7 @@ from brainbench.stimuli.objects import (
     shape_solids,
     sphere,
 )
-from brainbench.stimuli.obstacle import rotation_matrix
+from brainbench.stimuli.obstacle import TriangleMesh, rotation_matrix
 from brainbench.stimuli.whisker import Whisker
 
 SOLIDS = [sphere(2e-3), box((1e-3, 2e-3, 3e-3)), cylinder(1e-3, 5e-3), capsule(1e-3, 4e-3), rodgers_solid(segments=4)]
@@ -37,6 +39,10 @@ def _distances(mesh, points):
     """Distance of points to a surface, in millimetres (trimesh's tolerances are absolute)."""
     surface = mesh.scaled(1e3).to_trimesh()
     return trimesh.proximity.closest_point_naive(surface, points * 1e3)[1]
+
+
+def _volume(surface):
+    return Mesh(surface.vertices, surface.faces).volume
 
 
 def _samples(mesh, count=400):
@@ -174,14 +180,59 @@ def test_repairs_of_a_file_are_noted_and_reach_the_configuration(tmp_path):
     assert solid.config()["notes"] == ["the surface was inside out and was turned"]
 
 
-def test_an_exact_surface_is_possible_for_convex_meshes_only(tmp_path):
-    cube, crescent = tmp_path / "cube.stl", tmp_path / "crescent.stl"
+def test_an_exact_mesh_is_its_surface_and_has_a_convex_part_only_when_it_is_convex(tmp_path):
+    cube, crescent, sheet = tmp_path / "cube.stl", tmp_path / "crescent.stl", tmp_path / "open.obj"
     trimesh.creation.box().export(cube)
     rodgers_solid().mesh.to_trimesh().export(crescent)
-    (part,) = mesh_solid(cube, unit="mm", collision="exact").parts
-    assert ConvexHull(part.vertices).volume == pytest.approx(1e-9)
-    with pytest.raises(UsageError, match=r"'crescent' is not convex.*collision = 'decomposition'.*or 'hull'"):
-        mesh_solid(crescent, unit="m", collision="exact")
+    whole = trimesh.creation.box()
+    trimesh.Trimesh(whole.vertices, whole.faces[:-2]).export(sheet)
+    convex = mesh_solid(cube, unit="mm", collision="exact")
+    assert ConvexHull(convex.parts[0].vertices).volume == pytest.approx(1e-9)
+    assert _volume(convex.surface) == pytest.approx(1e-9)
+    concave = mesh_solid(crescent, unit="m", diagonal=0.03, collision="exact")
+    assert concave.parts == ()
+    assert _volume(concave.surface) == pytest.approx(concave.mesh.volume)
+    assert concave.diagonal == pytest.approx(0.03)
+    assert "that takes the backend 'rod'" in concave.notes[0]
+    assert concave.config()["hash"] != concave.to_diagonal(0.04).config()["hash"]
+    with pytest.raises(UsageError, match=r"'open' is not closed .*collision = 'hull'"):
+        mesh_solid(sheet, unit="mm", collision="exact")
+
+
+@pytest.mark.parametrize(
+    ("solid", "volume"),
+    [
+        (rodgers_solid(), rodgers_solid().mesh.volume),
+        (shape_solid(shapes.make("torus", 0, detail=2000)), None),
+        (shape_solid(shapes.make("bumpy", 0, detail=2000), collision="exact"), None),
+        (shape_solid(shapes.make("torus", 0, detail=2000), collision="hull"), "hull"),
+    ],
+)
+def test_solids_from_meshes_have_the_surface_that_whiskers_touch_and_placing_it_only_moves_it(solid, volume):
+    expected = {None: solid.mesh.volume, "hull": solid.mesh.hull().volume}.get(volume, volume)
+    assert _volume(solid.surface) == pytest.approx(expected)
+    placed = PlacedObject(solid.to_diagonal(0.05), (0.01, 0.02, 0.03), (0.3, -0.5, 1.2), Translation((0.1, 0.0, 0.0)))
+    surface = placed.obstacle().surface
+    vertices = solid.surface.vertices * 0.05 / solid.diagonal @ euler_matrix((0.3, -0.5, 1.2)).T + [0.01, 0.02, 0.03]
+    np.testing.assert_allclose(surface.vertices, vertices, atol=1e-12)
+    assert _volume(surface) == pytest.approx(expected * (0.05 / solid.diagonal) ** 3)
+    np.testing.assert_allclose([surface.boxes[:, 0].min(0), surface.boxes[:, 1].max(0)], surface.bounds())
+
+
+def test_pieces_that_stand_for_a_solid_and_primitives_have_no_surface(tmp_path):
+    path = tmp_path / "crescent.stl"
+    rodgers_solid(segments=4).mesh.to_trimesh().export(path)
+    settings = DecompositionSettings(threshold=0.2)
+    assert mesh_solid(path, unit="m", collision="decomposition", decomposition=settings).surface is None
+    assert mesh_solid(path, unit="m", collision="pieces").surface is None
+    assert sphere(1e-3).surface is None
+
+
+def test_a_surface_that_the_parts_do_not_tell_changes_the_configuration_and_the_rodgers_hash_is_the_released_one():
+    assert rodgers_solid().config()["hash"] == "186d5a1375345d55"
+    plain = rodgers_solid()
+    other = replace(plain, surface=TriangleMesh(plain.surface.vertices * 1.001, plain.surface.faces))
+    assert other.config()["hash"] != plain.config()["hash"]
 
 
 def test_a_decomposition_keeps_the_concave_face_and_states_its_deviation(tmp_path):
@@ -212,11 +263,19 @@ def test_a_procedural_torus_keeps_its_hole_and_a_hull_fills_it():
     assert "concavities are filled" in hull.notes[0]
 
 
-def test_a_shape_without_known_parts_refuses_to_be_exact_and_else_falls_back_to_its_hull():
+def test_a_shape_without_known_parts_is_touched_at_its_hull_unless_its_surface_is_asked_for():
     shape = shapes.make("bumpy", 0)
     assert len(shape_solid(shape).parts) == 1
-    with pytest.raises(UsageError, match="'bumpy-0' is not convex"):
-        shape_solid(shape, collision="exact")
+    assert shape_solid(shape, collision="exact").parts == ()
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "bullet"])
+def test_engines_of_convex_bodies_refuse_a_concave_surface_and_name_what_works(backend):
+    item = PlacedObject(shape_solid(shapes.make("bumpy", 0, detail=2000), collision="exact"), (1.0, 0.0, 0.0))
+    whisker = Whisker(0.02, 60e-6, 6e-6, young_modulus=5e9, density=1260.0, damping_ratio=0.3)
+    job = Job(whisker, StillFollicle(), (item.obstacle(),), np.array([1e-3]))
+    with pytest.raises(UsageError, match=rf"'{backend}' collides convex .*collision = 'decomposition'.*backend 'rod'"):
+        get_backend(backend).run([job], Fidelity(links=4, time_step=2e-4))
 
 
 def test_labelled_sets_of_shapes_are_made_on_demand():

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from brainbench.errors import UsageError
-from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, rotation_matrix
+from brainbench.stimuli.obstacle import (
+    Box,
+    Capsule,
+    ConvexPart,
+    Cylinder,
+    Obstacle,
+    Sphere,
+    TriangleMesh,
+    rotation_matrix,
+)
 
 TURN = (math.cos(math.pi / 8), 0.0, 0.0, math.sin(math.pi / 8))
 
@@ -34,6 +43,16 @@ def test_a_slanted_cylinder_stays_inside_its_bounds():
     np.testing.assert_allclose([points.min(0), points.max(0)], [low, high], atol=1e-4)
 
 
+@pytest.mark.parametrize("faces", [4, 5, 63, 64, 65, 500])
+def test_the_boxes_of_a_surface_hold_each_of_its_triangles_and_are_at_most_sixty_four(faces):
+    generator = np.random.default_rng(faces)
+    surface = TriangleMesh(generator.normal(size=(40, 3)), generator.integers(0, 40, (faces, 3)))
+    corners = surface.vertices[surface.faces][:, None]
+    inside = (corners >= surface.boxes[:, None, 0]) & (corners <= surface.boxes[:, None, 1])
+    assert inside.all(axis=(2, 3)).any(axis=1).all()
+    assert len(surface.boxes) <= 64
+
+
 def test_a_quarter_turn_about_z_takes_x_to_y():
     quarter = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
     np.testing.assert_allclose(rotation_matrix(quarter) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
@@ -49,6 +68,9 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
         (lambda: ConvexPart(np.zeros((3, 3))), "at least four finite vertices"),
         (lambda: ConvexPart(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])), "lie in one plane"),
         (lambda: Obstacle(()), "at least one part"),
+        (lambda: TriangleMesh(np.zeros((3, 3)), np.zeros((4, 3), int)), "at least four finite vertices"),
+        (lambda: TriangleMesh(np.eye(4, 3), np.array([[0, 1, 2]])), "at least four faces"),
+        (lambda: TriangleMesh(np.eye(4, 3), np.full((4, 3), 4)), "must name its 4 vertices"),
         (lambda: Obstacle((Sphere((0, 0, 0), 1.0),), friction=-1.0), "friction of an obstacle must be zero or more"),
         (lambda: Obstacle(("ball",)), "received str"),  # pyright: ignore[reportArgumentType]
     ],

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from brainbench.errors import UsageError
 from brainbench.stimuli.chain import build_chain
 
 if TYPE_CHECKING:
@@ -27,6 +28,21 @@ LEAST_TAPER = 1e-6
 """Difference of the radii of a link's ends (mm) below which it is a capsule."""
 LARGEST_BEND = 1.5
 """Angle between two links (rad) that no intact whisker reaches; beyond it a simulation counts as unstable."""
+
+
+def require_parts(jobs: Sequence[Job], backend: str) -> None:
+    """Refuse obstacles that only engines which collide surfaces can touch.
+
+    Raises:
+        UsageError: an obstacle has a surface and no convex parts.
+    """
+    for obstacle in {id(item): item for job in jobs for item in job.obstacles}.values():
+        if obstacle.surface is not None and not obstacle.parts:
+            raise UsageError(
+                f"The backend {backend!r} collides convex bodies only, and an object here is a concave surface of"
+                f" {len(obstacle.surface.faces)} triangles; give the object collision = 'decomposition' (convex pieces,"
+                " whose deviation is stated) or use the backend 'rod', which touches the surface itself."
+            )
 
 
 def warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:

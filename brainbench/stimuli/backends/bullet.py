@@ -32,7 +32,7 @@ import numpy as np
 from brainbench.errors import UsageError
 from brainbench.stimuli.backends._bullet_contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.backends._bullet_model import FOLLICLE, BulletWorld, engine
-from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, warn_overdamped
+from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, require_parts, warn_overdamped
 from brainbench.stimuli.backends._mujoco_drive import drive_scalars
 from brainbench.stimuli.backends._reach import reachable
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
@@ -79,6 +79,7 @@ class BulletBackend:
         if workers is not None and workers < 1:
             raise UsageError(f"workers must be at least 1; received {workers}.")
         engine()
+        require_parts(jobs, self.name)
         warn_overdamped(jobs, fidelity)
         traces = []
         for job in jobs:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.errors import UsageError
-from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, warn_overdamped
+from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, require_parts, warn_overdamped
 from brainbench.stimuli.backends._mujoco_drive import ARMATURE
 from brainbench.stimuli.backends._mujoco_model import SLOT_WIDTH, WhiskerModel, build_model, engine
 from brainbench.stimuli.backends._reach import reachable
@@ -61,6 +61,7 @@ class MujocoBackend:
         """
         if workers is not None and workers < 1:
             raise UsageError(f"workers must be at least 1; received {workers}.")
+        require_parts(jobs, self.name)
         warn_overdamped(jobs, fidelity)
         traces: list[Trace | None] = [None] * len(jobs)
         with _quiet(), ThreadPoolExecutor(max_workers=workers or _processors()) as pool:

@@ -127,7 +127,11 @@ class Trace:
 
 
 class Backend(Protocol):
-    """A physics engine that runs jobs."""
+    """A physics engine that runs jobs.
+
+    An engine that collides the exact surface of obstacles that have one says so by an attribute ``surfaces = True``;
+    others collide the convex parts.
+    """
 
     @property
     def name(self) -> str:
