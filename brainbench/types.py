@@ -37,6 +37,11 @@ Progress = Callable[[int, int, str], None]
 RECORD_SCHEMA = 1
 """Version of the result-record JSON layout."""
 
+SWEEPS_FORMAT = "brainbench-sweeps"
+"""Attribute ``format`` of every shard and manifest of a data set of sweeps (``docs/datasets.md``)."""
+SWEEPS_SCHEMA = 1
+"""Version of that layout."""
+
 
 @dataclass(frozen=True)
 class Interval:
