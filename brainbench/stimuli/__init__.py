@@ -19,6 +19,7 @@ _LAZY = {
     "Recorded": "trajectory",
     "Scene": "scene",
     "Solid": "objects",
+    "Spin": "motion",
     "Still": "motion",
     "Stimuli": "sets",
     "SweepGrid": "sweep_grid",
@@ -52,6 +53,7 @@ __all__ = [
     "Recorded",
     "Scene",
     "Solid",
+    "Spin",
     "Still",
     "Stimuli",
     "SweepGrid",
@@ -79,7 +81,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.fidelity import Fidelity
     from brainbench.stimuli.frames import Frames
     from brainbench.stimuli.morphology import WhiskerArray
-    from brainbench.stimuli.motion import Path, Still, Translation, Whisking
+    from brainbench.stimuli.motion import Path, Spin, Still, Translation, Whisking
     from brainbench.stimuli.objects import PlacedObject, Solid
     from brainbench.stimuli.readout import to_frame, to_grid
     from brainbench.stimuli.recipes import describe_recipe, get_recipe, list_recipes

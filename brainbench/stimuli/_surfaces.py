@@ -13,6 +13,7 @@ import numpy as np
 
 from brainbench.geometry import Mesh
 from brainbench.stimuli._raster import Triangles
+from brainbench.stimuli.motion import Path, Spin
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, Sphere, rotation_matrix
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class Surface:
     """The surface of one object."""
 
     corners: NDArray[np.float64]
-    """[F, 3, 3] m, world, as placed at t = 0 without the motion."""
+    """[F, 3, 3] m, in the frame that ``motion`` moves; in the world without."""
     normals: NDArray[np.float64]
     """[F, 3, 3] unit vectors."""
     motion: RigidMotion | None
@@ -61,7 +62,8 @@ def object_surface(item: PlacedObject) -> Surface:
     elif item.solid.mesh is None:
         meshes = [part_mesh(part) for part in obstacle.parts]
     else:
-        meshes = [item.solid.mesh.transformed(euler_matrix(item.rotation), item.position)]
+        place = (0.0, 0.0, 0.0) if isinstance(item.motion, (Spin, Path)) else item.position
+        meshes = [item.solid.mesh.transformed(euler_matrix(item.rotation), place)]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
     normals = np.concatenate([corner_normals(mesh) for mesh in meshes])
     return Surface(corners, normals, obstacle.motion)

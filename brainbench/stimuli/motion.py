@@ -1,4 +1,4 @@
-"""How whiskers and objects move: whisking after Knutsen, translation, rest. Angles in rad, times in s."""
+"""How whiskers and objects move: whisking after Knutsen, translation, turning, keyframes, rest. In rad and s."""
 
 from __future__ import annotations
 
@@ -138,17 +138,40 @@ class Translation:
 
     def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far it has moved since t = 0, [n, 3] (m, world)."""
-        times = np.asarray(times, dtype=float)
-        if self.onset == 0:
-            path = np.maximum(times, 0.0)
-        else:
-            u = np.clip(times / self.onset, 0.0, 1.0)
-            path = self.onset * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(times - self.onset, 0.0)
-        return path[:, None] * np.array(self.velocity)
+        return _smooth_path(times, self.onset)[:, None] * np.array(self.velocity)
 
     def config(self) -> dict[str, Any]:
         """Plain values for hashing and display."""
         return {"kind": "translation", "velocity": list(self.velocity), "onset": self.onset}
+
+
+@dataclass(frozen=True)
+class Spin:
+    """Turning about an axis through the body's origin that reaches its speed smoothly, as :class:`Translation` does."""
+
+    velocity: Vector
+    """Final angular velocity [rad/s, world], along the axis by the right-hand rule."""
+    onset: float = 0.01
+    """Duration of the smooth start [s]; 0 turns at full speed from the first instant."""
+
+    def __post_init__(self) -> None:
+        if len(self.velocity) != 3 or not all(math.isfinite(value) for value in self.velocity):
+            raise UsageError(f"An angular velocity is three finite numbers in rad/s; received {self.velocity!r}.")
+        _require("spin onset (s)", self.onset)
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return zeros [n, 3]: the origin stays."""
+        return np.zeros((len(times), 3))
+
+    def turn(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the body has turned since t = 0, rotation matrices [n, 3, 3] in world axes."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_rotvec(_smooth_path(times, self.onset)[:, None] * np.array(self.velocity)).as_matrix()
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        return {"kind": "spin", "velocity": list(self.velocity), "onset": self.onset}
 
 
 @dataclass(frozen=True)
@@ -268,6 +291,15 @@ def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float
         return np.ones_like(np.asarray(times, dtype=float))
     u = np.clip(np.asarray(times, dtype=float) / duration, 0.0, 1.0)
     return u**3 * (u * (6 * u - 15) + 10)
+
+
+def _smooth_path(times: NDArray[np.float64], onset: float) -> NDArray[np.float64]:
+    """Return the integral [n] (s) of a speed that grows from 0 to 1 during ``onset`` (s) as :func:`smooth_step`."""
+    times = np.asarray(times, dtype=float)
+    if onset == 0:
+        return np.maximum(times, 0.0)
+    u = np.clip(times / onset, 0.0, 1.0)
+    return onset * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(times - onset, 0.0)
 
 
 def _require(what: str, value: float, *, positive: bool = False) -> None:

@@ -5,48 +5,43 @@ A :class:`Solid` stands in its own frame; :class:`PlacedObject` puts it into a s
 
 from __future__ import annotations
 
-import functools
-import logging
-import math
-import os
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError, unknown_name
-from brainbench.files import content_hash, to_plain
-from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
-from brainbench.stimuli.motion import Still, Translation
-from brainbench.stimuli.obstacle import (
-    Box,
-    Capsule,
-    ConvexPart,
-    Cylinder,
-    Obstacle,
-    Part,
-    Sphere,
-    TriangleMesh,
-    rotation_matrix,
-)
+from brainbench.errors import UsageError
+from brainbench.geometry import Mesh
+from brainbench.stimuli._mesh_solids import COLLISIONS, mesh_solid, shape_solid, shape_solids
+from brainbench.stimuli._placement import euler_matrix, move_part, scale_part, translating, turning
+from brainbench.stimuli._solid import Solid, to_surface
+from brainbench.stimuli.motion import Path, Spin, Still, Translation
+from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from numpy.typing import ArrayLike
 
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.stimuli.shapes import Shape
-
-_LOG = logging.getLogger(__name__)
+__all__ = [
+    "COLLISIONS",
+    "RODGERS_CONTROL",
+    "RODGERS_OFFSET",
+    "RODGERS_SPAN",
+    "PlacedObject",
+    "Solid",
+    "box",
+    "capsule",
+    "cylinder",
+    "euler_matrix",
+    "mesh_solid",
+    "move_part",
+    "rodgers_solid",
+    "scale_part",
+    "shape_solid",
+    "shape_solids",
+    "sphere",
+]
 
 Vector = tuple[float, float, float]
-
-COLLISIONS = ("exact", "hull", "pieces", "decomposition")
-"""What whiskers touch of a mesh. ``exact``: the surface itself; a concave one without known convex parts can be
-touched by the backend ``rod`` only, because ``mujoco`` and ``bullet`` collide convex bodies. ``hull``: the convex
-hull. ``pieces``: the hull of each connected piece, for files that bring a convex decomposition along.
-``decomposition``: convex pieces cut by CoACD or V-HACD."""
 
 RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))
 """Control points (x, y) of the cubic Bézier curve that is the convex face of the Rodgers solid, in the
@@ -59,59 +54,6 @@ RODGERS_SPAN = (-0.256589, 0.251290)
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
-    """A rigid shape in its own frame."""
-
-    name: str
-    parts: tuple[Part, ...]
-    """Convex parts whose union is what whiskers touch [m]; empty for a concave surface that is not cut into any."""
-    mesh: Mesh | None = None
-    """Surface for pictures and measurements; None for primitives."""
-    notes: tuple[str, ...] = ()
-    """What a user should know, such as a concavity lost to the convex hull."""
-    origin: Mapping[str, Any] | None = None
-    """What the parts were computed from, where their last digits depend on the machine; :meth:`config` has it."""
-    surface: TriangleMesh | None = None
-    """The exact surface [m], for engines that collide meshes; None where the parts are exact by themselves
-    (primitives) or stand for the solid (``pieces``, ``decomposition``)."""
-
-    @cached_property
-    def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner [2, 3] (m)."""
-        if self.mesh is not None:
-            return self.mesh.bounds
-        bodies = self.parts if self.surface is None else (self.surface,)
-        corners = np.stack([body.bounds() for body in bodies])
-        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
-
-    @property
-    def diagonal(self) -> float:
-        """Length of the bounding-box diagonal [m]."""
-        return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
-
-    def scaled(self, factor: float) -> Solid:
-        """Return the solid scaled about its origin."""
-        if not (math.isfinite(factor) and factor > 0):
-            raise UsageError(f"A solid is scaled by a positive factor; received {factor!r}.")
-        parts = tuple(scale_part(part, factor) for part in self.parts)
-        surface = self.surface and self.surface.scaled(factor)
-        return replace(self, parts=parts, mesh=self.mesh and self.mesh.scaled(factor), surface=surface)
-
-    def to_diagonal(self, diagonal: float) -> Solid:
-        """Return the solid scaled about its origin to a bounding-box diagonal [m]."""
-        return self.scaled(diagonal / self.diagonal)
-
-    def config(self) -> dict[str, Any]:
-        """Plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
-        parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
-        summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
-        if self.origin is not None:
-            return {**summary, "hash": content_hash(self.origin, round(self.diagonal, 12))}
-        told = () if self.surface is None or _through_corners(self.surface, self.parts) else (self.surface,)
-        return {**summary, "hash": content_hash(parts, *map(to_plain, told))}
-
-
-@dataclass(frozen=True, eq=False)
 class PlacedObject:
     """A solid in a scene (world frame)."""
 
@@ -120,7 +62,8 @@ class PlacedObject:
     """Where the solid's origin lies [m]."""
     rotation: Vector = (0.0, 0.0, 0.0)
     """Angles [rad] about the world's x, then y, then z axis."""
-    motion: Still | Translation = field(default_factory=Still)
+    motion: Still | Translation | Spin | Path = field(default_factory=Still)
+    """How it moves from there; it turns about its solid's origin."""
     friction: float | None = None
     """Coulomb coefficient of its contacts; None takes each whisker's own."""
 
@@ -129,21 +72,21 @@ class PlacedObject:
 
         Args:
             frame: rotation [3, 3] and origin [3] (m) of the frame, in the world, in which the
-                obstacle is expressed; the world itself when None.
+                obstacle and its motion are expressed; the world itself when None.
         """
         axes, origin = (np.eye(3), np.zeros(3)) if frame is None else (np.asarray(frame[0]), np.asarray(frame[1]))
         rotation = axes.T @ euler_matrix(self.rotation)
-        translation = axes.T @ (np.asarray(self.position) - origin)
-        parts = tuple(move_part(part, rotation, translation) for part in self.solid.parts)
-        surface = self.solid.surface and self.solid.surface.moved(rotation, translation)
-        if isinstance(self.motion, Still):
-            return Obstacle(parts=parts, friction=self.friction, surface=surface)
+        place = axes.T @ (np.asarray(self.position) - origin)
         motion = self.motion
-
-        def path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-            identity = np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
-            return motion.displacement(times) @ axes, identity
-
+        path = None
+        if isinstance(motion, (Spin, Path)):
+            path = turning(motion, axes, place)
+        elif isinstance(motion, Translation):
+            path = translating(motion, axes)
+        # What turns is expressed about its own origin, which stays near it.
+        shift = np.zeros(3) if isinstance(motion, (Spin, Path)) else place
+        parts = tuple(move_part(part, rotation, shift) for part in self.solid.parts)
+        surface = self.solid.surface and self.solid.surface.moved(rotation, shift)
         return Obstacle(parts=parts, motion=path, friction=self.friction, surface=surface)
 
     def config(self) -> dict[str, Any]:
@@ -207,208 +150,4 @@ def rodgers_solid(diagonal: float = 0.055, *, segments: int = 24) -> Solid:
     faces = np.vstack([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]])
     mesh = Mesh(rings.reshape(-1, 3), faces, "rodgers")
     parts = tuple(ConvexPart(np.vstack([rings[i], rings[i + 1]])) for i in range(segments))
-    return Solid("rodgers", parts, mesh, surface=_surface(mesh)).to_diagonal(diagonal)
-
-
-def mesh_solid(
-    path: str | os.PathLike[str],
-    *,
-    unit: str,
-    diagonal: float | None = None,
-    collision: str = "hull",
-    decomposition: DecompositionSettings | None = None,
-) -> Solid:
-    """Return a mesh file as a solid, repaired where that needs no guessing (see :func:`brainbench.geometry.repair`).
-
-    Args:
-        path: any format :func:`brainbench.geometry.load_mesh` reads.
-        unit: length unit of the file (``m``, ``mm``, …).
-        diagonal: scale to this bounding-box diagonal [m]; None keeps the size.
-        collision: what whiskers touch, one of :data:`COLLISIONS`.
-        decomposition: how ``decomposition`` cuts; its defaults when None.
-
-    Raises:
-        UsageError: ``collision`` or the unit is unknown, or ``exact`` is asked of a mesh that is not closed.
-        DataError: the file is missing, unreadable or flat, or the decomposition passed its limits.
-        MissingDependencyError: the decomposition needs a package that is not installed.
-    """
-    _check_collision(collision)
-    repaired = repair(load_mesh(path, unit=unit))
-    solid = _touchable(repaired.mesh, collision, decomposition)
-    # Separate bodies are what "pieces" is for.
-    expected = collision == "pieces" and repaired.mesh.diagnosis.watertight
-    solid = replace(solid, notes=(*repaired.done, *solid.notes, *(() if expected else repaired.remaining)))
-    for note in solid.notes:
-        _LOG.warning("%s: %s", os.fspath(path), note)
-    return solid if diagonal is None else solid.to_diagonal(diagonal)
-
-
-def shape_solid(
-    shape: Shape,
-    *,
-    diagonal: float = 0.04,
-    collision: str | None = None,
-    decomposition: DecompositionSettings | None = None,
-) -> Solid:
-    """Return a procedural shape (:func:`brainbench.stimuli.shapes.make`) as a solid.
-
-    Args:
-        shape: any member of a family.
-        diagonal: bounding-box diagonal [m]; the thesis used 40 mm.
-        collision: one of :data:`COLLISIONS`; None takes the convex parts that the family knows (``exact``), or
-            the ``hull`` where it knows none, and a note says which.
-        decomposition: how ``decomposition`` cuts; its defaults when None.
-
-    Raises:
-        UsageError: ``collision`` is unknown.
-        DataError: the decomposition passed its limits.
-        MissingDependencyError: the decomposition needs a package that is not installed.
-    """
-    if collision is None:
-        collision = "exact" if shape.part_points else "hull"
-    _check_collision(collision)
-    name = f"{shape.label}-{shape.seed}"
-    mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, name)
-    if collision != "exact" or not shape.part_points:
-        return _touchable(mesh, collision, decomposition).to_diagonal(diagonal)
-    notes: tuple[str, ...] = ()
-    if len(shape.parts) > 1:
-        found = deviation(mesh, shape.parts, samples=1000)
-        notes = (
-            f"whiskers touch {len(shape.parts)} convex parts of the shape, which stand out from its mesh by at most"
-            f" {found.outward:.2%} and fall short of it by at most {found.inward:.2%} of its diagonal (sampled)",
-        )
-    parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
-    origin = {"mesh": mesh.content_hash, "parts": content_hash([*shape.part_points])}
-    return Solid(name, parts, mesh, notes, origin, _surface(mesh)).to_diagonal(diagonal)
-
-
-def shape_solids(
-    families: Iterable[str] | None = None,
-    *,
-    members: int = 1,
-    diagonal: float = 0.04,
-    detail: int = 4_000,
-    collision: str | None = None,
-) -> dict[str, Callable[[], Solid]]:
-    """Return, by name (``torus-0``), functions that make procedural solids when they are needed, as sweeps take them.
-
-    Args:
-        families: names from :func:`brainbench.stimuli.shapes.list_families`; all of them when None.
-        members: shapes of each family, with the seeds 0, 1, ….
-        diagonal, collision: as for :func:`shape_solid`.
-        detail: as for :func:`brainbench.stimuli.shapes.make`.
-
-    Raises:
-        UsageError: a family is unknown, or there is less than one member.
-    """
-    from brainbench.stimuli import shapes
-
-    if members < 1:
-        raise UsageError(f"A family needs at least one member; received {members!r}.")
-    chosen = shapes.list_families() if families is None else tuple(families)
-    for family in chosen:
-        shapes.describe_family(family)
-
-    def load(family: str, seed: int) -> Solid:
-        return shape_solid(shapes.make(family, seed, detail=detail), diagonal=diagonal, collision=collision)
-
-    return {f"{family}-{seed}": functools.partial(load, family, seed) for family in chosen for seed in range(members)}
-
-
-def _check_collision(collision: str) -> None:
-    if collision not in COLLISIONS:
-        raise unknown_name("collision geometry", collision, COLLISIONS)
-
-
-def _touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
-    """Make the parts of a solid from its mesh."""
-    if collision == "decomposition":
-        cut = decompose(mesh, settings)
-        origin = {"mesh": mesh.content_hash, "decomposition": cut.key}
-        return Solid(mesh.name, tuple(ConvexPart(piece.vertices) for piece in cut.pieces), mesh, cut.notes, origin)
-    if collision == "exact":
-        return _exact(mesh)
-    pieces = mesh.pieces() if collision == "pieces" else (mesh,)
-    hulls = [piece.hull() for piece in pieces]
-    notes: tuple[str, ...] = ()
-    if any(_is_concave(piece, hull) for piece, hull in zip(pieces, hulls, strict=True)):
-        what = "the mesh" if collision == "hull" else "its pieces"
-        notes = (f"whiskers touch the convex hull of {what}: concavities are filled",)
-    surface = _surface(hulls[0]) if collision == "hull" else None
-    return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, notes, surface=surface)
-
-
-def _exact(mesh: Mesh) -> Solid:
-    """Make a solid that is touched at its surface, and at its hull by other engines if it is convex."""
-    if not mesh.diagnosis.watertight:
-        raise UsageError(
-            f"The mesh {mesh.name!r} is not closed ({mesh.diagnosis}), so it has no inside to keep whiskers out of; use"
-            " collision = 'hull' (its concavities filled), or close it."
-        )
-    # The parts of a convex mesh do not tell a shallow dent, which the surface has.
-    origin, hull = {"mesh": mesh.content_hash, "collision": "exact"}, mesh.hull()
-    if not _is_concave(mesh, hull):
-        return Solid(mesh.name, (ConvexPart(hull.vertices),), mesh, (), origin, _surface(mesh))
-    notes = (
-        f"whiskers touch the {len(mesh.faces)} triangles of this concave mesh themselves: that takes the backend 'rod'",
-    )
-    return Solid(mesh.name, (), mesh, notes, origin, _surface(mesh))
-
-
-def _surface(mesh: Mesh) -> TriangleMesh:
-    return TriangleMesh(mesh.vertices, mesh.faces.astype(np.int32))
-
-
-def _through_corners(surface: TriangleMesh, parts: tuple[Part, ...]) -> bool:
-    """Whether the surface runs through corners of the convex parts alone, so that the parts tell it."""
-    corners = {tuple(corner) for part in parts if isinstance(part, ConvexPart) for corner in part.vertices.tolist()}
-    return all(tuple(vertex) in corners for vertex in surface.vertices.tolist())
-
-
-def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:
-    """Rotation matrix [3, 3] of ``angles`` [rad] about the fixed x, then y, then z axis."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
-
-
-def move_part(part: Part, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Part:
-    """Return ``part`` rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
-
-    def place(point: ArrayLike) -> Any:
-        return tuple(map(float, rotation @ np.asarray(point) + translation))
-
-    if isinstance(part, ConvexPart):
-        return ConvexPart(part.vertices @ rotation.T + translation)
-    if isinstance(part, Sphere):
-        return replace(part, centre=place(part.centre))
-    if isinstance(part, Box):
-        from scipy.spatial.transform import Rotation
-
-        turned = Rotation.from_matrix(rotation @ rotation_matrix(part.quaternion)).as_quat(scalar_first=True)
-        return replace(part, centre=place(part.centre), quaternion=tuple(map(float, turned)))
-    return replace(part, start=place(part.start), end=place(part.end))
-
-
-def scale_part(part: Part, factor: float) -> Part:
-    """Return ``part`` scaled about the origin."""
-
-    def times(vector: ArrayLike) -> Any:
-        return tuple(float(value) * factor for value in np.asarray(vector))
-
-    if isinstance(part, ConvexPart):
-        return ConvexPart(part.vertices * factor)
-    if isinstance(part, Sphere):
-        return Sphere(times(part.centre), part.radius * factor)
-    if isinstance(part, Box):
-        return replace(part, centre=times(part.centre), half_sizes=times(part.half_sizes))
-    return replace(part, start=times(part.start), end=times(part.end), radius=part.radius * factor)
-
-
-def _is_concave(mesh: Mesh, hull: Mesh) -> bool:
-    if not mesh.diagnosis.watertight:
-        return True
-    return mesh.volume < 0.999 * hull.volume
+    return Solid("rodgers", parts, mesh, surface=to_surface(mesh)).to_diagonal(diagonal)

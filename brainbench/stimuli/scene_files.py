@@ -41,7 +41,8 @@
     radius_mm = 0.5
     height_mm = 20
     position_mm = [14, 5, 0]
-    friction = 0.3               # optional; velocity_mm_s = [0, -30, 0] moves the object
+    friction = 0.3               # optional
+    velocity_mm_s = [0, -30, 0]  # optional; or spin_deg_s = [0, 0, 90] about its position; or keyframes as for the head
 
 ``[[object]]`` at the top level stands in every scene. Other shapes: ``sphere`` (``radius_mm``), ``box``
 (``size_mm``), ``capsule`` (``radius_mm``, ``length_mm``), ``rodgers`` (``diagonal_mm``, ``segments``) and
@@ -56,39 +57,20 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
-from brainbench.geometry import DecompositionSettings
-from brainbench.stimuli import shapes
+from brainbench.stimuli._motion_files import read_head_motion, read_whisking
+from brainbench.stimuli._object_files import read_object
+from brainbench.stimuli._toml import MILLI, Table, mapping, number, tables, text, vector, whole
 from brainbench.stimuli.frames import Frames
 from brainbench.stimuli.morphology import SPECIES, WhiskerArray
-from brainbench.stimuli.motion import ROTATIONS, Still, Translation, Whisking
-from brainbench.stimuli.motion import Path as HeadPath
-from brainbench.stimuli.objects import (
-    PlacedObject,
-    Solid,
-    box,
-    capsule,
-    cylinder,
-    mesh_solid,
-    rodgers_solid,
-    shape_solid,
-    sphere,
-)
 from brainbench.stimuli.scene import Animal, Head, Scene
 from brainbench.stimuli.sweeps import SweepScenes
 
-if TYPE_CHECKING:
-    from brainbench.stimuli.motion import Rotations
-    from brainbench.stimuli.trajectory import Recorded
-
-_WHISKINGS = ("sinusoid", "still", "recorded")
-_MM = 1e-3
-_FAMILY = "family:"
 _NOTHING: Mapping[str, Any] = {}
 
 
@@ -132,13 +114,13 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
 
 
 def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
-    top = _Table("the scene file", data)
-    description = top.take("description", _text, "")
+    top = Table("the scene file", data)
+    description = top.take("description", text, "")
     array = _array(top.table("array"))
-    others = tuple(_animal(_Table("[[animal]]", item), path.parent) for item in top.take("animal", _tables, []))
-    shared = {name: top.take(name, _mapping, _NOTHING) for name in ("head", "whisking", "frames")}
-    common = top.take("object", _tables, [])
-    entries = top.take("scene", _tables, [])
+    others = tuple(_animal(Table("[[animal]]", item), path.parent) for item in top.take("animal", tables, []))
+    shared = {name: top.take(name, mapping, _NOTHING) for name in ("head", "whisking", "frames")}
+    common = top.take("object", tables, [])
+    entries = top.take("scene", tables, [])
     top.finish()
     if not entries:
         raise UsageError("the file has no [[scene]].")
@@ -157,108 +139,60 @@ def _scene(
     common: list[Mapping[str, Any]],
     folder: Path,
 ) -> Scene:
-    table = _Table("[[scene]]", entry)
-    label = table.take("label", _text)
-    merged = {name: {**shared[name], **table.take(name, _mapping, _NOTHING)} for name in ("head", "whisking")}
-    objects = [*common, *table.take("object", _tables, [])]
+    table = Table("[[scene]]", entry)
+    label = table.take("label", text)
+    merged = {name: {**shared[name], **table.take(name, mapping, _NOTHING)} for name in ("head", "whisking")}
+    objects = [*common, *table.take("object", tables, [])]
     table.finish()
     return Scene(
         label=label,
         array=array,
-        objects=tuple(_object(_Table(f"[[object]] of scene {label!r}", item), folder) for item in objects),
-        whisking=_whisking(_Table("[whisking]", merged["whisking"]), folder),
-        head=_head(_Table("[head]", merged["head"])),
-        frames=_frames(_Table("[frames]", shared["frames"])),
+        objects=tuple(read_object(Table(f"[[object]] of scene {label!r}", item), folder) for item in objects),
+        whisking=read_whisking(Table("[whisking]", merged["whisking"]), folder),
+        head=_head(Table("[head]", merged["head"])),
+        frames=_frames(Table("[frames]", shared["frames"])),
         others=others,
     )
 
 
-def _animal(table: _Table, folder: Path) -> Animal:
+def _animal(table: Table, folder: Path) -> Animal:
     animal = Animal(
-        name=table.take("name", _text),
+        name=table.take("name", text),
         array=_array(table.table("array")),
-        whisking=_whisking(table.table("whisking"), folder),
+        whisking=read_whisking(table.table("whisking"), folder),
         head=_head(table.table("head")),
     )
     table.finish()
     return animal
 
 
-def _array(table: _Table) -> WhiskerArray:
-    species = table.take("species", _text, "mouse")
+def _array(table: Table) -> WhiskerArray:
+    species = table.take("species", text, "mouse")
     if species not in SPECIES:
         raise unknown_name("species", species, SPECIES)
     make = WhiskerArray.mouse if species == "mouse" else WhiskerArray.rat
-    array = make(side=table.take("side", _text, "right"))  # type: ignore[arg-type]
-    for pattern, changes in table.take("replace", _mapping, _NOTHING).items():
-        array = array.replace(pattern, **_mapping(changes))
-    array = array.select(table.take("whiskers", _text, "all"))
+    array = make(side=table.take("side", text, "right"))  # type: ignore[arg-type]
+    for pattern, changes in table.take("replace", mapping, _NOTHING).items():
+        array = array.replace(pattern, **mapping(changes))
+    array = array.select(table.take("whiskers", text, "all"))
     table.finish()
     return array
 
 
-def _head(table: _Table) -> Head:
+def _head(table: Table) -> Head:
     head = Head(
-        position=table.take("position_mm", _vector(_MM), (0.0, 0.0, 0.0)),
-        rotation=table.take("rotation_deg", _vector(math.pi / 180), (0.0, 0.0, 0.0)),
-        motion=_path(table) or _motion(table),
+        position=table.take("position_mm", vector(MILLI), (0.0, 0.0, 0.0)),
+        rotation=table.take("rotation_deg", vector(math.pi / 180), (0.0, 0.0, 0.0)),
+        motion=read_head_motion(table),
     )
     table.finish()
     return head
 
 
-def _path(table: _Table) -> HeadPath | None:
-    """Keyframes of a head; None when it has none."""
-    keys = ("times_ms", "path_mm", "path_deg")
-    times = table.take(keys[0], _list(_number(_MM)), None)
-    places = table.take(keys[1], _list(_vector(_MM)), None)
-    turns = table.take(keys[2], _list(_vector(math.pi / 180)), None)
-    if times is None:
-        if places is None and turns is None:
-            return None
-        raise UsageError(f"{table.name} needs the key {keys[0]!r} beside its path.")
-    still = ((0.0, 0.0, 0.0),) * len(times)
-    return HeadPath(times, still if places is None else places, still if turns is None else turns)
-
-
-def _whisking(table: _Table, folder: Path) -> Still | Whisking | Recorded:
-    kind = table.take("kind", _text, "sinusoid")
-    if kind not in _WHISKINGS:
-        raise unknown_name("kind of whisking", kind, _WHISKINGS)
-    usual = Whisking()
-    name = table.take("rotations", _text, usual.rotations.name)
-    if name not in ROTATIONS:
-        raise unknown_name("set of rotations", name, ROTATIONS)
-    whisking = Whisking(
-        frequency=table.take("frequency_hz", _number(1.0), usual.frequency),
-        protraction=table.take("protraction_deg", _number(math.pi / 180), usual.protraction),
-        retraction=table.take("retraction_deg", _number(math.pi / 180), usual.retraction),
-        onset=table.take("onset_ms", _number(_MM), usual.onset),
-        rotations=ROTATIONS[name],
-    )
-    recorded = _recorded(table, folder, ROTATIONS[name]) if kind == "recorded" else None
-    table.finish()
-    return recorded or (whisking if kind == "sinusoid" else Still())
-
-
-def _recorded(table: _Table, folder: Path, rotations: Rotations) -> Recorded:
-    from brainbench.stimuli.trajectory import Recorded, load_initial_angles, load_trajectory
-
-    layout = table.take("layout", _text, None)
-    rate = table.take("rate_hz", _number(1.0), 1000.0)
-    initial = table.take("initial_path", _text, None)
-    return Recorded(
-        load_trajectory(folder / table.take("path", _text), layout=layout, rate=rate),
-        start=table.take("start_deg", _number(math.pi / 180), 0.0),
-        rotations=rotations,
-        initial={} if initial is None else load_initial_angles(folder / initial, layout=layout),
-    )
-
-
-def _frames(table: _Table) -> Frames:
+def _frames(table: Table) -> Frames:
     usual = Frames()
-    interval = table.take("interval_ms", _number(_MM), None)
-    rate = table.take("rate_hz", _number(1.0), None)
+    interval = table.take("interval_ms", number(MILLI), None)
+    rate = table.take("rate_hz", number(1.0), None)
     if interval is not None and rate is not None:
         raise UsageError("[frames] takes interval_ms or rate_hz, not both.")
     if rate is not None:
@@ -266,168 +200,14 @@ def _frames(table: _Table) -> Frames:
             raise UsageError(f"'rate_hz' of [frames] must be positive; received {rate:g}.")
         interval = 1 / rate
     frames = Frames(
-        first=table.take("first_ms", _number(_MM), usual.first),
+        first=table.take("first_ms", number(MILLI), usual.first),
         interval=usual.interval if interval is None else interval,
-        count=table.take("count", _whole, usual.count),
-        average=table.take("average", _whole, usual.average),
-        lowpass=table.take("lowpass_hz", _number(1.0), usual.lowpass),
-        phase=table.take("phase", _text, usual.phase),
-        axes=table.take("axes", _text, usual.axes),
-        clip=table.take("clip_newton", _number(1.0), usual.clip),
+        count=table.take("count", whole, usual.count),
+        average=table.take("average", whole, usual.average),
+        lowpass=table.take("lowpass_hz", number(1.0), usual.lowpass),
+        phase=table.take("phase", text, usual.phase),
+        axes=table.take("axes", text, usual.axes),
+        clip=table.take("clip_newton", number(1.0), usual.clip),
     )
     table.finish()
     return frames
-
-
-def _motion(table: _Table) -> Still | Translation:
-    velocity = table.take("velocity_mm_s", _vector(_MM), None)
-    onset = table.take("velocity_onset_ms", _number(_MM), None)
-    if velocity is None:
-        return Still()
-    return Translation(velocity) if onset is None else Translation(velocity, onset)
-
-
-def _object(table: _Table, folder: Path) -> PlacedObject:
-    shape = table.take("shape", _text)
-    if shape not in _SHAPES and not shape.startswith(_FAMILY):
-        raise unknown_name("shape", shape, [*_SHAPES, f"{_FAMILY}NAME"])
-    placed = PlacedObject(
-        solid=_family(table, shape.removeprefix(_FAMILY)) if shape not in _SHAPES else _SHAPES[shape](table, folder),
-        position=table.take("position_mm", _vector(_MM), (0.0, 0.0, 0.0)),
-        rotation=table.take("rotation_deg", _vector(math.pi / 180), (0.0, 0.0, 0.0)),
-        motion=_motion(table),
-        friction=table.take("friction", _number(1.0), None),
-    )
-    table.finish()
-    return placed
-
-
-def _mesh(table: _Table, folder: Path) -> Solid:
-    path = folder / table.take("path", _text)
-    return mesh_solid(
-        path,
-        unit=table.take("unit", _text),
-        diagonal=table.take("diagonal_mm", _length, None),
-        collision=table.take("collision", _text, "hull"),
-        decomposition=_decomposition(table),
-    )
-
-
-def _family(table: _Table, name: str) -> Solid:
-    shape = shapes.make(name, table.take("seed", _whole, 0), detail=table.take("detail", _whole, 4_000))
-    return shape_solid(
-        shape,
-        diagonal=table.take("diagonal_mm", _length, 0.04),
-        collision=table.take("collision", _text, None),
-        decomposition=_decomposition(table),
-    )
-
-
-def _decomposition(table: _Table) -> DecompositionSettings:
-    usual = DecompositionSettings()
-    return DecompositionSettings(
-        method=table.take("method", _text, usual.method),  # type: ignore[arg-type]
-        threshold=table.take("threshold", _number(1.0), usual.threshold),
-        most_pieces=table.take("most_pieces", _whole, usual.most_pieces),
-    )
-
-
-def _rodgers(table: _Table, folder: Path) -> Solid:
-    diagonal = table.take("diagonal_mm", _length, 0.055)
-    return rodgers_solid(diagonal, segments=table.take("segments", _whole, 24))
-
-
-_SHAPES: dict[str, Callable[[_Table, Path], Solid]] = {
-    "sphere": lambda table, folder: sphere(table.take("radius_mm", _length)),
-    "box": lambda table, folder: box(table.take("size_mm", _vector(_MM))),
-    "cylinder": lambda table, folder: cylinder(table.take("radius_mm", _length), table.take("height_mm", _length)),
-    "capsule": lambda table, folder: capsule(table.take("radius_mm", _length), table.take("length_mm", _length)),
-    "rodgers": _rodgers,
-    "mesh": _mesh,
-}
-
-_REQUIRED = object()
-
-
-class _Table:
-    """One TOML table from which known keys are taken; whatever is left is an error."""
-
-    def __init__(self, name: str, data: Mapping[str, Any]) -> None:
-        self.name = name
-        self._rest = dict(data)
-        self._known: list[str] = []
-
-    def take(self, key: str, convert: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
-        self._known.append(key)
-        if key not in self._rest:
-            if default is _REQUIRED:
-                raise UsageError(f"{self.name} needs the key {key!r}.")
-            return default
-        value = self._rest.pop(key)
-        try:
-            return convert(value)
-        except (TypeError, ValueError) as error:
-            raise UsageError(f"{key!r} of {self.name} must be {error}; received {value!r}.") from error
-
-    def table(self, key: str) -> _Table:
-        return _Table(f"[{key}]", self.take(key, _mapping, _NOTHING))
-
-    def finish(self) -> None:
-        for key in self._rest:
-            raise unknown_name(f"key of {self.name}", key, sorted(self._known))
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError("a text")
-    return value
-
-
-def _whole(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError("a whole number")
-    return value
-
-
-def _number(factor: float) -> Callable[[Any], float]:
-    def convert(value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise TypeError("a finite number")
-        return value * factor
-
-    return convert
-
-
-def _list(item: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, ...]]:
-    def convert(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list):
-            raise TypeError("a list")
-        return tuple(map(item, value))
-
-    return convert
-
-
-def _length(value: Any) -> float:
-    return _number(_MM)(value)
-
-
-def _vector(factor: float) -> Callable[[Any], tuple[float, float, float]]:
-    def convert(value: Any) -> tuple[float, float, float]:
-        if not isinstance(value, list) or len(value) != 3:
-            raise TypeError("three numbers in brackets")
-        x, y, z = map(_number(factor), value)
-        return x, y, z
-
-    return convert
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise TypeError("a table")
-    return value
-
-
-def _tables(value: Any) -> list[Mapping[str, Any]]:
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise TypeError("a list of tables in double brackets")
-    return value

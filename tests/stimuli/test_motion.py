@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from brainbench.errors import UsageError
 from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import ROTATIONS, ArrayFollicle, Still, Translation, Whisking, smooth_step
+from brainbench.stimuli.motion import ROTATIONS, ArrayFollicle, Spin, Still, Translation, Whisking, smooth_step
 
 ARRAY = WhiskerArray.mouse(side="both")
 TIMES = np.linspace(0, 1, 20001)
@@ -105,6 +105,30 @@ def test_translation_integrates_the_smooth_step():
     motion = Translation((1.0, 0.0, 0.0), onset=0.3)
     numerical = np.concatenate([[0], np.cumsum(np.diff(TIMES) * smooth_step((TIMES[1:] + TIMES[:-1]) / 2, 0.3))])
     np.testing.assert_allclose(motion.displacement(TIMES)[:, 0], numerical, atol=1e-8)
+
+
+def test_a_spin_turns_about_its_axis_by_the_integral_of_its_speed():
+    rate, axis = 4.0, np.array([1.0, 2.0, -2.0]) / 3
+    motion = Spin(tuple(rate * axis), onset=0.2)
+    turned = motion.turn(TIMES)
+    np.testing.assert_allclose(turned @ axis, np.tile(axis, (len(TIMES), 1)), atol=1e-12)
+    angle = np.arccos((np.trace(turned, axis1=1, axis2=2) - 1) / 2)
+    travelled = Translation((rate, 0.0, 0.0), onset=0.2).displacement(TIMES)[:, 0]
+    folded = np.abs((travelled + np.pi) % (2 * np.pi) - np.pi)
+    np.testing.assert_allclose(angle, folded, atol=1e-7)
+    # A quarter turn about z takes x to y, not to −y.
+    quarter = Spin((0.0, 0.0, np.pi / 2), onset=0.0).turn(np.array([1.0]))[0]
+    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    assert (motion.displacement(TIMES) == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(((1.0, 2.0),), "three finite numbers in rad/s"), (((0, 0, 1), -1.0), "spin onset .s. must be zero or more")],
+)
+def test_an_impossible_spin_is_refused(arguments, message):
+    with pytest.raises(UsageError, match=message):
+        Spin(*arguments)
 
 
 def test_a_travelling_head_carries_its_follicles():

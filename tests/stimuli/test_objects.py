@@ -14,7 +14,7 @@ from brainbench.stimuli import shapes
 from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.backends.protocol import Job, StillFollicle
 from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.motion import Translation
+from brainbench.stimuli.motion import Path, Spin, Translation
 from brainbench.stimuli.objects import (
     RODGERS_CONTROL,
     PlacedObject,
@@ -135,6 +135,34 @@ def test_a_moving_object_is_carried_in_the_frame_it_is_seen_from():
     position, quaternion = placed.obstacle((frame, (0, 0, 0))).motion(np.array([0.0, 0.5]))
     np.testing.assert_allclose(position, [[0, 0, 0], [0, -0.015, 0]], atol=1e-15)
     np.testing.assert_allclose(quaternion, [[1, 0, 0, 0]] * 2)
+
+
+MOTIONS = [
+    Translation((0.03, -0.02, 0.01), 0.05),
+    Spin((1.0, -2.0, 3.0), 0.05),
+    Path((0.0, 0.1, 0.3), ((0, 0, 0), (1e-3, 2e-3, 0), (4e-3, 0, 1e-3)), ((0, 0, 0), (0.2, -0.1, 0.4), (0.5, 0.3, 1))),
+]
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: type(motion).__name__)
+@settings(max_examples=10)
+@given(
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+)
+def test_each_point_of_a_moving_object_goes_where_rigid_kinematics_sends_it(motion, turn, place, axes, origin):
+    placed = PlacedObject(rodgers_solid(segments=2), place, turn, motion)
+    times = np.array([0.0, 0.02, 0.15, 0.3])
+    frame, place, origin = euler_matrix(axes), np.array(place), np.array(origin)
+    obstacle = placed.obstacle((frame, origin))
+    position, quaternion = obstacle.motion(times)
+    seen = np.einsum("tij,vj->tvi", rotation_matrix(quaternion), obstacle.parts[1].vertices) + position[:, None]
+    turned = motion.turn(times) if hasattr(motion, "turn") else np.tile(np.eye(3), (4, 1, 1))
+    own = placed.solid.parts[1].vertices @ euler_matrix(turn).T
+    world = np.einsum("tij,vj->tvi", turned, own) + place + motion.displacement(times)[:, None]
+    np.testing.assert_allclose(seen @ frame.T + origin, world, atol=1e-12)
 
 
 def test_a_mesh_is_touched_at_its_hull_and_says_when_that_fills_a_concavity(tmp_path):

@@ -6,7 +6,7 @@ import trimesh
 
 from brainbench.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.stimuli.frames import Frames
-from brainbench.stimuli.motion import ROTATIONS, Still, Translation
+from brainbench.stimuli.motion import ROTATIONS, Path, Spin, Still, Translation
 from brainbench.stimuli.obstacle import Cylinder
 from brainbench.stimuli.scene_files import load_scene
 
@@ -247,3 +247,33 @@ def test_a_scene_file_moves_heads_and_holds_several_animals(tmp_path):
 def test_mistakes_in_moving_scenes_are_named(tmp_path, old, new, message):
     with pytest.raises(UsageError, match=message):
         load_scene(_write(tmp_path, MOVING.replace(old, new)))
+
+
+def _object_motion(tmp_path, keys):
+    text = f'[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = 1\n{keys}\n'
+    return load_scene(_write(tmp_path, text)).scenes[0].objects[0].motion
+
+
+def test_an_object_turns_or_follows_keyframes(tmp_path):
+    assert _object_motion(tmp_path, "") == Still()
+    spin = _object_motion(tmp_path, "spin_deg_s = [0, 0, 180]\nspin_onset_ms = 20")
+    assert spin == Spin((0.0, 0.0, math.pi), 0.02)
+    assert _object_motion(tmp_path, "spin_deg_s = [0, 0, 180]").onset == Spin((0, 0, 1)).onset
+    path = _object_motion(
+        tmp_path, "times_ms = [0, 50]\npath_mm = [[0, 0, 0], [1, 0, 0]]\npath_deg = [[0, 0, 0], [0, 0, 90]]"
+    )
+    assert path == Path((0.0, 0.05), ((0, 0, 0), (1e-3, 0, 0)), ((0, 0, 0), (0, 0, math.pi / 2)))
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("spin_deg_s = [0, 0, 9]\nvelocity_mm_s = [1, 0, 0]", "takes a velocity, a spin or keyframes, not several"),
+        ("spin_deg_s = 9", "'spin_deg_s' of .* must be three numbers in brackets"),
+        ("spin_deg = [0, 0, 9]", "did you mean 'spin_deg_s'"),
+        ("path_mm = [[0, 0, 0], [1, 0, 0]]", "needs the key 'times_ms' beside its path"),
+    ],
+)
+def test_motions_of_objects_that_cannot_be_meant_are_refused(tmp_path, keys, message):
+    with pytest.raises(UsageError, match=message):
+        _object_motion(tmp_path, keys)

@@ -1,14 +1,17 @@
 """Scenes run through the real engine, where the answer is known beforehand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import Still, Translation, Whisking
-from brainbench.stimuli.objects import PlacedObject, capsule, euler_matrix, sphere
+from brainbench.stimuli.motion import Path, Still, Translation, Whisking, smooth_step
+from brainbench.stimuli.objects import PlacedObject, Solid, capsule, euler_matrix, sphere
+from brainbench.stimuli.obstacle import Capsule
 from brainbench.stimuli.recipes import get_recipe
 from brainbench.stimuli.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
@@ -54,6 +57,30 @@ def test_a_bar_that_pushes_the_whisker_towards_minus_y_makes_it_push_its_base_to
     assert moment[2] == pytest.approx(-stiffness * DEFLECTION * AT, rel=0.05)
     assert max(abs(force_x), abs(force_z)) < 0.05 * abs(force_y)
     assert max(abs(moment[0]), abs(moment[1])) < 0.01 * abs(moment[2])
+
+
+@pytest.mark.parametrize("head", [Head(), Head((0.01, -0.02, 0.03), (0.3, -0.5, 1.2))], ids=["plain", "turned"])
+def test_a_bar_that_turns_against_the_whisker_does_what_turning_the_base_the_other_way_does(head):
+    # Smoothly by .2 rad and then at rest, about a slanted axis through the base, which is the origin of both.
+    # The whisker sags in the same way when inertia has died away.
+    axis, times = np.array([0.2, 0.1, 1.0]), np.linspace(0.0, 0.12, 61)
+    angles = 0.2 * smooth_step(times, 0.08)
+    bar = Solid("bar", (Capsule((AT, -0.6e-3, -8e-3), (AT, -0.6e-3, 8e-3), 0.5e-3),))
+    turns = [_path(times, head.matrix @ axis, sign * angles) for sign in (1, -1)]
+    placed = PlacedObject(bar, head.position, head.rotation, friction=0.0)
+    frames = Frames(0.119, 0.001, 1)
+    moved = Scene("bar", STRAIGHT, (replace(placed, motion=turns[0]),), Still(), head, frames)
+    passing = Scene("base", STRAIGHT, (placed,), Still(), replace(head, motion=turns[1]), frames)
+    by_bar, by_base = (_wrench(scene) for scene in (moved, passing))
+    back = turns[0].turn(np.array([0.119]))[0]
+    assert np.linalg.norm(by_bar[:3]) > 1e-5
+    np.testing.assert_allclose(by_bar[:3], back @ by_base[:3], atol=2e-3 * np.linalg.norm(by_bar[:3]))
+    np.testing.assert_allclose(by_bar[3:], back @ by_base[3:], atol=2e-3 * np.linalg.norm(by_bar[3:]))
+
+
+def _path(times, axis, angles):
+    turns = Rotation.from_rotvec(angles[:, None] * axis / np.linalg.norm(axis)).as_euler("xyz")
+    return Path(tuple(times), ((0.0, 0.0, 0.0),) * len(times), tuple(map(tuple, turns)))
 
 
 def test_turning_the_whole_scene_turns_the_wrench():

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from brainbench.geometry import Mesh
+from brainbench.stimuli import shapes
 from brainbench.stimuli._surfaces import ball, corner_normals, object_surface, part_mesh, smoothed, tube
-from brainbench.stimuli.motion import Translation
-from brainbench.stimuli.objects import PlacedObject, box, mesh_solid, rodgers_solid, sphere
+from brainbench.stimuli.motion import Spin, Translation
+from brainbench.stimuli.objects import PlacedObject, box, mesh_solid, rodgers_solid, shape_solid, sphere
 from brainbench.stimuli.obstacle import Box, Capsule, Cylinder, Sphere
 
 START, END, R = (1e-3, 2e-3, -1e-3), (3e-3, -1e-3, 5e-3), 1.5e-3
@@ -30,6 +31,18 @@ def test_a_drawn_part_is_the_part_that_is_touched(part, volume):
     assert solid.is_watertight
     assert solid.volume == pytest.approx(volume * 1e9, rel=0.01)
     np.testing.assert_allclose(mesh.bounds, part.bounds(), atol=0.01 * R)
+
+
+def test_a_turning_object_is_drawn_where_it_is_touched():
+    spin = Spin((0.0, 0.0, math.pi), onset=0.0)
+    for solid in (box((2e-3, 4e-3, 6e-3)), shape_solid(shapes.make("brick", 0), diagonal=8e-3)):
+        surface = object_surface(PlacedObject(solid, (0.01, 0.02, 0.03), motion=spin))
+        corners = surface.at(0.5, (1, 1, 1)).corners.reshape(-1, 3)
+        low, high = solid.bounds
+        # A quarter turn about the object's own z: (x, y) becomes (−y, x).
+        expected = np.array([[-high[1], low[0], low[2]], [-low[1], high[0], high[2]]])
+        drawn = np.array([corners.min(axis=0), corners.max(axis=0)]) - [0.01, 0.02, 0.03]
+        np.testing.assert_allclose(drawn, expected, atol=1e-9)
 
 
 def test_round_surfaces_are_shaded_smoothly_and_edges_sharply():
