@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from typing import Literal
 
 from brainbench.errors import UsageError, unknown_name
 from brainbench.fidelity import TradeoffPoint, cheapest
@@ -33,6 +34,8 @@ class Fidelity:
     """Least number of time steps in one period of a whisker's first mode, so that short, stiff whiskers get shorter
     steps; None for ``time_step`` on every whisker. Frequency and damping ratio of the first mode then come out low
     by about π ζ / ``steps_per_period``."""
+    precision: Literal["single", "double"] = "single"
+    """Arithmetic of the ``rod`` backend; the others always use double precision."""
 
     def __post_init__(self) -> None:
         if not 2 <= self.links <= MOST_LINKS:

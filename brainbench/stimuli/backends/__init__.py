@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 _BACKENDS = {
     "bullet": ("brainbench.stimuli.backends.bullet", "BulletBackend"),
     "mujoco": ("brainbench.stimuli.backends.mujoco", "MujocoBackend"),
+    "rod": ("brainbench.stimuli.backends.rod", "RodBackend"),
 }
 
 

@@ -1,0 +1,920 @@
+"""The whisker kernel: one thread takes one whisker from its first reading to its last.
+
+A step is the articulated-body algorithm (Featherstone 2008, chapter 7) in world axes about the base point, made
+linearly implicit: joint springs and dampers act at the end of the step, so the joint-space inertia is
+D = SᵀAS + h d + h² k and stiffness limits no time step. Contacts are rigid and unilateral: the factorised chain gives
+their exact compliance (Delassus) matrix in one more pass, a small Coulomb problem is solved for their forces, and one
+pass applies them. A contact takes part before it closes (g + h vₙ ≥ 0, gap g, approach vₙ), so nothing passes through
+anything within a step. Everything is O(links). Units: mg, mm, ms, mN, µN·m.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from brainbench.stimuli.backends.rod._shapes import MESH, distances
+from brainbench.stimuli.backends.rod._tracks import tracks
+
+CONTACTS = 6
+"""Contacts of one whisker that are solved together; the tightest are kept when there are more."""
+SWEEPS = 60
+"""Most Gauss-Seidel sweeps over the contacts of one step."""
+LARGEST_BEND = 1.5
+"""Bend of one joint (rad) beyond which a chain means nothing."""
+REST = 1e-6
+"""Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
+FAR = 3.0
+"""How far (mm) a distance query looks; a link further away is looked at again when it may have come nearer."""
+CREVICE = 0.02
+"""Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
+
+OK, BENT, LOST = 0, 1, 2
+"""How a whisker ended: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
+
+
+@cache
+def solver(real: type, capacity: int) -> SimpleNamespace:
+    """Return the structures and the kernel for chains of at most ``capacity`` links in one precision.
+
+    Args:
+        real: ``warp.float32`` or ``warp.float64``.
+        capacity: links that fit; a module is compiled for each.
+    """
+    import warp as wp
+
+    vec2: Any = wp.types.vector(2, real)
+    vec3: Any = wp.types.vector(3, real)
+    vec4: Any = wp.types.vector(4, real)
+    vec6: Any = wp.types.vector(6, real)
+    mat33: Any = wp.types.matrix((3, 3), real)
+    shape = distances(real)
+    track = tracks(real)
+    segment_primitive, segment_triangle = shape.segment_primitive, shape.segment_triangle
+    primitive = shape.primitive
+    Tracks, pose_at = track.Tracks, track.pose_at
+    single = real is wp.float32
+    rows = 3 * CONTACTS
+
+    @wp.struct
+    class Chains:
+        links: wp.array(dtype=wp.int32)
+        """[whisker]"""
+        beta: wp.array(dtype=real)
+        """[whisker] damping over stiffness, numerical damping included."""
+        friction: wp.array(dtype=real)
+        """[whisker]"""
+        length: wp.array(dtype=real)
+        """[whisker] arc length."""
+        build: wp.array2d(dtype=vec4)
+        """[link, whisker] length, cosine and sine of the rest bend, mass."""
+        inertia: wp.array2d(dtype=vec4)
+        """[link, whisker] centre of mass, axial and transverse inertia, hinge stiffness."""
+        taper: wp.array2d(dtype=vec4)
+        """[link, whisker] radius at both ends, arc at the joint, arc of the link."""
+
+    @wp.struct
+    class Bodies:
+        first: wp.array(dtype=wp.int32)
+        """[scene + 1] first shape of each scene."""
+        kind: wp.array(dtype=wp.int32)
+        """[shape]"""
+        size: wp.array(dtype=vec3)
+        """[shape]"""
+        place: wp.array(dtype=vec3)
+        """[shape] origin of the shape in its body."""
+        turn: wp.array(dtype=vec4)
+        """[shape] quaternion, shape to body."""
+        scale: wp.array(dtype=real)
+        """[shape] length of one unit of the shape (mm)."""
+        radius: wp.array(dtype=real)
+        """[shape] farthest point of the shape from the body's origin (mm)."""
+        speed: wp.array(dtype=real)
+        """[shape] fastest that any of its points ever moves."""
+        friction: wp.array(dtype=real)
+        """[shape] negative for the whisker's own."""
+        track: wp.array(dtype=wp.int32)
+        """[shape] motion of its body."""
+        mesh: wp.array(dtype=wp.uint64)
+        """[shape] Warp mesh."""
+        face: wp.array(dtype=wp.int32)
+        """[shape] first of its triangles below."""
+        corner: wp.array2d(dtype=vec3)
+        """[triangle, 3]"""
+        outward: wp.array2d(dtype=vec3)
+        """[triangle, 7] angle-weighted normals: face, three corners, edges opposite to them."""
+
+    @wp.struct
+    class Lanes:
+        whisker: wp.array(dtype=wp.int32)
+        """[lane]"""
+        scene: wp.array(dtype=wp.int32)
+        """[lane]"""
+        base: wp.array(dtype=wp.int32)
+        """[lane] motion of the base."""
+        step: wp.array(dtype=real)
+        """[lane] longest time step."""
+        load_first: wp.array(dtype=wp.int32)
+        """[lane + 1] first load of each lane."""
+        load_link: wp.array(dtype=wp.int32)
+        """[load]"""
+        load_share: wp.array(dtype=real)
+        """[load] where on its link."""
+        load_force: wp.array(dtype=vec3)
+        """[load]"""
+        load_stop: wp.array(dtype=real)
+        """[load]"""
+
+    @wp.struct
+    class Options:
+        start: real
+        gravity: vec3
+        quasistatic: wp.int32
+        shape: wp.int32
+
+    @wp.struct
+    class Results:
+        wrench: wp.array3d(dtype=real)
+        """[reading, 6, lane] action of the whisker on its base."""
+        contact: wp.array2d(dtype=real)
+        """[reading, lane] arc of the contact, negative without."""
+        points: wp.array3d(dtype=vec3)
+        """[reading, node, lane] when shapes are recorded."""
+        depth: wp.array(dtype=real)
+        """[lane] deepest overlap."""
+        status: wp.array(dtype=wp.int32)
+        """[lane]"""
+        failed: wp.array(dtype=real)
+        """[lane] when it failed."""
+        steps: wp.array(dtype=wp.int32)
+        """[lane] steps computed."""
+        touching: wp.array(dtype=wp.int32)
+        """[lane] steps with contact."""
+        crowded: wp.array(dtype=wp.int32)
+        """[lane] steps in which a contact found no place."""
+        unsolved: wp.array(dtype=wp.int32)
+        """[lane] steps whose contact forces did not converge."""
+
+    @wp.func
+    def sym(a: vec6, x: vec3) -> vec3:
+        """Product of a symmetric matrix (xx yy zz xy xz yz) and a vector."""
+        return vec3(
+            a[0] * x[0] + a[3] * x[1] + a[4] * x[2],
+            a[3] * x[0] + a[1] * x[1] + a[5] * x[2],
+            a[4] * x[0] + a[5] * x[1] + a[2] * x[2],
+        )
+
+    @wp.func
+    def sym_pair(a: vec3, b: vec3, c: vec3, d: vec3) -> vec6:
+        """Symmetric matrix a bᵀ + c dᵀ, given that it is symmetric."""
+        return vec6(
+            a[0] * b[0] + c[0] * d[0],
+            a[1] * b[1] + c[1] * d[1],
+            a[2] * b[2] + c[2] * d[2],
+            a[0] * b[1] + c[0] * d[1],
+            a[0] * b[2] + c[0] * d[2],
+            a[1] * b[2] + c[1] * d[2],
+        )
+
+    @wp.func
+    def sine(x: real) -> real:
+        if wp.static(single):
+            y = x * x
+            return x * (
+                real(1.0)
+                + y * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
+            )
+        return wp.sin(x)
+
+    @wp.func
+    def cosine(x: real) -> real:
+        if wp.static(single):
+            y = x * x
+            return real(1.0) + y * (
+                real(-0.5)
+                + y
+                * (
+                    real(1.0 / 24.0)
+                    + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0)))
+                )
+            )
+        return wp.cos(x)
+
+    @wp.func
+    def rotate(q: vec4, x: vec3) -> vec3:
+        u = vec3(q[1], q[2], q[3])
+        t = real(2.0) * wp.cross(u, x)
+        return x + q[0] * t + wp.cross(u, t)
+
+    @wp.func
+    def unrotate(q: vec4, x: vec3) -> vec3:
+        u = vec3(-q[1], -q[2], -q[3])
+        t = real(2.0) * wp.cross(u, x)
+        return x + q[0] * t + wp.cross(u, t)
+
+    @wp.func
+    def outward_of(bodies: Bodies, face: int, v: real, w: real) -> vec3:
+        """Pseudo-normal of the corner, edge or face on which the point with these barycentric coordinates lies."""
+        u = real(1.0) - v - w
+        low = real(1e-4)
+        on_p = u > low
+        on_q = v > low
+        on_r = w > low
+        slot = int(0)
+        if on_p and not on_q and not on_r:
+            slot = 1
+        elif on_q and not on_p and not on_r:
+            slot = 2
+        elif on_r and not on_p and not on_q:
+            slot = 3
+        elif not on_p:
+            slot = 4
+        elif not on_q:
+            slot = 5
+        elif not on_r:
+            slot = 6
+        return bodies.outward[face, slot]
+
+    @wp.func
+    def single3(x: vec3) -> wp.vec3f:
+        return wp.vec3f(wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]))
+
+    @wp.struct
+    class Touch:
+        found: wp.int32
+        share: real
+        gap: real
+        clear: real
+        """Lower bound of the distance of the link's axis from the surface."""
+        normal: vec3
+
+    @wp.func
+    def near_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, margin: real) -> Touch:
+        """Look at the triangles around a link whose axis a–b lies within ``margin`` + radius of a mesh."""
+        touch = Touch()
+        mesh = bodies.mesh[s]
+        reach = wp.max(ra, rb) + margin
+        low = wp.vec3f(
+            wp.float32(wp.min(a[0], b[0]) - reach),
+            wp.float32(wp.min(a[1], b[1]) - reach),
+            wp.float32(wp.min(a[2], b[2]) - reach),
+        )
+        high = wp.vec3f(
+            wp.float32(wp.max(a[0], b[0]) + reach),
+            wp.float32(wp.max(a[1], b[1]) + reach),
+            wp.float32(wp.max(a[2], b[2]) + reach),
+        )
+        query = wp.mesh_query_aabb(mesh, low, high)
+        candidate = wp.int32(0)
+        nearest = real(1e20)
+        face = wp.int32(-1)
+        share = real(0.0)
+        v = real(0.0)
+        w = real(0.0)
+        first = bodies.face[s]
+        while wp.mesh_query_aabb_next(query, candidate):
+            row = first + candidate
+            at = segment_triangle(a, b, bodies.corner[row, 0], bodies.corner[row, 1], bodies.corner[row, 2])
+            if at[0] < nearest:
+                nearest = at[0]
+                share = at[1]
+                v = at[2]
+                w = at[3]
+                face = row
+        touch.found = 0
+        touch.clear = reach
+        if face >= 0:
+            distance = wp.sqrt(nearest)
+            normal = outward_of(bodies, face, v, w)
+            radius = ra + (rb - ra) * share
+            if distance < real(0.3) * radius:
+                # The axis itself is at the surface: an end that lies inside tells where out is.
+                deepest = real(0.0)
+                for end in range(2):
+                    point = a
+                    if end == 1:
+                        point = b
+                    hit = wp.mesh_query_point_sign_normal(mesh, single3(point), wp.float32(1.0))
+                    if hit.result:
+                        if hit.sign < 0.0:
+                            on = wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v)
+                            away = vec3(real(on[0]), real(on[1]), real(on[2])) - point
+                            depth = wp.length(away)
+                            if depth > deepest:
+                                deepest = depth
+                                share = real(end)
+                                if depth > real(1e-4) * radius:
+                                    normal = away / depth
+                radius = ra + (rb - ra) * share
+                touch.gap = -deepest - radius
+                if deepest == real(0.0):
+                    touch.gap = distance - radius
+                touch.normal = normal
+            else:
+                p = bodies.corner[face, 0]
+                on = p + (bodies.corner[face, 1] - p) * v + (bodies.corner[face, 2] - p) * w
+                away = (a + (b - a) * share - on) / distance
+                side = real(1.0)
+                if wp.dot(away, normal) < real(0.0):
+                    side = real(-1.0)
+                touch.normal = away * side
+                touch.gap = distance * side - radius
+            touch.share = share
+            touch.clear = distance
+            touch.found = 1
+        return touch
+
+    @wp.func
+    def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real) -> Touch:
+        """Distance bound of a link from a mesh, and a contact when its middle lies inside."""
+        touch = Touch()
+        touch.found = 0
+        middle = real(0.5) * (a + b)
+        half = real(0.5) * wp.length(b - a)
+        far = real(wp.static(FAR)) / bodies.scale[s]
+        hit = wp.mesh_query_point_sign_normal(bodies.mesh[s], single3(middle), wp.float32(far))
+        touch.clear = far - half
+        if hit.result:
+            on = wp.mesh_eval_position(bodies.mesh[s], hit.face, hit.u, hit.v)
+            away = middle - vec3(real(on[0]), real(on[1]), real(on[2]))
+            distance = wp.length(away)
+            touch.clear = distance - half
+            if hit.sign < 0.0 and distance > real(0.0):
+                touch.found = 1
+                touch.share = real(0.5)
+                touch.normal = -away / distance
+                touch.gap = -distance - real(0.5) * (ra + rb)
+                touch.clear = real(0.0)
+        return touch
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def run(ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, opt: Options, readings: wp.array(dtype=real), out: Results):
+        lane = wp.tid()
+        zero = real(0.0)
+        one = real(1.0)
+        none = vec3(zero, zero, zero)
+        who = ln.whisker[lane]
+        scene = ln.scene[lane]
+        base = ln.base[lane]
+        links = ch.links[who]
+        beta = ch.beta[who]
+        longest = ln.step[lane]
+        shapes_from = bodies.first[scene]
+        shapes_to = bodies.first[scene + 1]
+        loads_from = ln.load_first[lane]
+        loads_to = ln.load_first[lane + 1]
+        still_base = int(0)
+        if tr.count[base] == 1 and wp.length_sq(tr.velocity[tr.first[base]]) == zero:
+            still_base = 1
+        may_rest = int(0)
+        if still_base == 1 and loads_from == loads_to and wp.length_sq(opt.gravity) == zero and opt.shape == 0:
+            may_rest = 1
+
+        # State of the joints, and what one step keeps of each link between its passes.
+        q = wp.zeros(wp.static(capacity), dtype=vec2)
+        qd = wp.zeros(wp.static(capacity), dtype=vec2)
+        e1 = wp.zeros(wp.static(capacity), dtype=vec3)
+        e2 = wp.zeros(wp.static(capacity), dtype=vec3)
+        node = wp.zeros(wp.static(capacity + 1), dtype=vec3)
+        k1w = wp.zeros(wp.static(capacity), dtype=vec3)
+        k1v = wp.zeros(wp.static(capacity), dtype=vec3)
+        k2w = wp.zeros(wp.static(capacity), dtype=vec3)
+        k2v = wp.zeros(wp.static(capacity), dtype=vec3)
+        push = wp.zeros(wp.static(capacity), dtype=vec2)
+        inverse = wp.zeros(wp.static(capacity), dtype=vec3)
+        clear = wp.zeros(wp.static(capacity), dtype=real)
+        # Contacts of one step.
+        c_link = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
+        c_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
+        c_gap = wp.zeros(wp.static(CONTACTS), dtype=real)
+        c_mu = wp.zeros(wp.static(CONTACTS), dtype=real)
+        c_at = wp.zeros(wp.static(CONTACTS), dtype=vec3)
+        c_move = wp.zeros(wp.static(CONTACTS), dtype=vec3)
+        axis = wp.zeros(wp.static(rows), dtype=vec3)
+        fw = wp.zeros(wp.static(rows), dtype=vec3)
+        fv = wp.zeros(wp.static(rows), dtype=vec3)
+        ju = wp.zeros(wp.static(rows), dtype=vec2)
+        free = wp.zeros(wp.static(rows), dtype=real)
+        force = wp.zeros(wp.static(rows), dtype=real)
+        comply = wp.zeros(wp.static(rows * rows), dtype=real)
+
+        jump = zero
+        deepest = zero
+        steps = int(0)
+        touching = int(0)
+        crowded = int(0)
+        unsolved = int(0)
+        status = int(0)
+        failed = zero
+        before = opt.start
+        resting = int(0)
+        idle = opt.start
+        closing = int(0)
+        for reading in range(readings.shape[0]):
+            upto = readings[reading]
+            span = upto - before
+            if resting == 1 and upto <= idle:
+                # At rest, and nothing can have come near: the wrench stays zero.
+                for i in range(links):
+                    clear[i] = zero
+                before = upto
+                continue
+            count = wp.max(1, int(wp.ceil(span / longest - real(1e-3))))
+            h = span / real(count)
+            step_damping = wp.max(beta - h, zero)
+            arc_sum = zero
+            force_sum = zero
+            for sub in range(count):
+                now = before + span * (real(sub) / real(count))
+                pose0 = pose_at(tr, base, now)
+                pose1 = pose_at(tr, base, now + h)
+                origin = pose0.place
+                bw = pose0.spin
+                bv = pose0.velocity
+                baw = (pose1.spin - bw) / h
+                bav = (pose1.velocity - bv) / h - wp.cross(bw, bv) - opt.gravity
+                qt = pose0.turn
+                x = rotate(qt, vec3(one, zero, zero))
+                y = rotate(qt, vec3(zero, one, zero))
+                z = wp.cross(x, y)
+                # Down the chain: where the links are and how they move.
+                vw = bw
+                vv = bv
+                at = none
+                fastest = wp.length_sq(bv)
+                for i in range(links):
+                    b4 = ch.build[i, who]
+                    turned = x * b4[1] + y * b4[2]
+                    y = y * b4[1] - x * b4[2]
+                    angle = q[i]
+                    rate = qd[i]
+                    ca = cosine(angle[0])
+                    sa = sine(angle[0])
+                    cb = cosine(angle[1])
+                    sb = sine(angle[1])
+                    x = turned * ca - z * sa
+                    z = turned * sa + z * ca
+                    e1[i] = y
+                    e2[i] = z
+                    node[i] = at
+                    vw = vw + y * rate[0] + z * rate[1]
+                    vv = vv + wp.cross(at, y) * rate[0] + wp.cross(at, z) * rate[1]
+                    turned = x * cb + y * sb
+                    y = y * cb - x * sb
+                    x = turned
+                    at = at + x * b4[0]
+                    fastest = wp.max(fastest, wp.length_sq(vv + wp.cross(vw, at)))
+                node[links] = at
+                quickest = wp.sqrt(fastest)
+                # Contacts that may close within this step.
+                contacts = int(0)
+                closing = int(0)
+                for s in range(shapes_from, shapes_to):
+                    body = pose_at(tr, bodies.track[s], now)
+                    turn_s = bodies.turn[s]
+                    scale = bodies.scale[s]
+                    travel = h * (quickest + wp.length(body.velocity) + wp.length(body.spin) * bodies.radius[s])
+                    margin = real(1.5) * travel + h * jump + real(0.001)
+                    mu = bodies.friction[s]
+                    if mu < zero:
+                        mu = ch.friction[who]
+                    for i in range(links):
+                        taper = ch.taper[i, who]
+                        ra = taper[0] / scale
+                        rb = taper[1] / scale
+                        thick = wp.max(taper[0], taper[1])
+                        if s == shapes_from:
+                            clear[i] = clear[i] - travel * real(1.02)
+                        if clear[i] > margin + thick:
+                            continue
+                        a = (unrotate(turn_s, unrotate(body.turn, node[i] + origin - body.place) - bodies.place[s])) / scale
+                        b = (
+                            unrotate(turn_s, unrotate(body.turn, node[i + 1] + origin - body.place) - bodies.place[s])
+                        ) / scale
+                        touch = Touch()
+                        touch.found = 0
+                        if bodies.kind[s] == wp.static(MESH):
+                            touch = far_mesh(bodies, s, a, b, ra, rb)
+                            if touch.found == 0 and touch.clear * scale <= margin + thick:
+                                touch = near_mesh(bodies, s, a, b, ra, rb, margin / scale)
+                        else:
+                            found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
+                            touch.found = 1
+                            touch.share = found[0]
+                            touch.gap = found[1]
+                            touch.clear = found[1] + wp.min(ra, rb)
+                            touch.normal = vec3(found[2], found[3], found[4])
+                        if s == shapes_from:
+                            clear[i] = touch.clear * scale
+                        else:
+                            clear[i] = wp.min(clear[i], touch.clear * scale)
+                        gap = touch.gap * scale
+                        if touch.found == 1 and gap < margin and not (touch.share > real(0.9999) and i < links - 1):
+                            deepest = wp.max(deepest, -gap)
+                            slot = contacts
+                            if contacts < wp.static(CONTACTS):
+                                contacts = contacts + 1
+                            else:
+                                crowded = crowded + 1
+                                slot = int(0)
+                                for c in range(1, wp.static(CONTACTS)):
+                                    if c_gap[c] > c_gap[slot]:
+                                        slot = c
+                                if c_gap[slot] <= gap:
+                                    slot = int(-1)
+                            if slot >= 0:
+                                normal = rotate(body.turn, rotate(turn_s, touch.normal))
+                                radius = taper[0] + (taper[1] - taper[0]) * touch.share
+                                point = node[i] + (node[i + 1] - node[i]) * touch.share - normal * radius
+                                c_link[slot] = i
+                                c_gap[slot] = gap
+                                c_mu[slot] = mu
+                                c_at[slot] = point
+                                c_arc[slot] = taper[2] + taper[3] * touch.share
+                                half = pose_at(tr, bodies.track[s], now + real(0.5) * h)
+                                c_move[slot] = half.velocity + wp.cross(half.spin, point + origin - half.place)
+                                # One tangent along the whisker, where it tends to slide.
+                                along = node[i + 1] - node[i]
+                                tangent = along - normal * wp.dot(along, normal)
+                                if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
+                                    tangent = e1[i] - normal * wp.dot(e1[i], normal)
+                                tangent = wp.normalize(tangent)
+                                axis[3 * slot] = normal
+                                axis[3 * slot + 1] = tangent
+                                axis[3 * slot + 2] = wp.cross(normal, tangent)
+
+                # Up the chain: articulated inertia, bias and what each joint does with them.
+                ia = vec6(zero, zero, zero, zero, zero, zero)
+                ib = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+                ic = vec6(zero, zero, zero, zero, zero, zero)
+                pw = none
+                pv = none
+                for back in range(links):
+                    i = links - 1 - back
+                    b4 = ch.build[i, who]
+                    i4 = ch.inertia[i, who]
+                    at = node[i]
+                    xa = (node[i + 1] - at) / b4[0]
+                    com = at + xa * i4[0]
+                    m = b4[3]
+                    thin = i4[1] - i4[2]
+                    common = m * wp.dot(com, com) + i4[2]
+                    mc = com * m
+                    ia = ia + vec6(
+                        common + thin * xa[0] * xa[0] - mc[0] * com[0],
+                        common + thin * xa[1] * xa[1] - mc[1] * com[1],
+                        common + thin * xa[2] * xa[2] - mc[2] * com[2],
+                        thin * xa[0] * xa[1] - mc[0] * com[1],
+                        thin * xa[0] * xa[2] - mc[0] * com[2],
+                        thin * xa[1] * xa[2] - mc[1] * com[2],
+                    )
+                    ib = ib + mat33(zero, -mc[2], mc[1], mc[2], zero, -mc[0], -mc[1], mc[0], zero)
+                    ic = ic + vec6(m, m, m, zero, zero, zero)
+                    momentum = vv * m + wp.cross(vw, mc)
+                    spin = wp.cross(com, momentum) + vw * i4[2] + xa * (thin * wp.dot(xa, vw))
+                    pw = pw + wp.cross(vw, spin) + wp.cross(vv, momentum)
+                    pv = pv + wp.cross(vw, momentum)
+                    if loads_to > loads_from:
+                        for load in range(loads_from, loads_to):
+                            if ln.load_link[load] == i and now < ln.load_stop[load]:
+                                pull = ln.load_force[load]
+                                pw = pw - wp.cross(at + xa * (b4[0] * ln.load_share[load]), pull)
+                                pv = pv - pull
+                    s1 = e1[i]
+                    s2 = e2[i]
+                    m1 = wp.cross(at, s1)
+                    m2 = wp.cross(at, s2)
+                    u1w = sym(ia, s1) + ib * m1
+                    u1v = s1 * ib + sym(ic, m1)
+                    u2w = sym(ia, s2) + ib * m2
+                    u2v = s2 * ib + sym(ic, m2)
+                    k = i4[3]
+                    soft = h * k * (h + step_damping)
+                    d11 = wp.dot(s1, u1w) + wp.dot(m1, u1v) + soft
+                    d12 = wp.dot(s1, u2w) + wp.dot(m1, u2v)
+                    d22 = wp.dot(s2, u2w) + wp.dot(m2, u2v) + soft
+                    whole = one / (d11 * d22 - d12 * d12)
+                    i11 = d22 * whole
+                    i12 = -d12 * whole
+                    i22 = d11 * whole
+                    angle = q[i]
+                    rate = qd[i]
+                    lag = h + step_damping
+                    t1 = -k * (angle[0] + lag * rate[0]) - wp.dot(s1, pw) - wp.dot(m1, pv)
+                    t2 = -k * (angle[1] + lag * rate[1]) - wp.dot(s2, pw) - wp.dot(m2, pv)
+                    f1 = i11 * t1 + i12 * t2
+                    f2 = i12 * t1 + i22 * t2
+                    g1w = u1w * i11 + u2w * i12
+                    g1v = u1v * i11 + u2v * i12
+                    g2w = u1w * i12 + u2w * i22
+                    g2v = u1v * i12 + u2v * i22
+                    k1w[i] = g1w
+                    k1v[i] = g1v
+                    k2w[i] = g2w
+                    k2v[i] = g2v
+                    push[i] = vec2(f1, f2)
+                    inverse[i] = vec3(i11, i12, i22)
+                    # Velocity-product acceleration of the joint.
+                    jw = s1 * rate[0] + s2 * rate[1]
+                    jv = m1 * rate[0] + m2 * rate[1]
+                    vw = vw - jw
+                    vv = vv - jv
+                    both = rate[0] * rate[1]
+                    cw = wp.cross(vw, jw) + wp.cross(s1, s2) * both
+                    cv = wp.cross(vw, jv) + wp.cross(vv, jw) + (wp.cross(s1, m2) + wp.cross(m1, s2)) * both
+                    ia = ia - sym_pair(u1w, g1w, u2w, g2w)
+                    ic = ic - sym_pair(u1v, g1v, u2v, g2v)
+                    ib = ib - wp.outer(u1w, g1v) - wp.outer(u2w, g2v)
+                    pw = pw + sym(ia, cw) + ib * cv + u1w * f1 + u2w * f2
+                    pv = pv + cw * ib + sym(ic, cv) + u1v * f1 + u2v * f2
+                reaction_w = sym(ia, baw) + ib * bav + pw
+                reaction_v = baw * ib + sym(ic, bav) + pv
+                # Down again: accelerations without contact.
+                aw = baw
+                av = bav
+                vw = bw
+                vv = bv
+                for i in range(links):
+                    s1 = e1[i]
+                    s2 = e2[i]
+                    at = node[i]
+                    m1 = wp.cross(at, s1)
+                    m2 = wp.cross(at, s2)
+                    rate = qd[i]
+                    jw = s1 * rate[0] + s2 * rate[1]
+                    jv = m1 * rate[0] + m2 * rate[1]
+                    both = rate[0] * rate[1]
+                    aw = aw + wp.cross(vw, jw) + wp.cross(s1, s2) * both
+                    av = av + wp.cross(vw, jv) + wp.cross(vv, jw) + (wp.cross(s1, m2) + wp.cross(m1, s2)) * both
+                    vw = vw + jw
+                    vv = vv + jv
+                    f = push[i]
+                    a1 = f[0] - wp.dot(k1w[i], aw) - wp.dot(k1v[i], av)
+                    a2 = f[1] - wp.dot(k2w[i], aw) - wp.dot(k2v[i], av)
+                    push[i] = vec2(a1, a2)
+                    aw = aw + s1 * a1 + s2 * a2
+                    av = av + m1 * a1 + m2 * a2
+                    for c in range(contacts):
+                        if c_link[c] == i:
+                            point = c_at[c]
+                            # Gravity was added to the base's acceleration; it moves nothing by itself.
+                            moved = vv + av * h + opt.gravity * h + wp.cross(vw + aw * h, point) - c_move[c]
+                            for d in range(3):
+                                free[3 * c + d] = wp.dot(axis[3 * c + d], moved)
+                jump_now = h * wp.length(av + wp.cross(aw, node[links]))
+                jump = wp.max(jump_now, real(0.5) * jump)
+
+                if contacts > 0:
+                    # Contacts that would open anyway cost nothing more.
+                    top = int(0)
+                    for c in range(contacts):
+                        goal = -c_gap[c] / h
+                        if goal > real(wp.static(CREVICE)) / h:
+                            goal = real(wp.static(CREVICE)) / h
+                        c_gap[c] = goal
+                        if free[3 * c] < goal:
+                            closing = 1
+                        top = wp.max(top, c_link[c])
+                    if closing == 1:
+                        rows_used = 3 * contacts
+                        for r in range(rows_used):
+                            force[r] = zero
+                            for e in range(rows_used):
+                                comply[r * wp.static(rows) + e] = zero
+                        for back in range(top + 1):
+                            i = top - back
+                            s1 = e1[i]
+                            s2 = e2[i]
+                            m1 = wp.cross(node[i], s1)
+                            m2 = wp.cross(node[i], s2)
+                            g1w = k1w[i]
+                            g1v = k1v[i]
+                            g2w = k2w[i]
+                            g2v = k2v[i]
+                            inv = inverse[i]
+                            for r in range(rows_used):
+                                link = c_link[r // 3]
+                                if link >= i:
+                                    if link == i:
+                                        fv[r] = axis[r]
+                                        fw[r] = wp.cross(c_at[r // 3], axis[r])
+                                    u1 = wp.dot(s1, fw[r]) + wp.dot(m1, fv[r])
+                                    u2 = wp.dot(s2, fw[r]) + wp.dot(m2, fv[r])
+                                    ju[r] = vec2(u1, u2)
+                                    w1 = h * (inv[0] * u1 + inv[1] * u2)
+                                    w2 = h * (inv[1] * u1 + inv[2] * u2)
+                                    for e in range(r + 1):
+                                        if c_link[e // 3] >= i:
+                                            other = ju[e]
+                                            comply[r * wp.static(rows) + e] += w1 * other[0] + w2 * other[1]
+                                    fw[r] = fw[r] - g1w * u1 - g2w * u2
+                                    fv[r] = fv[r] - g1v * u1 - g2v * u2
+                        for r in range(rows_used):
+                            for e in range(r):
+                                comply[e * wp.static(rows) + r] = comply[r * wp.static(rows) + e]
+                        # Forces of rigid contacts with Coulomb friction: projected Gauss-Seidel, one contact at a time.
+                        settled = int(0)
+                        for turn in range(wp.static(SWEEPS)):
+                            if settled == 0:
+                                change = zero
+                                largest = zero
+                                for c in range(contacts):
+                                    r = 3 * c
+                                    n0 = force[r]
+                                    p0 = force[r + 1]
+                                    q0 = force[r + 2]
+                                    bn = free[r] - c_gap[c]
+                                    b1 = free[r + 1]
+                                    b2 = free[r + 2]
+                                    for e in range(rows_used):
+                                        if e // 3 != c:
+                                            bn += comply[r * wp.static(rows) + e] * force[e]
+                                            b1 += comply[(r + 1) * wp.static(rows) + e] * force[e]
+                                            b2 += comply[(r + 2) * wp.static(rows) + e] * force[e]
+                                    nn = comply[r * wp.static(rows) + r]
+                                    n1 = comply[r * wp.static(rows) + r + 1]
+                                    n2 = comply[r * wp.static(rows) + r + 2]
+                                    c11 = comply[(r + 1) * wp.static(rows) + r + 1]
+                                    c12 = comply[(r + 1) * wp.static(rows) + r + 2]
+                                    c22 = comply[(r + 2) * wp.static(rows) + r + 2]
+                                    mu = c_mu[c]
+                                    fn = zero
+                                    f1 = zero
+                                    f2 = zero
+                                    if bn < zero:
+                                        fn = -bn / nn
+                                        if mu > zero:
+                                            # Sticking: solve for all three, tangents eliminated first.
+                                            det = c11 * c22 - c12 * c12
+                                            stuck = int(0)
+                                            if det > real(1e-9) * c11 * c22:
+                                                tb1 = -(c22 * b1 - c12 * b2) / det
+                                                tb2 = -(c11 * b2 - c12 * b1) / det
+                                                ta1 = -(c22 * n1 - c12 * n2) / det
+                                                ta2 = -(c11 * n2 - c12 * n1) / det
+                                                stiff = nn + n1 * ta1 + n2 * ta2
+                                                if stiff > real(1e-6) * nn:
+                                                    tn = -(bn + n1 * tb1 + n2 * tb2) / stiff
+                                                    tf1 = tb1 + ta1 * tn
+                                                    tf2 = tb2 + ta2 * tn
+                                                    if tn >= zero and tf1 * tf1 + tf2 * tf2 <= mu * mu * tn * tn:
+                                                        fn = tn
+                                                        f1 = tf1
+                                                        f2 = tf2
+                                                        stuck = 1
+                                            if stuck == 0:
+                                                # Sliding: find the direction of slip by a fixed point.
+                                                f1 = p0
+                                                f2 = q0
+                                                pace = one / (c11 + c22)
+                                                for _ in range(24):
+                                                    fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
+                                                    s1_ = f1 - pace * (b1 + n1 * fn + c11 * f1 + c12 * f2)
+                                                    s2_ = f2 - pace * (b2 + n2 * fn + c12 * f1 + c22 * f2)
+                                                    size = wp.sqrt(s1_ * s1_ + s2_ * s2_)
+                                                    bound = mu * fn
+                                                    if size > bound:
+                                                        s1_ = s1_ * (bound / size)
+                                                        s2_ = s2_ * (bound / size)
+                                                    f1 = s1_
+                                                    f2 = s2_
+                                                fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
+                                    force[r] = fn
+                                    force[r + 1] = f1
+                                    force[r + 2] = f2
+                                    change = wp.max(change, wp.abs(fn - n0) + wp.abs(f1 - p0) + wp.abs(f2 - q0))
+                                    largest = wp.max(largest, fn)
+                                if change <= real(1e-5) * largest:
+                                    settled = 1
+                        if settled == 0:
+                            unsolved = unsolved + 1
+                        # Apply them: forces up the chain, then the change of acceleration down.
+                        tw = none
+                        tv = none
+                        for back in range(top + 1):
+                            i = top - back
+                            for c in range(contacts):
+                                if c_link[c] == i:
+                                    total = (
+                                        axis[3 * c] * force[3 * c]
+                                        + axis[3 * c + 1] * force[3 * c + 1]
+                                        + axis[3 * c + 2] * force[3 * c + 2]
+                                    )
+                                    tv = tv + total
+                                    tw = tw + wp.cross(c_at[c], total)
+                            s1 = e1[i]
+                            s2 = e2[i]
+                            u1 = wp.dot(s1, tw) + wp.dot(wp.cross(node[i], s1), tv)
+                            u2 = wp.dot(s2, tw) + wp.dot(wp.cross(node[i], s2), tv)
+                            tw = tw - k1w[i] * u1 - k2w[i] * u2
+                            tv = tv - k1v[i] * u1 - k2v[i] * u2
+                            inv = inverse[i]
+                            inverse[i] = vec3(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2, zero)
+                        reaction_w = reaction_w - tw
+                        reaction_v = reaction_v - tv
+                        aw = none
+                        av = none
+                        for i in range(links):
+                            extra = vec3(zero, zero, zero)
+                            if i <= top:
+                                extra = inverse[i]
+                            a1 = extra[0] - wp.dot(k1w[i], aw) - wp.dot(k1v[i], av)
+                            a2 = extra[1] - wp.dot(k2w[i], aw) - wp.dot(k2v[i], av)
+                            s1 = e1[i]
+                            s2 = e2[i]
+                            aw = aw + s1 * a1 + s2 * a2
+                            av = av + wp.cross(node[i], s1) * a1 + wp.cross(node[i], s2) * a2
+                            push[i] = push[i] + vec2(a1, a2)
+                        jump = wp.max(jump, h * wp.length(av + wp.cross(aw, node[links])))
+
+                touched = int(0)
+                if sub == count - 1:
+                    arc_sum = zero
+                    force_sum = zero
+                if contacts > 0:
+                    for c in range(contacts):
+                        if closing == 1 and force[3 * c] > zero:
+                            touched = 1
+                            if sub == count - 1:
+                                arc_sum += force[3 * c] * c_arc[c]
+                                force_sum += force[3 * c]
+                touching += touched
+                steps = steps + 1
+                worst = zero
+                busy = touched
+                for i in range(links):
+                    rate = qd[i] + push[i] * h
+                    angle = q[i] + rate * h
+                    if opt.quasistatic == 1:
+                        rate = vec2(zero, zero)
+                    qd[i] = rate
+                    q[i] = angle
+                    bend = wp.max(wp.abs(angle[0]), wp.abs(angle[1]))
+                    # A value that is no number must not slip through a comparison.
+                    if not (bend < real(wp.static(LARGEST_BEND))):
+                        if status == 0:
+                            status = wp.static(BENT)
+                            if not (bend < real(1e30)):
+                                status = wp.static(LOST)
+                            failed = now + h
+                    worst = wp.max(worst, wp.max(bend, wp.max(wp.abs(rate[0]), wp.abs(rate[1]))))
+                resting = int(0)
+                if busy == 0 and worst < real(wp.static(REST)) and may_rest == 1:
+                    resting = 1
+                    idle = real(1e30)
+                    for s in range(shapes_from, shapes_to):
+                        if bodies.speed[s] > zero:
+                            for i in range(links):
+                                thick = wp.max(ch.taper[i, who][0], ch.taper[i, who][1]) + real(0.05)
+                                idle = wp.min(idle, now + h + (clear[i] - thick) / (real(1.02) * bodies.speed[s]))
+                if sub == count - 1 and status == 0:
+                    out.wrench[reading, 0, lane] = -reaction_v[0]
+                    out.wrench[reading, 1, lane] = -reaction_v[1]
+                    out.wrench[reading, 2, lane] = -reaction_v[2]
+                    out.wrench[reading, 3, lane] = -reaction_w[0]
+                    out.wrench[reading, 4, lane] = -reaction_w[1]
+                    out.wrench[reading, 5, lane] = -reaction_w[2]
+                    if force_sum > zero:
+                        out.contact[reading, lane] = arc_sum / force_sum
+                    if opt.shape == 1:
+                        x = rotate(pose1.turn, vec3(one, zero, zero))
+                        y = rotate(pose1.turn, vec3(zero, one, zero))
+                        z = wp.cross(x, y)
+                        at = pose1.place
+                        out.points[reading, 0, lane] = at
+                        for i in range(links):
+                            b4 = ch.build[i, who]
+                            angle = q[i]
+                            turned = x * b4[1] + y * b4[2]
+                            y = y * b4[1] - x * b4[2]
+                            x = turned * cosine(angle[0]) - z * sine(angle[0])
+                            z = turned * sine(angle[0]) + z * cosine(angle[0])
+                            turned = x * cosine(angle[1]) + y * sine(angle[1])
+                            y = y * cosine(angle[1]) - x * sine(angle[1])
+                            x = turned
+                            at = at + x * b4[0]
+                            out.points[reading, i + 1, lane] = at
+                if status != 0:
+                    break
+            before = upto
+            if status != 0:
+                break
+        out.depth[lane] = deepest
+        out.status[lane] = status
+        out.failed[lane] = failed
+        out.steps[lane] = steps
+        out.touching[lane] = touching
+        out.crowded[lane] = crowded
+        out.unsolved[lane] = unsolved
+
+    return SimpleNamespace(
+        run=run,
+        Chains=Chains,
+        Bodies=Bodies,
+        Lanes=Lanes,
+        Options=Options,
+        Results=Results,
+        Tracks=Tracks,
+        vec3=vec3,
+        vec4=vec4,
+        primitive=primitive,
+    )

@@ -1,0 +1,278 @@
+"""The ``rod`` backend: our own whisker solver, one source for processors and NVIDIA GPUs."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from brainbench.stimuli.backends._engines import MICRO, MILLI, warn_overdamped
+from brainbench.stimuli.backends._reach import Reach, reachable
+from brainbench.stimuli.backends.protocol import Trace
+from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
+from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
+from brainbench.stimuli.chain import build_chain
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.backends.protocol import Job, Progress
+    from brainbench.stimuli.chain import Chain
+    from brainbench.stimuli.fidelity import Fidelity
+
+SLICE = 65_536
+"""Whiskers of one launch on a GPU: bounds the memory of a run."""
+
+
+@dataclass(frozen=True)
+class RodBackend:
+    """Runs whisker jobs in our own solver.
+
+    Raises:
+        UsageError: the device is unknown, or ``cuda`` is asked for where there is none.
+        MissingDependencyError: warp-lang is not installed.
+    """
+
+    device: str = "cpu"
+    """``cpu`` or ``cuda``."""
+
+    name = "rod"
+    surfaces = True
+    devices = ("cpu", "cuda")
+
+    def run(
+        self,
+        jobs: Sequence[Job],
+        fidelity: Fidelity,
+        *,
+        progress: Progress | None = None,
+        workers: int | None = None,
+        record_shape: bool = False,
+    ) -> list[Trace]:
+        """Simulate every job; see :meth:`brainbench.stimuli.backends.protocol.Backend.run`.
+
+        A job whose whisker reaches no obstacle while its base stands still, without gravity and loads, is not
+        simulated: its wrench is exactly zero. On a GPU ``workers`` means nothing.
+        """
+        if workers is not None and workers < 1:
+            raise UsageError(f"workers must be at least 1; received {workers}.")
+        warn_overdamped(jobs, fidelity)
+        device = pick_device(self.device)
+        traces: list[Trace | None] = [None] * len(jobs)
+        groups: dict[Any, list[int]] = {}
+        for index, job in enumerate(jobs):
+            links = fidelity.link_count(job.whisker.arc_length)
+            key = (capacity_for(links), job.times.tobytes(), job.start, tuple(job.gravity))
+            groups.setdefault(key, []).append(index)
+        size = SLICE if device.is_cuda else 1
+        slices = [(key[0], some[i : i + size]) for key, some in groups.items() for i in range(0, len(some), size)]
+        threads = 1 if device.is_cuda else workers or _processors()
+        with ThreadPoolExecutor(max_workers=threads) as pool:
+            futures = [
+                pool.submit(_simulate, [jobs[i] for i in some], some, fidelity, device, capacity, record_shape)
+                for capacity, some in slices
+            ]
+            done = 0
+            try:
+                for future in as_completed(futures):
+                    for index, trace in future.result():
+                        traces[index] = trace
+                        done += 1
+                        if progress is not None:
+                            progress(done, len(jobs))
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return [trace for trace in traces if trace is not None]
+
+
+def _processors() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass
+class _Batch:
+    """Whiskers that share their readings, gathered for one launch."""
+
+    device: Any
+    fidelity: Fidelity
+    capacity: int
+    start: float
+    stop: float
+    tracks: Tracks = field(default_factory=Tracks)
+    chains: list[Chain] = field(default_factory=list)
+    lanes: list[tuple[int, int, int, float]] = field(default_factory=list)
+    """(whisker, scene, base, step in ms) of each lane."""
+    loads: list[tuple[int, float, NDArray[np.float64], float]] = field(default_factory=list)
+    load_first: list[int] = field(default_factory=lambda: [0])
+    _whiskers: dict[Any, int] = field(default_factory=dict)
+    _scenes: dict[Any, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.shapes = Shapes(self.device)
+
+    def add(self, job: Job, reach: Reach) -> Chain:
+        """Append one job as a lane; return its chain."""
+        if job.whisker not in self._whiskers:
+            self._whiskers[job.whisker] = len(self.chains)
+            self.chains.append(build_chain(job.whisker, self.fidelity.link_count(job.whisker.arc_length)))
+        which = self._whiskers[job.whisker]
+        chain = self.chains[which]
+        seen = tuple((id(item.motion), item.friction, *map(id, (item.surface, *item.parts))) for item in reach.obstacles)
+        if seen not in self._scenes:
+            self._scenes[seen] = self.shapes.add_scene(reach.obstacles, self.tracks, self.start, self.stop)
+        knots, spacing = follicle_knots(job.follicle, self.start, self.stop)
+        base = self.tracks.add(knots, self.start * MILLI, spacing)
+        step = self.fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi)) * MILLI
+        self.lanes.append((which, self._scenes[seen], base, step))
+        for load in job.loads:
+            link = min(max(int(np.searchsorted(chain.nodes, load.arc)) - 1, 0), chain.links - 1)
+            share = (load.arc - chain.nodes[link]) / (chain.nodes[link + 1] - chain.nodes[link])
+            self.loads.append((link, float(share), np.multiply(load.force, MILLI), load.stop * MILLI))
+        self.load_first.append(len(self.loads))
+        return chain
+
+
+def _simulate(
+    jobs: Sequence[Job], indices: Sequence[int], fidelity: Fidelity, device: Any, capacity: int, record_shape: bool
+) -> list[tuple[int, Trace]]:
+    """Run jobs that share their readings in one launch."""
+    from brainbench.stimuli.backends.rod._solver import solver
+
+    started = time.thread_time()
+    wp = warp()
+    first = jobs[0]
+    batch = _Batch(device, fidelity, capacity, first.start, float(first.times[-1]))
+    found: list[tuple[int, Trace]] = []
+    lanes: list[tuple[int, Job, Chain]] = []
+    seen = np.linspace(first.start, first.times[-1], max(2, math.ceil((first.times[-1] - first.start) / KNOT)))
+    for index, job in zip(indices, jobs, strict=True):
+        position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
+        reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
+        moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
+        if reach or moves or job.loads or np.any(job.gravity) or record_shape:
+            lanes.append((index, job, batch.add(job, reach)))
+        else:
+            found.append((index, _silent(job, started)))
+    if not lanes:
+        return found
+    real = wp.float32 if fidelity.precision == "single" else wp.float64
+    kernels = solver(real, capacity)
+    readings = first.times * MILLI
+    count, frames = len(lanes), len(readings)
+    out = kernels.Results()
+    dtype = real
+
+    def empty(*shape: int, fill: float | None = None, kind: Any = dtype) -> Any:
+        return wp.full(shape, fill, dtype=kind, device=device) if fill else wp.zeros(shape, dtype=kind, device=device)
+
+    out.wrench = empty(frames, 6, count)
+    out.contact = empty(frames, count, fill=-1.0)
+    out.points = empty(*((frames, capacity + 1, count) if record_shape else (1, 1, 1)), kind=kernels.vec3)
+    out.depth, out.failed = empty(count), empty(count)
+    for name in ("status", "steps", "touching", "crowded", "unsolved"):
+        setattr(out, name, empty(count, kind=wp.int32))
+    options = kernels.Options()
+    options.start = first.start * MILLI
+    options.gravity = kernels.vec3(*np.divide(first.gravity, MILLI).tolist())
+    options.shape = int(record_shape)
+    wp.launch(
+        kernels.run,
+        dim=count,
+        inputs=[*batch_structs(batch, kernels, device), options, wp.array(readings, dtype=real, device=device), out],
+        device=device,
+    )
+    spent = time.thread_time() - started
+    results = {
+        name: getattr(out, name).numpy()
+        for name in ("wrench", "contact", "depth", "status", "failed", "steps", "touching", "crowded", "unsolved")
+    }
+    points = out.points.numpy() if record_shape else None
+    for lane, (index, job, chain) in enumerate(lanes):
+        shape = None if points is None else points[:, : chain.links + 1, lane].astype(float) / MILLI
+        found.append((index, _trace(results, lane, job, shape, spent / count)))
+    return found
+
+
+def batch_structs(batch: _Batch, kernels: Any, device: Any) -> list[Any]:
+    """The chains, tracks, shapes and lanes of a batch on the device."""
+    lanes = np.array([lane[:3] for lane in batch.lanes], dtype=np.int32).reshape(-1, 3)
+    loads = {
+        "load_first": np.array(batch.load_first, dtype=np.int32),
+        "load_link": np.array([load[0] for load in batch.loads], dtype=np.int32),
+        "load_share": np.array([load[1] for load in batch.loads]),
+        "load_force": np.array([load[2] for load in batch.loads]).reshape(-1, 3),
+        "load_stop": np.minimum([load[3] for load in batch.loads], 1e30),
+    }
+    return [
+        to_struct(kernels.Chains, Chains(batch.capacity, batch.chains).arrays(), device),
+        to_struct(kernels.Tracks, batch.tracks.arrays(), device),
+        to_struct(kernels.Bodies, batch.shapes.arrays(), device),
+        to_struct(
+            kernels.Lanes,
+            {
+                "whisker": lanes[:, 0],
+                "scene": lanes[:, 1],
+                "base": lanes[:, 2],
+                "step": np.array([lane[3] for lane in batch.lanes]),
+                **loads,
+            },
+            device,
+        ),
+    ]
+
+
+def _silent(job: Job, started: float) -> Trace:
+    count = len(job.times)
+    return Trace(
+        wrench=np.zeros((count, 6)),
+        contact=np.zeros(count, dtype=bool),
+        contact_arc=np.full(count, np.nan),
+        seconds=time.thread_time() - started,
+    )
+
+
+def _trace(results: dict[str, NDArray], lane: int, job: Job, shape: NDArray | None, seconds: float) -> Trace:
+    from brainbench.stimuli.backends.rod._solver import BENT
+
+    status = int(results["status"][lane])
+    failed = float(results["failed"][lane]) / MILLI
+    good = np.ones(len(job.times), dtype=bool) if not status else job.times < failed - 1e-9
+    wrench = results["wrench"][:, :, lane].astype(float) * np.repeat([1 / MILLI, 1 / MICRO], 3)
+    arc = results["contact"][:, lane].astype(float)
+    touching = (arc >= 0) & good
+    reason = ""
+    if status:
+        what = (
+            "a joint bent by more than 1.5 rad, more than a chain of links can represent"
+            if status == BENT
+            else "the state stopped being finite"
+        )
+        reason = f"{what} at {failed:.6g} s; choose a smaller time step"
+    unsolved, crowded, steps = (int(results[name][lane]) for name in ("unsolved", "crowded", "steps"))
+    if not reason and unsolved > 0.01 * steps:
+        status, reason = 1, f"the contact forces of {unsolved} of {steps} steps did not converge"
+        good[:] = False
+    if not reason and crowded > 0.01 * steps:
+        status, reason = 1, f"more contacts than can be solved together in {crowded} of {steps} steps; use fewer links"
+        good[:] = False
+    return Trace(
+        wrench=np.where(good[:, None], wrench, np.nan),
+        contact=touching & good,
+        contact_arc=np.where(touching & good, arc / MILLI, np.nan),
+        penetration=float(results["depth"][lane]) / MILLI,
+        status="unstable" if status else "ok",
+        reason=reason,
+        steps=steps,
+        seconds=seconds,
+        link_positions=None if shape is None else np.where(good[:, None, None], shape, np.nan),
+    )
