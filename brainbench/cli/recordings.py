@@ -79,6 +79,21 @@ def rdm(
     emit(data, text, as_json=as_json)
 
 
+@app.command("export")
+def export(
+    source: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
+    target: Annotated[Path, typer.Argument(help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")],
+    select: SelectOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a small copy without raw data: spike times and tables. Scores of the copy are identical."""
+    from brainbench.datasets import export as export_files
+
+    files = export_files(source, target, select=select)
+    rows = [[str(path), f"{path.stat().st_size / 1e6:.2f} MB"] for path in files]
+    emit({"files": files}, table("", ["file", ""], rows, right=(1,)), as_json=as_json)
+
+
 def _verdict(animal: SubjectRDM) -> str:
     from brainbench.metrics import RELIABILITY_GATE
 

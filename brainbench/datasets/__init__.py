@@ -6,9 +6,11 @@
 
 from brainbench.datasets.blocks import SessionBlock, blocks
 from brainbench.datasets.conditions import Conditions
+from brainbench.datasets.exports import export
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import Inspection, inspect
-from brainbench.datasets.recipes import Recipe, get_recipe, list_recipes
+from brainbench.datasets.pooling import pooled
+from brainbench.datasets.recipes import Recipe, get_recipe, list_recipes, register_recipe
 from brainbench.datasets.recordings import open_recordings
 from brainbench.datasets.selection import Rule, Selection
 from brainbench.datasets.sessions import Session, make_session
@@ -24,10 +26,13 @@ __all__ = [
     "SessionBlock",
     "Window",
     "blocks",
+    "export",
     "get_recipe",
     "inspect",
     "list_recipes",
     "make_session",
     "open_recordings",
+    "pooled",
+    "register_recipe",
     "write_recordings",
 ]

@@ -159,6 +159,12 @@ def read_spikes(units: Table, notes: list[str]) -> list[NDArray[np.float64]]:
     return spikes
 
 
+def recorded_span(spikes: list[NDArray[np.float64]]) -> tuple[float, float] | None:
+    """Return the first and last spike (s) of all units, or None without any."""
+    heard = [times for times in spikes if len(times)]
+    return (float(min(times[0] for times in heard)), float(max(times[-1] for times in heard))) if heard else None
+
+
 def count(
     spikes: list[NDArray[np.float64]],
     edges: NDArray[np.float64],
@@ -221,9 +227,8 @@ def _coverage(
         for index, own in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
             for low, high in _merged(own):
                 covered[:, index] |= (edges[:, 0] >= low) & (edges[:, 1] <= high)
-    elif numbers.any():
-        low = min(times[0] for times in spikes if len(times))
-        high = max(times[-1] for times in spikes if len(times))
+    elif (span := recorded_span(spikes)) is not None:
+        low, high = span
         covered[:] = ((edges[:, 0] >= low) & (edges[:, 1] <= high))[:, None]
         tally.notes.append(
             f"{units.label}: no obs_intervals; recorded span taken from first to last spike, {low:.3f}–{high:.3f} s"

@@ -34,6 +34,8 @@ def join(parts: list[Part], plan: Plan, *, source: str, recipe: str, notes: list
 
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
     removed = _total(part.tally.removed for part in parts)
+    everything, parts = parts, [part for part in parts if part.labels] or parts
+    notes = [*notes, *(_left_out(part) for part in everything if not part.labels)]
     trials, units = sum(len(part.labels) for part in parts), sum(len(part.unit_ids) for part in parts)
     if not trials or not units:
         what = "trial" if not trials else "unit"
@@ -81,13 +83,17 @@ def join(parts: list[Part], plan: Plan, *, source: str, recipe: str, notes: list
         "selection": {"name": plan.selection.name, "rules": list(plan.selection.lines())},
         "removed": removed,
         "missing": _missing(parts, vocabulary),
-        "sessions": [_about(part) for part in parts],
-        "notes": [*notes, *(note for part in parts for note in part.tally.notes)],
+        "sessions": [_about(part) for part in everything],
+        "notes": [*notes, *(note for part in everything for note in part.tally.notes)],
         "source": source,
-        "synthetic": any(part.synthetic for part in parts),
+        "synthetic": any(part.synthetic for part in everything),
         "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
     }
     return dataset
+
+
+def _left_out(part: Part) -> str:
+    return f"{part.source}: no trial is left, so its {len(part.unit_ids)} units are left out"
 
 
 def _content(part: Part) -> tuple[Any, ...]:

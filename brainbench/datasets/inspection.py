@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from brainbench.datasets import hdf5
-from brainbench.datasets._extract import has_units, no_units, read_spikes
+from brainbench.datasets._extract import has_units, no_units, read_spikes, recorded_span
 from brainbench.datasets.proposals import EXAMPLES, ColumnSummary, Proposal, propose, summarise_columns
 from brainbench.datasets.recipes import detect_recipe
 from brainbench.datasets.sessions import SPIKES, Session, Table, natural_order
@@ -48,6 +48,16 @@ class UnitsSummary:
 
 
 @dataclass(frozen=True)
+class AcquiredSummary:
+    """One acquired signal."""
+
+    name: str
+    kind: str
+    shape: tuple[int, ...]
+    gigabytes: float
+
+
+@dataclass(frozen=True)
 class SessionSummary:
     """One session."""
 
@@ -59,6 +69,8 @@ class SessionSummary:
     tables: tuple[TableSummary, ...]
     modules: tuple[tuple[str, tuple[str, ...]], ...]
     """Processing modules with what they hold."""
+    acquired: tuple[AcquiredSummary, ...]
+    """Signals in the file; their samples are never read here."""
     missing: tuple[str, ...]
     """What scoring needs and this session lacks."""
     notes: tuple[str, ...] = ()
@@ -116,6 +128,7 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
                 return _counted(hdf5.read_counts(file, file_path), file_path)
             for session in read_file(file, file_path):
                 found = detect_recipe(session)
+                session = session if found is None else found.adapted(session)
                 recipes[found.name if found else None] = None
                 formats[session.format] = None
                 own = propose([session])
@@ -163,6 +176,10 @@ def _summary(session: Session, usable: bool) -> SessionSummary:
         units=units,
         tables=tables,
         modules=tuple(session.modules.items()),
+        acquired=tuple(
+            AcquiredSummary(item.name, item.kind, tuple(item.data.shape), item.gigabytes)
+            for item in session.series.values()
+        ),
         missing=tuple(missing),
         notes=session.notes,
     )
@@ -176,15 +193,16 @@ def _units(session: Session) -> UnitsSummary | None:
         spikes = read_spikes(table, [])
     except DataError as error:
         return UnitsSummary(len(table), len(table.data[SPIKES]), np.nan, np.nan, 0, table.columns, str(error))
-    heard = [times for times in spikes if len(times)]
+    span = recorded_span(spikes)
+    first, last = span or (np.nan, np.nan)
     return UnitsSummary(
         units=len(spikes),
         spikes=sum(map(len, spikes)),
-        first=float(min((times[0] for times in heard), default=np.nan)),
-        last=float(max((times[-1] for times in heard), default=np.nan)),
-        silent=len(spikes) - len(heard),
+        first=first,
+        last=last,
+        silent=sum(not len(times) for times in spikes),
         columns=table.columns,
-        problem="" if heard else "none of the units has a spike",
+        problem="" if span else "none of the units has a spike",
     )
 
 
@@ -204,7 +222,7 @@ def _counted(dataset: object, path: Path) -> Inspection:
     labels = Counter(dataset["stimulus"].values.astype(str).tolist())
     pairs = dict.fromkeys(zip(dataset["subject"].values.tolist(), dataset["session"].values.tolist(), strict=True))
     sessions = tuple(
-        SessionSummary(str(subject), str(session), "", bool(dataset.attrs["synthetic"]), None, (), (), ())
+        SessionSummary(str(subject), str(session), "", bool(dataset.attrs["synthetic"]), None, (), (), (), ())
         for subject, session in pairs
     )
     vocabulary = tuple(dataset.attrs["vocabulary"])
@@ -227,5 +245,8 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
             yield f"    {column.name} ({column.kind}) {values}{' …' if column.distinct > EXAMPLES else ''}"
     for name, contents in session.modules:
         yield f"  processing/{name}: {', '.join(contents)}"
+    for item in session.acquired:
+        shape = " × ".join(map(str, item.shape))
+        yield f"  {item.name} ({item.kind}): {shape} samples, {item.gigabytes:.3g} GB, not read"
     for item in (*session.missing, *session.notes):
         yield f"  ! {item}"

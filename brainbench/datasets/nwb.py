@@ -6,11 +6,14 @@ Needs no NWB schema and touches no raw data. Interval tables are every ``TimeInt
 
 from __future__ import annotations
 
+import contextlib
+import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.datasets.sessions import Session, Table, decode, text
+from brainbench.datasets.sessions import Series, Session, Table, decode, text
 from brainbench.errors import DataError
 
 if TYPE_CHECKING:
@@ -60,6 +63,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         intracellular=_intracellular(file),
         modules={name: tuple(module) for name, module in _groups(file.get("processing"))},
         notes=tuple(notes),
+        series=dict(_series(file.get("acquisition"))),
     )
 
 
@@ -87,10 +91,34 @@ def _intracellular(file: h5py.File) -> dict[str, int]:
     return {kind: kinds.count(kind) for kind in _INTRACELLULAR if kind in kinds}
 
 
+def _series(parent: Any) -> Iterator[tuple[str, Series]]:
+    """Acquired signals, also those inside containers such as BehavioralTimeSeries."""
+    import h5py
+
+    for _, group in _groups(parent):
+        data, stamps, begin = group.get("data"), group.get("timestamps"), group.get("starting_time")
+        if not isinstance(data, h5py.Dataset):
+            yield from _series(group)
+            continue
+        path = (group.name or "").strip("/")
+        regular = isinstance(begin, h5py.Dataset) and begin.shape == ()
+        start, rate = (float(begin[()]), float(begin.attrs.get("rate", math.nan))) if regular else (0.0, math.nan)
+        yield path, Series(path, _type(group), data, stamps, start, rate)
+
+
 def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
     import h5py
 
-    return [] if parent is None else [(name, item) for name, item in parent.items() if isinstance(item, h5py.Group)]
+    groups: list[tuple[str, h5py.Group]] = []
+    if parent is None:
+        return groups
+    for name in parent:
+        # A link into a file that is not there (raw data kept apart) must not hide the rest.
+        with contextlib.suppress(KeyError, OSError):
+            item = parent[name]
+            if isinstance(item, h5py.Group):
+                groups.append((name, item))
+    return groups
 
 
 def _type(group: h5py.Group) -> str:

@@ -1,79 +1,39 @@
-"""Named ways to read a data set: its conditions, vocabulary, selection and window, in one record."""
+"""The registry of recipes: named ways to read a data set."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from itertools import product
+from pathlib import Path
 
 from brainbench.datasets import rodgers
-from brainbench.datasets.conditions import Conditions
+from brainbench.datasets._recipe import Recipe
 from brainbench.datasets.selection import DEFAULT, EVERYTHING, Selection
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.window import Window
 from brainbench.errors import UsageError, unknown_name
 
-
-@dataclass(frozen=True)
-class Recipe:
-    """How one published data set is read. Every part can be overridden by an argument."""
-
-    name: str
-    title: str
-    citation: str
-    conditions: Conditions
-    orders: Mapping[str, tuple[str, ...]]
-    """Column → its values in fixed order; other values are not part of the experiment."""
-    selection: Selection
-    window: Window
-    layout: tuple[str, ...]
-    """Columns of the condition table by which a file of this data set is recognised."""
-    remarks: tuple[str, ...] = ()
-
-    def matches(self, session: Session) -> bool:
-        """Tell whether a session has the layout of this data set."""
-        table = session.tables.get(self.conditions.table)
-        return table is not None and all(column in table for column in self.layout)
-
-    def vocabulary(self, conditions: Conditions) -> tuple[str, ...] | None:
-        """Return the fixed labels, or None if a column's values are not declared here."""
-        if conditions.table != self.conditions.table or any(name not in self.orders for name in conditions.columns):
-            return None
-        return tuple("-".join(values) for values in product(*(self.orders[name] for name in conditions.columns)))
-
-    def describe(self) -> str:
-        """Print every rule of the recipe, one per line."""
-        return "\n".join(self._lines())
-
-    def _lines(self) -> Iterator[str]:
-        yield f"{self.name}: {self.title}"
-        yield f"citation: {self.citation}"
-        yield f"conditions: {self.conditions}"
-        yield f"vocabulary: {', '.join(self.vocabulary(self.conditions) or ())}"
-        yield f"window: {self.window}"
-        if self.window.fallback is not None:
-            yield f"window of sessions without contact tables: {self.window.fallback}"
-        yield from self.selection.lines()
-        yield from self.remarks
-
-
-_RECIPES = {
-    recipe.name: recipe
-    for recipe in (
-        Recipe(
-            name="rodgers",
-            title=rodgers.TITLE,
-            citation=rodgers.CITATION,
-            conditions=rodgers.CONDITIONS,
-            orders=rodgers.ORDERS,
-            selection=rodgers.SELECTION,
-            window=rodgers.WINDOW,
-            layout=rodgers.LAYOUT,
-            remarks=rodgers.REMARKS,
-        ),
-    )
+_RECIPES: dict[str, Recipe] = {
+    recipe.name: recipe for recipe in (rodgers.RECIPE, rodgers.DISCRIMINATION, rodgers.DETECTION)
 }
-_SELECTIONS = {"none": EVERYTHING, "default": DEFAULT, "rodgers": rodgers.SELECTION}
+_SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
+
+
+def register_recipe(recipe: Recipe) -> Recipe:
+    """Make a recipe known by its name and its layout for the rest of this process; returns it.
+
+    On the command line ``FILE.py:PATH`` registers the ``RECIPE`` that a file defines.
+
+    Raises:
+        UsageError: another recipe has this name, or it could not be told from a path.
+    """
+    if not _is_name(recipe.name):
+        raise UsageError(
+            f"A recipe's name is a word of at least two letters, digits, '-' or '_', beginning with a letter; "
+            f"received {recipe.name!r}."
+        )
+    known = _RECIPES.get(recipe.name)
+    if known is not None and known != recipe:
+        raise UsageError(f"There is already a recordings recipe {recipe.name!r} ({known.title}); choose another name.")
+    _RECIPES[recipe.name] = recipe
+    return recipe
 
 
 def get_recipe(name: str) -> Recipe:
@@ -93,12 +53,13 @@ def list_recipes() -> list[str]:
 
 
 def detect_recipe(session: Session) -> Recipe | None:
-    """Return the recipe whose layout a session has, if any."""
-    return next((recipe for recipe in _RECIPES.values() if recipe.matches(session)), None)
+    """Return the recipe whose layout a session has, if any; of several the most specific one."""
+    found = [recipe for recipe in _RECIPES.values() if recipe.matches(session)]
+    return max(found, key=lambda recipe: len(recipe.layout), default=None)
 
 
 def resolve_selection(select: Selection | str) -> Selection:
-    """Return a selection from itself, a name ("none", "default", "rodgers") or rules in text.
+    """Return a selection from itself, a name ("none", "default" or a recipe's) or rules in text.
 
     Raises:
         UsageError: the text is neither a name nor a rule.
@@ -107,25 +68,55 @@ def resolve_selection(select: Selection | str) -> Selection:
         return select
     if select in _SELECTIONS:
         return _SELECTIONS[select]
+    if select in _RECIPES:
+        return _RECIPES[select].selection
     if "=" not in select:
-        raise unknown_name("selection", select, _SELECTIONS, hint="Or write rules: 'outcome=correct; units.layer=4'.")
+        names = [*_SELECTIONS, *list_recipes()]
+        raise unknown_name("selection", select, names, hint="Or write rules: 'outcome=correct; units.layer=4'.")
     return Selection.parse(select)
 
 
 def split_source(source: str) -> tuple[str | None, str]:
-    """Split ``RECIPE:PATH``; a source without a recipe gives (None, source).
+    """Split ``RECIPE:PATH`` or ``FILE.py:PATH``; a source without a recipe gives (None, source).
 
     A prefix counts as a recipe when it is a bare word of at least two letters (so drive letters stay
-    paths) and no file of the whole name exists.
+    paths) and no file of the whole name exists. A Python file is run and its ``RECIPE`` registered.
 
     Raises:
-        UsageError: the prefix is not a recipe.
+        UsageError: the prefix is not a recipe, or the file defines none.
     """
-    from pathlib import Path
-
     prefix, colon, rest = source.partition(":")
-    if not colon or len(prefix) < 2 or not prefix.isidentifier() or Path(source).exists():
+    if colon and prefix.endswith(".py") and not Path(source).exists():
+        recipe = load_recipe(prefix)
+    elif not colon or not _is_name(prefix) or Path(source).exists():
         return None, source
+    else:
+        recipe = None
     if not rest:
         raise UsageError(f"The source {source!r} names a recipe but no file; write {prefix}:PATH.")
-    return get_recipe(prefix).name, rest
+    return (recipe or get_recipe(prefix)).name, rest
+
+
+def load_recipe(path: str) -> Recipe:
+    """Run a Python file and register the recipe that it calls ``RECIPE``.
+
+    Raises:
+        UsageError: there is no such file, it fails, or it defines no recipe.
+    """
+    import runpy
+
+    if not Path(path).is_file():
+        raise UsageError(f"There is no recipe file {path!r}.")
+    try:
+        found = runpy.run_path(path).get("RECIPE")
+    except Exception as error:
+        raise UsageError(f"The recipe file {path!r} fails: {type(error).__name__}: {error}.") from error
+    if not isinstance(found, Recipe):
+        raise UsageError(
+            f"The recipe file {path!r} defines no RECIPE = brainbench.datasets.Recipe(…); docs/recordings.md shows one."
+        )
+    return register_recipe(found)
+
+
+def _is_name(word: str) -> bool:
+    return len(word) >= 2 and word.replace("-", "_").isidentifier()

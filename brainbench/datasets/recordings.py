@@ -6,8 +6,7 @@ only: trials are sorted by subject, session, start time and id, units by subject
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,18 +15,17 @@ from brainbench.datasets._extract import Part, Plan, extract, has_units, no_unit
 from brainbench.datasets._join import join
 from brainbench.datasets.conditions import Conditions
 from brainbench.datasets.proposals import propose
-from brainbench.datasets.recipes import Recipe, detect_recipe, get_recipe, list_recipes, resolve_selection, split_source
+from brainbench.datasets.reading import Source, each_session, find_recordings
+from brainbench.datasets.recipes import Recipe, list_recipes, resolve_selection
 from brainbench.datasets.selection import DEFAULT, Selection
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.sources import find_files, open_file, read_file
+from brainbench.datasets.sources import open_file
 from brainbench.datasets.window import WHOLE, Window, resolve_window
 from brainbench.errors import DataError, UsageError, listing, unknown_name
 from brainbench.types import check_recordings
 
 if TYPE_CHECKING:
     import xarray as xr
-
-Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
 def open_recordings(
@@ -70,7 +68,7 @@ def open_recordings(
         DataError: a file is damaged or unusable, a session appears twice, or fewer than two
             conditions, no trial or no unit remain.
     """
-    recipe, paths = _resolve(source)
+    recipe, paths = find_recordings(source)
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
     if len(paths) == 1 and (ready := _already_counted(paths[0], (wanted, select, window, bin, recipe))) is not None:
         return ready
@@ -105,18 +103,17 @@ class _Reader:
 
     def read(self, path: Path) -> None:
         """Read the sessions of one file."""
-        with open_file(path) as file:
-            for session in read_file(file, path):
-                if not has_units(session):
-                    self.skipped.append(no_units(session))
-                    continue
-                self._once(session)
-                plan = self._plan(session)
-                if plan.selection.subjects and session.subject not in plan.selection.subjects:
-                    self.other_subjects.append(session.subject)
-                    continue
-                self.notes += session.notes
-                self.parts.append(extract(session, plan))
+        for session, found in each_session(path, self.recipe if self.named else None):
+            if not has_units(session):
+                self.skipped.append(no_units(session))
+                continue
+            self._once(session)
+            plan = self._plan(session, found)
+            if plan.selection.subjects and session.subject not in plan.selection.subjects:
+                self.other_subjects.append(session.subject)
+                continue
+            self.notes += session.notes
+            self.parts.append(extract(session, plan))
 
     def _once(self, session: Session) -> None:
         keys = [("subject and session", session.subject, session.session)]
@@ -129,10 +126,14 @@ class _Reader:
                 )
             self.seen[key] = session.source
 
-    def _plan(self, session: Session) -> Plan:
+    def _plan(self, session: Session, found: Recipe | None) -> Plan:
         """Return the plan, made for the first session and checked against each later one."""
-        found = None if self.named else detect_recipe(session)
-        if found is not None and self.conditions is not None and self.conditions.table != found.conditions.table:
+        if (
+            not self.named
+            and found is not None
+            and self.conditions is not None
+            and (self.conditions.table != found.conditions.table)
+        ):
             found = None
         if self.plan is None:
             self.recipe = self.recipe if self.named else found
@@ -180,13 +181,6 @@ class _Reader:
         if self.recipe is None:
             return ""
         return self.recipe.name if self.named else f"{self.recipe.name} (detected from the layout)"
-
-
-def _resolve(source: Source) -> tuple[Recipe | None, list[Path]]:
-    if not isinstance(source, str):
-        return None, find_files(source)
-    name, rest = split_source(source)
-    return (get_recipe(name) if name else None), find_files(rest)
 
 
 def _already_counted(path: Path, options: Iterable[Any]) -> xr.Dataset | None:

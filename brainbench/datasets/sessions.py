@@ -117,6 +117,47 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Series:
+    """A sampled signal of a file; samples are read only when asked for."""
+
+    name: str
+    """Path in the file, such as ``acquisition/behavior/touch_onset``."""
+    kind: str
+    """NWB type."""
+    data: Any
+    """[samples, …] array-like."""
+    timestamps: Any = None
+    """[samples] s, or None for regular sampling from ``start`` at ``rate``."""
+    start: float = 0.0
+    rate: float = math.nan
+
+    @property
+    def gigabytes(self) -> float:
+        """Size of the samples, uncompressed."""
+        return float(np.prod(self.data.shape, dtype=np.float64) * self.data.dtype.itemsize / 1e9)
+
+    def active_times(self) -> NDArray[np.float64]:
+        """Times (s, ascending) of the samples of a 0/1 signal that are 1.
+
+        Raises:
+            DataError: the samples are not 0 or 1, or timestamps are missing or of another number.
+        """
+        values = np.asarray(self.data[...]).ravel()
+        where = np.flatnonzero(values > 0.5)
+        present = values[np.isfinite(values)]
+        if len(present) and not np.isin(present, (0, 1)).all():
+            raise DataError(f"The series {self.name} should hold zeros and ones; it reaches {present.max():g}.")
+        if self.timestamps is None:
+            if not self.rate > 0:
+                raise DataError(f"The series {self.name} has neither timestamps nor a rate; its samples have no time.")
+            return self.start + where / self.rate
+        times = np.asarray(self.timestamps[...], dtype=np.float64)
+        if len(times) != len(values):
+            raise DataError(f"The series {self.name} has {len(times)} timestamps for {len(values)} samples.")
+        return np.sort(times[where])
+
+
+@dataclass(frozen=True)
 class Session:
     """One session of one subject. Valid while its file is open."""
 
@@ -138,6 +179,8 @@ class Session:
     modules: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Contents of the processing modules, by name."""
     notes: tuple[str, ...] = ()
+    series: Mapping[str, Series] = field(default_factory=dict)
+    """Acquired signals by path; their samples stay in the file."""
 
     def table(self, name: str) -> Table:
         """Return one interval table.
@@ -178,9 +221,9 @@ def make_session(
     """
     data: dict[str, Any] = {"id": np.arange(len(spikes))}
     data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}
-    data |= _ragged(SPIKES, spikes)
+    data |= ragged(SPIKES, spikes)
     if observed is not None:
-        data |= _ragged(OBSERVED, [np.reshape(item, (-1, 2)) for item in observed])
+        data |= ragged(OBSERVED, [np.reshape(item, (-1, 2)) for item in observed])
     made = {
         name: Table(name, {key: np.asarray(item) for key, item in table.items()}, session)
         for name, table in tables.items()
@@ -195,7 +238,8 @@ def make_session(
     return Session(subject, session, units, made, source=session, start=start, synthetic=synthetic, format="arrays")
 
 
-def _ragged(name: str, rows: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def ragged(name: str, rows: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Store one list per row as a ragged column: all values, and the end of each row."""
     values = np.concatenate([np.asarray(row, dtype=np.float64) for row in rows]) if rows else np.zeros(0)
     return {name: values, f"{name}_index": np.cumsum([len(row) for row in rows], dtype=np.int64)}
 

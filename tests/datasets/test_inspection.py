@@ -41,6 +41,19 @@ def test_an_inspection_is_text_and_json(tmp_path):
     assert data["proposals"][0]["conditions"] == "trials:texture"
 
 
+def test_signals_are_listed_and_a_broken_link_hides_nothing(tmp_path):
+    import h5py
+
+    path = write_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "a") as file:
+        file["acquisition/behavior/touch/data"] = np.zeros((1000, 2))
+        file["acquisition/behavior/touch"].attrs["neurodata_type"] = "TimeSeries"
+        file["acquisition/voltage"] = h5py.ExternalLink("not-here.h5", "/voltage")
+    report = inspect(path)
+    assert "acquisition/behavior/touch (TimeSeries): 1000 × 2 samples, 1.6e-05 GB, not read" in str(report)
+    assert report.sessions[0].units.spikes == 120
+
+
 def test_problems_are_reported_not_raised(tmp_path):
     import h5py
 

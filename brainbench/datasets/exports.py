@@ -1,0 +1,184 @@
+"""Write a small copy of recordings: spike times, unit columns and interval tables, never raw data.
+
+Scoring the copy gives what scoring the original gives, to the last bit: rows keep their ids, spike
+times their digits, and what coverage was taken from units that are left out is written down.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.datasets._extract import has_units, read_spikes, recorded_span
+from brainbench.datasets._nwb_writer import NwbWriter
+from brainbench.datasets.hdf5 import write_recordings
+from brainbench.datasets.reading import Source, each_session, find_recordings
+from brainbench.datasets.recipes import resolve_selection
+from brainbench.datasets.selection import EVERYTHING, Selection, Tally
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, Table, as_labels, decode, ragged
+from brainbench.errors import DataError, UsageError, unknown_name
+from brainbench.files import atomic_path
+
+_NO_START = "1970-01-01T00:00:00+00:00"
+
+
+def export(source: Source, target: str | os.PathLike[str], *, select: Selection | str | None = None) -> list[Path]:
+    """Copy recordings without raw data.
+
+    Args:
+        source: as in :func:`~brainbench.datasets.open_recordings`.
+        target: ``*.h5`` (our layout; any number of sessions), ``*.nwb`` (one session), or a folder, which
+            gets one NWB file per session.
+        select: subjects, trials and units to copy; all by default. Rules are applied to the table that
+            the recipe names, else to ``trials``.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        DataError: nothing is left, or a session cannot be stored as NWB.
+        UsageError: several sessions for one NWB file, another suffix, an unknown subject or rule.
+    """
+    recipe, paths = find_recordings(source)
+    chosen = EVERYTHING if select is None else resolve_selection(select)
+    sessions, skipped = [], []
+    for path in paths:
+        for session, found in each_session(path, recipe):
+            if chosen.subjects and session.subject not in chosen.subjects:
+                skipped.append(session.subject)
+            elif has_units(session):
+                sessions.append(subset(session, chosen, found.conditions.table if found else "trials"))
+    if not sessions:
+        if skipped:
+            raise unknown_name("subject", chosen.subjects[0], sorted(set(skipped)))
+        raise DataError(f"None of the {len(paths)} files of {source} holds units with spike times; nothing to copy.")
+    target = Path(target)
+    if target.suffix in (".h5", ".hdf5"):
+        return [write_recordings(target, sessions)]
+    if target.suffix == ".nwb":
+        if len(sessions) > 1:
+            raise UsageError(f"An NWB file holds one session, these are {len(sessions)}; name a folder or an .h5 file.")
+        return [write_nwb(target, sessions[0])]
+    if target.suffix:
+        raise UsageError(f"Recordings are written to .nwb, .h5 or a folder; received {target.name!r}.")
+    files = {f"sub-{_entity(session.subject)}_ses-{_entity(session.session)}.nwb": session for session in sessions}
+    if len(files) < len(sessions):
+        raise UsageError("Two sessions would get the same file name; export to one .h5 file instead.")
+    return [write_nwb(target / name, session) for name, session in files.items()]
+
+
+def subset(session: Session, selection: Selection = EVERYTHING, table: str = "trials") -> Session:
+    """Read a session into memory: spikes, tables and plain columns of the rows that a selection keeps.
+
+    Raises:
+        DataError: units or tables are damaged, or no unit is left.
+        UsageError: a rule names a column that is not there.
+    """
+    units = session.units
+    if units is None:
+        raise DataError(f"{session.source} has no units table; there are no spikes to copy.")
+    tally = Tally()
+    spikes = read_spikes(units, tally.notes)
+    kept = tally.select(units, selection.units, "units")
+    kept &= np.array([len(times) for times in spikes]) >= selection.min_spikes
+    if not kept.any():
+        raise DataError(f"No unit of {session.source} passes {'; '.join(selection.lines())}; nothing to copy.")
+    columns = _plain(units, kept)
+    columns |= ragged(SPIKES, [times for times, keep in zip(spikes, kept, strict=True) if keep])
+    if not kept.all() and OBSERVED not in columns and (span := recorded_span(spikes)) is not None:
+        # The span was that of all units; the copy must not shrink it to that of those it holds.
+        columns |= ragged(OBSERVED, [np.array([span])] * int(kept.sum()))
+    tables = {}
+    for name, item in session.tables.items():
+        rows = tally.select(item, selection.trials, "trials") if name == table else np.ones(len(item), dtype=bool)
+        tables[name] = Table(name, _plain(item, rows), item.where)
+    return replace(session, units=Table("units", columns, units.where), tables=tables, series={})
+
+
+def write_nwb(path: str | os.PathLike[str], session: Session) -> Path:
+    """Write one session as NWB 2.x, atomically.
+
+    Raises:
+        DataError: ids are no integers or a table has no ``stop_time``, which NWB needs.
+    """
+    import h5py
+
+    if session.units is None:
+        raise DataError(f"{session.source} has no units table; there are no spikes to write.")
+    made = "SYNTHETIC session" if session.synthetic else "Session"
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        writer = NwbWriter(
+            file,
+            identifier=session.identifier or f"{session.subject}-{session.session}",
+            description=f"{made} copied by brainbench: spike times and tables without raw data.",
+            start=session.start or _NO_START,
+            general={"session_id": session.session, "keywords": ["synthetic"] * session.synthetic + ["brainbench"]},
+            subject={"subject_id": session.subject},
+        )
+        writer.table("units", "Units", "Units with their spike times.", _ids(session.units), _columns(session.units))
+        for name, table in session.tables.items():
+            for column in ("start_time", "stop_time"):
+                if column not in table:
+                    raise DataError(f"{table.label} has no {column}, which NWB needs; export to .h5 instead.")
+            module, slash, rest = name.partition("/")
+            if slash and f"processing/{module}" not in file:
+                writer.module(module, f"Tables of the module {module}.")
+            place = f"processing/{module}/{rest}" if slash else f"intervals/{name}"
+            writer.table(place, "TimeIntervals", f"Table {name}.", _ids(table), _columns(table))
+    return Path(path)
+
+
+def _plain(table: Table, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    """Columns that mean something outside their file, of the rows kept; references do not."""
+    made: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
+    for name in table.columns:
+        if name == SPIKES or name.endswith("_index"):
+            continue
+        raw = table.data[name]
+        kind = decode(getattr(raw, "attrs", {}).get("neurodata_type", "")).tolist()
+        if kind == "DynamicTableRegion":
+            continue
+        nested = f"{name}_index" in table.data
+        if (raw.ndim > 1 and name != OBSERVED) or f"{name}_index_index" in table.data:
+            continue
+        values = decode(raw[...])
+        if values.dtype.kind not in "biufU":
+            continue
+        if not nested:
+            made[name] = table.column(name)[rows]
+            continue
+        parts = np.split(values, table.ends(name)[:-1]) if len(table) else []
+        parts = [part for part, keep in zip(parts, rows, strict=True) if keep]
+        made[name] = np.concatenate(parts) if parts else values[:0]
+        made[f"{name}_index"] = np.cumsum([len(part) for part in parts], dtype=np.int64)
+    return made
+
+
+def _columns(table: Table) -> Mapping[str, tuple[str, Any]]:
+    columns: dict[str, tuple[str, Any]] = {}
+    for name in table.columns:
+        values = np.asarray(table.data[name])
+        if f"{name}_index" not in table.data:
+            columns[name] = (name, values)
+        elif len(table):
+            columns[name] = (name, np.split(values, table.ends(name)[:-1]))
+    return columns
+
+
+def _ids(table: Table) -> NDArray[np.int64]:
+    ids = as_labels(table.ids())
+    try:
+        return ids.astype(np.int64)
+    except ValueError as error:
+        raise DataError(f"{table.label} has ids that are no integers, which NWB needs; export to .h5.") from error
+
+
+def _entity(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "-", name)
