@@ -88,6 +88,21 @@ class TemporalGraph(nn.Module):
         """(C, H, W) of one step of the stimulus."""
         return self.spec.input_shape
 
+    @property
+    def features(self) -> int:
+        """Number of output values of one step."""
+        return math.prod(self._shapes[self.spec.output])
+
+    @property
+    def latency(self) -> int:
+        """Steps of the biological unrolling before the stimulus can show in the output."""
+        return self.spec.first_response()[self.spec.output]
+
+    @property
+    def receptive_field(self) -> int | None:
+        """Steps of the biological unrolling that the output can depend on; None: all so far."""
+        return self.spec.receptive_field()
+
     def load_tnn_state(self, state: Mapping[str, Any]) -> None:
         """Load arrays or tensors under PyTorchTNN's names, ``<node>._pre_memory.conv.weight`` and so on.
 

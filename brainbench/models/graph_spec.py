@@ -303,6 +303,20 @@ class GraphSpec:
                     first[edge.target] = min(step, first.get(edge.target, step))
         return {name: first[name] for name in self.order}
 
+    def receptive_field(self, unroll: Unroll = "biological") -> int | None:
+        """Return how many steps back the output can see, its own step included; None: all of them."""
+        check_unroll(unroll)
+        if any(node.memory is not None for node in self.nodes) or any(len(group) > 1 for group in self.groups()):
+            return None
+        if any(edge.source == edge.target for edge in self.edges):
+            return None
+        last = dict.fromkeys(self.inputs, 1)
+        for name in (name for group in self.groups() for name in group):
+            for edge in self.predecessors(name):
+                delay = 1 if unroll == "biological" or edge.feedback else 0
+                last[name] = max(last.get(name, 0), last[edge.source] + delay)
+        return last[self.output]
+
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Return the strongly connected components in the order in which they can be computed."""
         reach = {node.name: {node.name} for node in self.nodes}

@@ -1,26 +1,28 @@
 """Models by name.
 
 A name is ``<encoder>[-<cell>][-ln][-small][+<attender>][.<tag>]``. Without a tag the model is untrained;
-its weights follow from the seed alone. Other packages add models through the entry point group
+its weights follow from the seed alone. ``local-dir:PATH`` and ``hf-hub:OWNER/NAME`` name a folder of trained
+weights (:mod:`~brainbench.models.checkpoints`). Other packages add models through the entry point group
 ``brainbench.models``: an entry point names a module (or an object in it) whose import runs
 :func:`register_model`. Importing this module imports no framework.
 """
 
 from __future__ import annotations
 
+import inspect
 import logging
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.errors import UsageError, unknown_name
+from brainbench.models.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
 
 if TYPE_CHECKING:
-    import torch
     from torch import nn
 
 _log = logging.getLogger(__name__)
@@ -37,12 +39,17 @@ class ModelRecord:
     """One architecture of the registry."""
 
     name: str
-    build: Callable[[], nn.Module]
-    """Builds the model with new random weights."""
+    build: Callable[..., nn.Module]
+    """Builds the model with new random weights; takes no argument that is required."""
     family: str
     description: str
     citation: str
     licence: str
+
+    @property
+    def source(self) -> str:
+        """Top-level package that the code comes from."""
+        return self.build.__module__.partition(".")[0]
 
 
 @dataclass(frozen=True)
@@ -54,24 +61,31 @@ class ModelDescription:
     description: str
     citation: str
     licence: str
+    source: str
+    """Top-level package that the code comes from."""
     parameters: int
     multiply_adds: int | None
     """Multiply-adds of a time step, counted on the first one (attention to earlier steps adds under 0.2 % to
     the 22nd of ``+gpt``); None for a model without a method ``multiply_adds``."""
     layers: tuple[str, ...]
     """Layers that can be extracted by name."""
+    trained: Mapping[str, Any] | None = None
+    """For a name of trained weights: what their configuration says."""
 
 
 _records: dict[str, ModelRecord] = {}
 _sources: set[str] = set()
 
-Factory = TypeVar("Factory", bound="Callable[[], nn.Module]")
+Factory = TypeVar("Factory", bound="Callable[..., nn.Module]")
 
 
 def register_model(
     name: str, *, family: str, description: str = "", citation: str = "", licence: str = "unstated"
 ) -> Callable[[Factory], Factory]:
-    """Decorate a function without arguments that builds a model, so that it can be had by name.
+    """Decorate a function that builds a model, so that it can be had by name.
+
+    It is called without arguments, or with the options that a user or a checkpoint gives; a model that is to be
+    trained on other data takes ``classes``.
 
     Args:
         name: Lower-case letters, digits, ``-`` and ``+``.
@@ -119,41 +133,60 @@ def find_model(name: str) -> ModelRecord:
     return replace(_known()[_split(name)[0]])
 
 
-def load_model(name: str, *, seed: int = 0, pretrained: str | os.PathLike[str] | None = None) -> nn.Module:
+def load_model(
+    name: str, *, seed: int = 0, pretrained: str | os.PathLike[str] | None = None, **options: Any
+) -> nn.Module:
     """Build a model by name, in evaluation mode.
 
     Args:
-        name: ``architecture`` (untrained) or ``architecture.tag`` (trained with that objective).
+        name: ``architecture`` (untrained), ``architecture.tag`` (trained with that objective), or a folder of
+            trained weights as ``local-dir:PATH`` or ``hf-hub:OWNER/NAME[@REVISION]``.
         seed: Seed of untrained weights. Equal seeds give equal weights whatever else drew random
             numbers, and PyTorch's global random state is left as it was.
-        pretrained: Safetensors file with the weights of a tagged name.
+        pretrained: Folder of a checkpoint, or safetensors file, with the weights of a tagged name.
+        **options: What the architecture's builder takes; ours take ``classes``, ``decoder`` and ``unroll``.
 
     Raises:
-        UsageError: no such model or tag, weights given for an untagged name, or none for a tagged one.
-        DataError: the file of weights is missing, unreadable or does not fit.
+        UsageError: no such model, tag or option, weights given for an untagged name, or none for a tagged one.
+        DataError: the weights are missing, unreadable or do not fit.
+        MissingDependencyError: a hub was named and its client is not installed.
     """
-    architecture, tag = _split(name)
-    if tag is None and pretrained is not None:
-        raise UsageError(
-            f"Without a tag {name!r} is the untrained model; name the objective its weights were trained with, "
-            f"for example {name}.{OBJECTIVES[0]!s}, to load {os.fspath(pretrained)!r}."
-        )
-    if tag is not None and pretrained is None:
-        raise UsageError(
-            f"There are no weights for {name!r} yet; train them with: brainbench train {architecture} "
-            f"--objective {tag}; or load the untrained model {architecture!r}."
-        )
+    folder = None
+    if name.startswith(PREFIXES):
+        if pretrained is not None:
+            raise UsageError(f"{name!r} already names trained weights; pretrained is for registry names with a tag.")
+        folder = find_folder(name)
+        architecture, tag = _split(read_config(folder)["architecture"])
+    else:
+        architecture, tag = _split(name)
+        if tag is None and pretrained is not None:
+            raise UsageError(
+                f"Without a tag {name!r} is the untrained model; name the objective its weights were trained with, "
+                f"for example {name}.{OBJECTIVES[0]!s}, to load {os.fspath(pretrained)!r}."
+            )
+        if pretrained is not None and Path(pretrained).is_dir():
+            folder = Path(pretrained)
+        elif tag is not None and pretrained is None:
+            folder = shipped().get(name)
+            if folder is None:
+                raise UsageError(
+                    f"There are no weights for {name!r} yet; train them with: brainbench train {architecture} "
+                    f"--objective {tag}; or load the untrained model {architecture!r}."
+                )
+    if folder is not None:
+        config = read_config(folder)
+        options, pretrained = {**config["options"], **options}, folder / WEIGHTS
     from brainbench.models._seeding import seeded
 
     with seeded(seed):
-        model = _known()[architecture].build()
+        model = _build(architecture, options)
     if pretrained is not None:
-        _load_weights(model, Path(pretrained), name)
+        load_weights(model, pretrained, what=name)
     return model.eval()
 
 
 def describe_model(name: str) -> ModelDescription:
-    """Return an architecture's record with its size and cost, computed without allocating its weights.
+    """Return a model's record with its size and cost, computed without allocating its weights.
 
     Raises:
         UsageError: there is no such model.
@@ -162,39 +195,38 @@ def describe_model(name: str) -> ModelDescription:
 
     from brainbench.models._seeding import seeded
 
-    record = find_model(name)
+    folder = find_folder(name) if name.startswith(PREFIXES) else shipped().get(name)
+    trained = read_config(folder) if folder is not None else None
+    record = find_model(trained["architecture"] if trained is not None else name)
+    options = trained["options"] if trained is not None else {}
     with seeded(0):
         try:
             with torch.device("meta"):
-                model = record.build()
+                model = _build(record.name, options)
         except (RuntimeError, NotImplementedError):  # a model that computes with values while it is built
-            model = record.build()
+            model = _build(record.name, options)
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
     return ModelDescription(
-        record.name,
+        record.name if trained is None else name,
         record.family,
         record.description,
         record.citation,
         record.licence,
+        record.source,
         parameters=sum(parameter.numel() for parameter in model.parameters()),
         multiply_adds=count() if count is not None else None,
         layers=tuple(getattr(model, "layers", ())),
+        trained=trained,
     )
 
 
-def _load_weights(model: nn.Module, path: Path, name: str) -> None:
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    from brainbench.models._tnn_state import load_named
-
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file of weights {os.fspath(path)!r} for {name!r}.")
-    try:
-        state: dict[str, torch.Tensor] = load_file(path)
-    except SafetensorError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a readable safetensors file ({error}).") from error
-    load_named(model.state_dict(), state, what=f"the model {name!r}")
+def _build(architecture: str, options: Mapping[str, Any]) -> nn.Module:
+    build = _known()[architecture].build
+    accepted = inspect.signature(build).parameters
+    for option in options:
+        if option not in accepted and not any(item.kind is item.VAR_KEYWORD for item in accepted.values()):
+            raise unknown_name(f"option of the model {architecture!r}", option, accepted)
+    return build(**options)
 
 
 def _split(name: str) -> tuple[str, str | None]:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from brainbench.models.registry import register_model
 
 if TYPE_CHECKING:
     from brainbench.models.ead import EAD
+    from brainbench.models.graph_spec import Unroll
+    from brainbench.models.parts import Attender, Encoder
+
+LICENCE = "MIT"
 
 CELLS = {
     "": ("time-decay", "time-decay memory"),
@@ -22,45 +28,124 @@ CITATION = (
     "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven neural network models for the rodent "
     "whisker-trigeminal system, NeurIPS 30"
 )
-LICENCE = "MIT"
+CITATIONS = {
+    "zhuang": CITATION,
+    "resnet18": "He, Zhang, Ren & Sun 2016, Deep residual learning for image recognition, CVPR",
+    "s4": "Gu, Goel & Ré 2022, Efficiently modeling long sequences with structured state spaces, ICLR",
+    "gpt": "Radford, Wu, Child, Luan, Amodei & Sutskever 2019, Language models are unsupervised multitask learners",
+    "mamba": "Gu & Dao 2023, Mamba: linear-time sequence modeling with selective state spaces, arXiv:2312.00752",
+}
+"""Papers that the parts come from."""
+
+ATTENDERS = (None, "gpt", "mamba")
 
 
-def zhuang(cell: str, *, layer_norm: bool = False, small: bool = False, gpt: bool = False) -> EAD:
-    """Build a Zhuang network with new random weights and a linear decoder to 117 classes.
+@dataclass(frozen=True)
+class Architecture:
+    """What a registry name says: an encoder, its memory and size, and an attender."""
 
-    Args:
-        cell: Cell of the encoder.
-        layer_norm: Normalise the cell's gates (the output of time decay).
-        small: All widths × 3/16; the GPT attender is then 96 wide, at equal depth.
-        gpt: Add the GPT attender, as wide as the encoder's output.
-    """
-    from brainbench.models.attenders.gpt import GPTAttender
-    from brainbench.models.ead import EAD
-    from brainbench.models.encoders.zhuang import ZhuangEncoder
-    from brainbench.models.graph import TemporalGraph
+    encoder: str
+    """``zhuang``, ``resnet18`` or ``s4``."""
+    cell: str = ""
+    """Name part of a Zhuang encoder's cell (a key of :data:`CELLS`), or ``-feedforward``."""
+    layer_norm: bool = False
+    small: bool = False
+    attender: str | None = None
 
-    choice = ZhuangEncoder(cell, layer_norm, small)
-    return EAD(
-        TemporalGraph(choice.spec()),
-        GPTAttender(choice.features, choice.features) if gpt else None,
-    )
+    @property
+    def name(self) -> str:
+        """Registry name."""
+        name = f"{self.encoder}{self.cell}{'-ln' if self.layer_norm else ''}{'-small' if self.small else ''}"
+        return f"{name}+{self.attender}" if self.attender else name
+
+    @property
+    def family(self) -> str:
+        """Encoder and attender, for grouping on leaderboards."""
+        base = f"{self.encoder}{self.cell if self.cell == '-feedforward' else ''}"
+        return f"{base}+{self.attender}" if self.attender else base
+
+    @property
+    def description(self) -> str:
+        """One line for people."""
+        if self.encoder == "resnet18":
+            text = "Residual network of every step alone"
+        elif self.encoder == "s4":
+            text = "Structured state-space encoder"
+        elif self.cell == "-feedforward":
+            text = "Convolutional encoder without memory or feedback"
+        else:
+            text = f"Recurrent convolutional encoder, {CELLS[self.cell][1]}"
+        words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[self.attender]
+        return f"{text}{', LayerNorm' if self.layer_norm else ''}{words}{', 3/16 width' if self.small else ''}"
+
+    @property
+    def citation(self) -> str:
+        """Papers of the encoder and the attender."""
+        return "; ".join(CITATIONS[part] for part in (self.encoder, self.attender) if part)
+
+    def build(self, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological") -> EAD:
+        """Build the network with new random weights.
+
+        Args:
+            classes: Number of outputs.
+            decoder: ``linear``, ``mlp`` or ``all-steps``.
+            unroll: ``biological`` or ``full``, for a Zhuang encoder.
+
+        Raises:
+            UsageError: an option does not exist or does not fit.
+        """
+        from brainbench.models.decoders import make_decoder
+        from brainbench.models.ead import EAD
+
+        encoder = self._encoder()
+        attender = self._attender(encoder.features)
+        features = encoder.features if attender is None else attender.features
+        return EAD(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
+
+    def _encoder(self) -> Encoder:
+        if self.encoder == "resnet18":
+            from brainbench.models.encoders.resnet import ResNet18Encoder
+
+            return ResNet18Encoder(small=self.small)
+        if self.encoder == "s4":
+            from brainbench.models.encoders.s4 import S4Encoder
+
+            return S4Encoder(small=self.small)
+        from brainbench.models.encoders.zhuang import ZhuangEncoder
+        from brainbench.models.graph import TemporalGraph
+
+        feedforward = self.cell == "-feedforward"
+        cell = "time-decay" if feedforward else CELLS[self.cell][0]
+        return TemporalGraph(ZhuangEncoder(cell, self.layer_norm, self.small, feedforward=feedforward).spec())
+
+    def _attender(self, features: int) -> Attender | None:
+        if self.attender == "gpt":
+            from brainbench.models.attenders.gpt import GPTAttender
+
+            # As published, the ResNet's transformer is half as wide as its features.
+            return GPTAttender(features, features // 2 if self.encoder == "resnet18" else features)
+        if self.attender == "mamba":
+            from brainbench.models.attenders.mamba import MambaAttender
+
+            return MambaAttender(features)
+        return None
+
+
+def architectures() -> Iterator[Architecture]:
+    """Yield every architecture, full sizes first."""
+    for small in (False, True):
+        for attender in ATTENDERS:
+            for cell in CELLS:
+                for layer_norm in (False, True):
+                    yield Architecture("zhuang", cell, layer_norm, small, attender)
+            yield Architecture("zhuang", "-feedforward", small=small, attender=attender)
+            for encoder in ("resnet18", "s4"):
+                yield Architecture(encoder, small=small, attender=attender)
 
 
 def register() -> None:
-    """Enter every architecture into the registry, full sizes first."""
-    for small in (False, True):
-        for gpt in (False, True):
-            for part, (cell, words) in CELLS.items():
-                for layer_norm in (False, True):
-                    _register(part, cell, words, layer_norm=layer_norm, small=small, gpt=gpt)
-
-
-def _register(part: str, cell: str, words: str, *, layer_norm: bool, small: bool, gpt: bool) -> None:
-    name = f"zhuang{part}{'-ln' if layer_norm else ''}{'-small' if small else ''}{'+gpt' if gpt else ''}"
-    described = f"Recurrent convolutional encoder, {words}{', LayerNorm' if layer_norm else ''}"
-    described += f"{', GPT attender' if gpt else ''}{', 3/16 width' if small else ''}"
-    family = "zhuang+gpt" if gpt else "zhuang"
-
-    @register_model(name, family=family, description=described, citation=CITATION, licence=LICENCE)
-    def build() -> EAD:
-        return zhuang(cell, layer_norm=layer_norm, small=small, gpt=gpt)
+    """Enter every architecture into the registry."""
+    for item in architectures():
+        register_model(
+            item.name, family=item.family, description=item.description, citation=item.citation, licence=LICENCE
+        )(item.build)

@@ -26,14 +26,19 @@ def _clean(monkeypatch):
 def test_names_follow_the_grammar_and_patterns_select_them():
     names = list_models()
     assert names[0] == "zhuang"
-    assert len(names) == len(set(names)) == 40
+    assert len(names) == len(set(names)) == 78
     assert list_models("zhuang-intersection-ln*") == [
         "zhuang-intersection-ln",
         "zhuang-intersection-ln+gpt",
+        "zhuang-intersection-ln+mamba",
         "zhuang-intersection-ln-small",
         "zhuang-intersection-ln-small+gpt",
+        "zhuang-intersection-ln-small+mamba",
     ]
-    assert list_models("resnet*") == []
+    assert list_models("resnet*") == [
+        f"resnet18{size}{attender}" for size in ("", "-small") for attender in ("", "+gpt", "+mamba")
+    ]
+    assert list_models("transformer*") == []
 
 
 def test_listing_models_imports_no_framework():
@@ -99,23 +104,46 @@ def test_weights_are_loaded_under_a_tag_only(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "parameters"), [("zhuang-intersection-ln", 37_988_821), ("zhuang-intersection-ln+gpt", 63_767_509)]
+    ("name", "parameters"),
+    [
+        ("zhuang-intersection-ln", 37_988_821),
+        ("zhuang-intersection-ln+gpt", 63_767_509),
+        ("resnet18+gpt", 18_086_517),
+        ("resnet18+mamba", 18_367_861),
+        ("s4", 3_434_496 + 60_021),
+    ],
 )
 def test_a_description_states_the_published_size(name, parameters):
     described = describe_model(name)
     assert described.parameters == parameters
     assert described.licence == "MIT"
-    assert "NeurIPS" in described.citation
+    assert described.citation.count(";") == name.count("+")
+    assert described.source == "brainbench"
     assert described.layers[-1] == "decoder"
 
 
-@pytest.mark.parametrize("name", ["zhuang-small", "zhuang-gru-ln-small", "zhuang-lstm-small+gpt"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "zhuang-small",
+        "zhuang-gru-ln-small",
+        "zhuang-lstm-small+gpt",
+        "zhuang-feedforward-small",
+        "resnet18-small",
+        "resnet18-small+mamba",
+    ],
+)
 def test_multiply_adds_equal_pytorchs_count(name):
     model = load_model(name)
     # PyTorch does not count its fused attention on the CPU; a multiply-add is two FLOPs.
     with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         model(torch.zeros(1, 1, 30, 5, 7))
     assert describe_model(name).multiply_adds == counter.get_total_flops() // 2
+
+
+def test_multiply_adds_of_state_spaces_are_those_of_a_streamed_step():
+    linear = 1050 * 96 + 4 * 96 * 192 + 96 * 96 + 96 * 117
+    assert describe_model("s4-small").multiply_adds == linear + 4 * 96 * 32 * 12
 
 
 def test_the_full_gated_network_costs_what_was_published():

@@ -1,4 +1,9 @@
-"""The contract that every architecture of the registry keeps."""
+"""The contract that every architecture of the registry keeps.
+
+An attender does not know its encoder's cell, so at full size one cell stands for all with an attender.
+"""
+
+import copy
 
 import pytest
 import torch
@@ -7,9 +12,11 @@ from brainbench.models.registry import describe_model, list_models, load_model
 
 SMALL = list_models("*-small*")
 FULL = [name for name in list_models() if name not in SMALL]
-# Attenders do not know their encoder's cell, so one of them stands for all in the default run.
-QUICK = [name for name in FULL if not name.endswith("+gpt")] + ["zhuang-intersection-ln+gpt"]
+ENCODERS = [name for name in FULL if "+" not in name]
+UNIQUE = [*ENCODERS, "zhuang-intersection-ln+gpt", "zhuang+mamba", "resnet18+gpt", "s4+mamba"]
 SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+# conv6 first answers at step 5 and reaches the output three steps later.
+LONG_ENOUGH = 10
 
 
 def _sweep(batch, steps):
@@ -26,6 +33,8 @@ def _keeps_the_contract(model, x):
             assert values.shape[:2] == x.shape[:2]
             assert torch.isfinite(values).all()
         assert torch.equal(model(x), y)
+        assert model.spec.causal
+        assert model.encode(x).shape == (*x.shape[:2], model.features)
         state = model.init_state(len(x))
         for t in range(x.shape[1]):
             streamed, state = model.step(x[:, t], state)
@@ -38,7 +47,7 @@ def test_a_small_model_keeps_the_contract(name):
     _keeps_the_contract(load_model(name), _sweep(2, 6))
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", UNIQUE)
 def test_a_full_model_keeps_the_contract(name):
     _keeps_the_contract(load_model(name), _sweep(1, 3))
 
@@ -49,9 +58,9 @@ def test_a_full_model_keeps_the_contract_over_a_whole_sweep(name):
     _keeps_the_contract(load_model(name), _sweep(2, 22))
 
 
-def _gradients_arrive(model, steps):
+def _gradients_arrive(model):
     model.train()
-    model(_sweep(2, steps)).square().sum().backward()
+    model(_sweep(3, LONG_ENOUGH)).square().sum().backward()
     silent = [name for name, value in model.named_parameters() if value.grad is None or not value.grad.any()]
     assert silent == []
     assert all(torch.isfinite(value.grad).all() for value in model.parameters())
@@ -59,14 +68,13 @@ def _gradients_arrive(model, steps):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_gradients_reach_every_parameter(name):
-    # conv6 first answers at step 5 and reaches the output three steps later.
-    _gradients_arrive(load_model(name), 10)
+    _gradients_arrive(load_model(name))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FULL)
 def test_gradients_reach_every_parameter_of_a_full_model(name):
-    _gradients_arrive(load_model(name), 10)
+    _gradients_arrive(load_model(name))
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -74,16 +82,26 @@ def test_a_small_model_is_small(name):
     assert describe_model(name).parameters <= 2_500_000
 
 
-@pytest.mark.parametrize("name", SMALL)
-def test_weights_survive_saving(name, tmp_path):
+def _survives_saving(name, folder):
     from safetensors.torch import save_file
 
     model = load_model(name, seed=1)
-    save_file(model.state_dict(), tmp_path / "model.safetensors")
-    loaded = load_model(f"{name}.supervised", seed=2, pretrained=tmp_path / "model.safetensors")
+    save_file(model.state_dict(), folder / "model.safetensors")
+    loaded = load_model(f"{name}.supervised", seed=2, pretrained=folder / "model.safetensors")
     x = _sweep(1, 4)
     with torch.no_grad():
         assert torch.equal(loaded(x), model(x))
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_weights_survive_saving(name, tmp_path):
+    _survives_saving(name, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FULL)
+def test_weights_of_a_full_model_survive_saving(name, tmp_path):
+    _survives_saving(name, tmp_path)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -95,3 +113,67 @@ def test_different_stimuli_stay_different_in_every_layer(name):
         flat = values.flatten(1)
         spread, size = flat.std(0).pow(2).mean().sqrt(), flat.pow(2).mean().sqrt()
         assert spread > 1e-3 * size, layer
+
+
+def _agrees_in_half_precision(name, steps):
+    """Under autocast the answers stay within a few per cent: bfloat16 keeps 8 bits."""
+    model, x = load_model(name), _sweep(2, steps)
+    with torch.no_grad():
+        exact = model(x)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            rough = model(x)
+    assert torch.isfinite(rough).all()
+    assert (rough.float() - exact).norm() < 0.08 * exact.norm()
+
+
+@pytest.mark.parametrize("name", [name for name in SMALL if "-ln" not in name or "+" not in name])
+def test_half_precision_agrees(name):
+    _agrees_in_half_precision(name, 6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", UNIQUE)
+def test_half_precision_agrees_at_full_size_over_a_whole_sweep(name):
+    _agrees_in_half_precision(name, 22)
+
+
+@pytest.mark.parametrize("name", ["zhuang-intersection-ln-small", "resnet18-small", "s4-small", "zhuang-small+mamba"])
+def test_a_model_can_be_copied_and_keeps_its_answer(name):
+    model, x = load_model(name), _sweep(1, 4)
+    with torch.no_grad():
+        assert torch.equal(copy.deepcopy(model)(x), model(x))
+
+
+def test_classes_decoder_and_unrolling_can_be_chosen():
+    model = load_model("zhuang-ugrnn-small", classes=24, decoder="mlp", unroll="full")
+    assert model.spec.outputs == 24
+    assert model.spec.latency == 0
+    x = _sweep(2, 3)
+    with torch.no_grad():
+        y, state = model(x), model.init_state(2)
+        for t in range(3):
+            streamed, state = model.step(x[:, t], state)
+    torch.testing.assert_close(streamed, y, atol=1e-4, rtol=1e-4)
+
+
+def test_the_all_steps_decoder_streams_and_states_its_length():
+    model = load_model("resnet18-small", decoder="all-steps", classes=5)
+    assert model.spec.max_steps == 22
+    assert model.spec.receptive_field is None
+    x = _sweep(2, 4)
+    with torch.no_grad():
+        activations, state = model.activations(x), model.init_state(2)
+        for t in range(4):
+            streamed, state = model.step(x[:, t], state)
+            torch.testing.assert_close(streamed, activations["decoder"][:, t], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(streamed, model(x), atol=1e-4, rtol=1e-4)
+
+
+def test_the_feedforward_control_sees_eight_steps_and_three_of_them_late():
+    model = load_model("zhuang-feedforward-small")
+    assert (model.spec.receptive_field, model.spec.latency) == (8, 3)
+    x = _sweep(1, 12)
+    x.requires_grad_()
+    model(x).sum().backward()
+    seen = x.grad.flatten(2).abs().sum(2)[0] > 0
+    assert seen.nonzero()[:, 0].tolist() == [4, 6, 8]

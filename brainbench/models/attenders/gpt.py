@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from brainbench.errors import UsageError
 from brainbench.models._layers import Linear
+from brainbench.models.parts import wanted
 
 # GPT-2 draws weights with standard deviation 0.02 at any width; gain/√fan_in is its width-aware form
 # (0.02 ≈ gain 0.45 at 512), and residual branches shrink with depth so that the sum keeps its scale.
@@ -151,19 +152,17 @@ class GPTAttender(nn.Module):
             values.append(value)
         return self.lm_head(self.norm(stream[:, 1])), GPTState(tuple(keys), tuple(values))
 
-    def forward(
-        self, x: torch.Tensor, return_activations: bool | Collection[str] = False
-    ) -> torch.Tensor | tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the answers [B, T, width], with activations also those at the action tokens of named layers."""
         stream = self._tokens(x, 0)
-        wanted = self.layers if return_activations is True else return_activations or ()
+        names = wanted(self.layers, return_activations)
         activations = {}
         for index, name in enumerate(self.layers[:-1]):
             stream, _ = self._block(index)(stream)
-            if name in wanted:
+            if name in names:
                 activations[name] = stream[:, 1::2]
         y = self.lm_head(self.norm(stream[:, 1::2]))
-        if "lm_head" in wanted:
+        if "lm_head" in names:
             activations["lm_head"] = y
         return (y, activations) if return_activations is not False else y
 

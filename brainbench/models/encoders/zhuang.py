@@ -2,7 +2,8 @@
 
 Six 2×2 convolutions (the first "valid", 5 × 7 → 4 × 6, the others "same"), two dense layers, feedback
 3→2, 4→2, 4→3, 5→3, 5→4, 6→4, 6→5 and skips conv2, conv4 → fc7. With the time-decay cell every node has a
-memory, as published; with a gated cell the convolutions carry it and the dense layers have none.
+memory, as published; with a gated cell the convolutions carry it and the dense layers have none. The
+feedforward control keeps nodes, skips and timing and drops feedback and memory.
 """
 
 from __future__ import annotations
@@ -19,6 +20,11 @@ _FEEDBACK = ((3, 2), (4, 2), (4, 3), (5, 3), (5, 4), (6, 4), (6, 5))
 _FULL = (96, 128, 256, 384, 384, 256)
 
 
+def small_width(full: int) -> int:
+    """Return the width of a ``-small`` variant: 3/16 of the full one, in every encoder."""
+    return full * 3 // 16
+
+
 @dataclass(frozen=True)
 class ZhuangEncoder:
     """Choices of the encoder; :meth:`spec` is its graph.
@@ -31,9 +37,11 @@ class ZhuangEncoder:
     layer_norm: bool = False
     small: bool = False
     input_shape: tuple[int, int, int] = INPUT_SHAPE
+    feedforward: bool = False
+    """Neither memory nor feedback; ``cell`` and ``layer_norm`` then have no meaning."""
 
     def _width(self, full: int) -> int:
-        return full * 3 // 16 if self.small else full
+        return small_width(full) if self.small else full
 
     @property
     def features(self) -> int:
@@ -46,15 +54,16 @@ class ZhuangEncoder:
         Raises:
             UsageError: there is no such cell.
         """
-        memory = Memory(self.cell, layer_norm=self.layer_norm)
+        memory = None if self.feedforward else Memory(self.cell, layer_norm=self.layer_norm)
         names = [f"conv{index}" for index in range(1, 7)]
         nodes = [
             Node(name, Convolution(self._width(width), padding="valid" if name == "conv1" else "same"), memory)
             for name, width in zip(names, _FULL, strict=True)
         ]
-        dense = Memory() if self.cell == "time-decay" else None
+        dense = Memory() if self.cell == "time-decay" and not self.feedforward else None
         nodes += [Node("fc7", Dense(self._width(1024)), dense), Node("fc8", Dense(self.features), dense)]
         forward = [*pairwise(names), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
         edges = [Edge(*ends) for ends in (*forward, ("fc7", "fc8"))]
-        edges += [Edge(f"conv{source}", f"conv{target}", feedback=True) for source, target in _FEEDBACK]
+        if not self.feedforward:
+            edges += [Edge(f"conv{source}", f"conv{target}", feedback=True) for source, target in _FEEDBACK]
         return GraphSpec(tuple(nodes), tuple(edges), ("conv1",), "fc8", self.input_shape)

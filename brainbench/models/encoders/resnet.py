@@ -1,0 +1,136 @@
+"""ResNet18 of every time step on its own: the feedforward control without any memory.
+
+Residual network of He et al. 2016 with eight basic blocks. Its first convolution takes all channels of a
+step; the last layer gives the features. 11,523,840 parameters at full width.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Any
+
+import torch
+from torch import nn
+
+from brainbench.errors import UsageError
+from brainbench.models._layers import RECTIFIER_GAIN, Conv2d, Linear
+from brainbench.models.encoders.zhuang import INPUT_SHAPE, small_width
+from brainbench.models.parts import wanted
+
+_WIDTHS = (64, 128, 256, 512)
+
+
+class BasicBlock(nn.Module):
+    """Two 3×3 convolutions with batch norm around a shortcut, [B, C, H, W] → [B, out, H', W']."""
+
+    def __init__(self, in_channels: int, out_channels: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = _convolution(in_channels, out_channels, 3, stride)
+        self.norm1 = nn.BatchNorm2d(out_channels)
+        self.conv2 = _convolution(out_channels, out_channels, 3, 1)
+        self.norm2 = nn.BatchNorm2d(out_channels)
+        self.shortcut = nn.Sequential()
+        if stride != 1 or in_channels != out_channels:
+            self.shortcut.append(_convolution(in_channels, out_channels, 1, stride))
+            self.shortcut.append(nn.BatchNorm2d(out_channels))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the rectified sum of the branch and the shortcut."""
+        y = self.norm2(self.conv2(torch.relu(self.norm1(self.conv1(x)))))
+        return torch.relu(y + self.shortcut(x))
+
+
+class ResNet18Encoder(nn.Module):
+    """Features [B, T, F] of a sweep [B, T, C, H, W], each step alone.
+
+    Args:
+        small: All widths × 3/16 (F = 96 instead of 512; 0.4 M parameters).
+        input_shape: (C, H, W) of one step.
+
+    In training, batch norm pools over batch and time.
+    """
+
+    layers: tuple[str, ...] = ("conv1", "layer1", "layer2", "layer3", "layer4", "fc")
+    latency: int = 0
+    receptive_field: int | None = 1
+
+    def __init__(self, *, small: bool = False, input_shape: tuple[int, int, int] = INPUT_SHAPE) -> None:
+        super().__init__()
+        widths = [small_width(width) if small else width for width in _WIDTHS]
+        self.input_shape = input_shape
+        self.features = widths[-1]
+        self.conv1 = nn.Sequential(
+            _convolution(input_shape[0], widths[0], 7, 2),
+            nn.BatchNorm2d(widths[0]),
+            nn.ReLU(),
+            nn.MaxPool2d(3, 2, 1),
+        )
+        before = widths[0]
+        for index, width in enumerate(widths, start=1):
+            stride = 1 if index == 1 else 2
+            self.add_module(
+                f"layer{index}", nn.Sequential(BasicBlock(before, width, stride), BasicBlock(width, width, 1))
+            )
+            before = width
+        self.fc = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), Linear(before, self.features))
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of one step of one stimulus."""
+        _, rows, columns = self.input_shape
+        size = (_halved(_halved(rows)), _halved(_halved(columns)))
+        first, *_ = (module for module in self.conv1 if isinstance(module, Conv2d))
+        total = first.weight.numel() * _halved(rows) * _halved(columns)
+        for index in range(1, 5):
+            size = size if index == 1 else (_halved(size[0]), _halved(size[1]))
+            layer = self.get_submodule(f"layer{index}")
+            total += sum(m.weight.numel() for m in layer.modules() if isinstance(m, Conv2d)) * math.prod(size)
+        return total + self.features**2
+
+    def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
+        """Return the features [B, T, F], with activations also ``{layer: [B, T, ...]}``.
+
+        Raises:
+            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
+        """
+        if x.ndim != 5 or tuple(x.shape[2:]) != self.input_shape:
+            raise UsageError(
+                f"The ResNet expects [batch, time, {', '.join(map(str, self.input_shape))}]; received {list(x.shape)}."
+            )
+        leading = x.shape[:2]
+        names = wanted(self.layers, return_activations)
+        y, activations = x.flatten(0, 1), {}
+        for name in self.layers:
+            y = self.get_submodule(name)(y)
+            if name in names:
+                activations[name] = y.unflatten(0, leading)
+        y = y.unflatten(0, leading)
+        return y if return_activations is False else (y, activations)
+
+    def init_state(
+        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> tuple[()]:
+        """Return the state before the first step: there is none to keep."""
+        del batch, device, dtype
+        return ()
+
+    def step(self, x: torch.Tensor, state: tuple[()]) -> tuple[torch.Tensor, tuple[()]]:
+        """Return the features [B, F] of one step [B, C, H, W] and the (empty) state."""
+        return self(x[:, None])[:, 0], state
+
+
+def _convolution(in_channels: int, out_channels: int, size: int, stride: int) -> Conv2d:
+    return Conv2d(
+        in_channels,
+        out_channels,
+        kernel_size=(size, size),
+        stride=(stride, stride),
+        padding=(size // 2, size // 2),
+        use_bias=False,
+        gain=RECTIFIER_GAIN,
+    )
+
+
+def _halved(length: int) -> int:
+    """Return the length after a stride of 2 with "same"-like padding of an odd kernel."""
+    return (length + 1) // 2

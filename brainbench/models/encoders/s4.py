@@ -1,0 +1,119 @@
+"""Structured state-space encoder (S4): a linear layer, four blocks with diagonal-plus-low-rank memory, a linear layer.
+
+Gu, Goel & Ré 2022 (ICLR), with the stable form A = Λ − P P* of Goel et al. 2022. 3,434,496 parameters at
+full width. A sweep is one convolution over time by FFT; a stream is the recurrence of the same system.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Any, cast
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from brainbench.errors import UsageError
+from brainbench.models._layers import RECTIFIER_GAIN, Linear
+from brainbench.models._state_space import StateSpace, System
+from brainbench.models.encoders.zhuang import INPUT_SHAPE, small_width
+from brainbench.models.parts import wanted
+
+S4State = tuple[tuple[torch.Tensor, System], ...]
+"""For every block the memory [B, width, pairs, 2] and the discretised system (constant while streaming)."""
+
+
+class S4Block(nn.Module):
+    """x + GLU(GELU(state space(LayerNorm(x)))), [B, T, width]."""
+
+    def __init__(self, width: int, pairs: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.memory = StateSpace(width, pairs)
+        self.mix = Linear(width, 2 * width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Process a sweep [B, T, width]."""
+        return x + self._mixed(self.memory(self.norm(x)))
+
+    def step(self, x: torch.Tensor, memory: torch.Tensor, system: System) -> tuple[torch.Tensor, torch.Tensor]:
+        """Advance by one step [B, width]; return the answer and the next memory."""
+        y, memory = self.memory.step(self.norm(x), memory, system)
+        return x + self._mixed(y), memory
+
+    def _mixed(self, y: torch.Tensor) -> torch.Tensor:
+        return functional.glu(self.mix(self.dropout(functional.gelu(y))), -1)
+
+
+class S4Encoder(nn.Module):
+    """Features [B, T, F] of a sweep [B, T, C, H, W], causally.
+
+    Args:
+        small: All widths × 3/16 (F = 96 instead of 512; 0.3 M parameters).
+        input_shape: (C, H, W) of one step.
+        blocks: Number of S4 blocks.
+        pairs: Conjugate pairs of poles per channel.
+        dropout: Inside the blocks, in training alone.
+    """
+
+    latency: int = 0
+    receptive_field: int | None = None
+
+    def __init__(
+        self,
+        *,
+        small: bool = False,
+        input_shape: tuple[int, int, int] = INPUT_SHAPE,
+        blocks: int = 4,
+        pairs: int = 32,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.input_shape = input_shape
+        self.features = small_width(512) if small else 512
+        self.embed = Linear(math.prod(input_shape), self.features, gain=RECTIFIER_GAIN)
+        self.blocks = nn.ModuleList(S4Block(self.features, pairs, dropout) for _ in range(blocks))
+        self.fc = Linear(self.features, self.features)
+        self.layers: tuple[str, ...] = ("embed", *(f"block{index}" for index in range(1, blocks + 1)), "fc")
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of one streamed step: linear layers, and 12 per conjugate pair of the recurrence."""
+        linear = sum(module.weight.numel() for module in self.modules() if isinstance(module, Linear))
+        return linear + sum(12 * self._block(index).memory.frequency.numel() for index in range(len(self.blocks)))
+
+    def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
+        """Return the features [B, T, F], with activations also ``{layer: [B, T, width]}``.
+
+        Raises:
+            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
+        """
+        if x.ndim != 5 or tuple(x.shape[2:]) != self.input_shape:
+            raise UsageError(
+                f"S4 expects [batch, time, {', '.join(map(str, self.input_shape))}]; received {list(x.shape)}."
+            )
+        names = wanted(self.layers, return_activations)
+        y, activations = x.flatten(2), {}
+        for name, module in zip(self.layers, (self.embed, *self.blocks, self.fc), strict=True):
+            y = module(y)
+            if name in names:
+                activations[name] = y
+        return y if return_activations is False else (y, activations)
+
+    def init_state(
+        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> S4State:
+        """Return the state before the first step: empty memories and the systems discretised from the weights."""
+        return tuple(self._block(index).memory.init_state(batch, device, dtype) for index in range(len(self.blocks)))
+
+    def step(self, x: torch.Tensor, state: S4State) -> tuple[torch.Tensor, S4State]:
+        """Return the features [B, F] of one step [B, C, H, W] and the next state."""
+        y, after = self.embed(x.flatten(1)), []
+        for index, (memory, system) in enumerate(state):
+            y, memory = self._block(index).step(y, memory, system)
+            after.append((memory, system))
+        return self.fc(y), tuple(after)
+
+    def _block(self, index: int) -> S4Block:
+        return cast(S4Block, self.blocks[index])

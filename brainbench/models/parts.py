@@ -1,0 +1,78 @@
+"""What the parts of an encoder-attender-decoder network offer one another.
+
+Letters: B batch, T time step, (C, H, W) one step of the stimulus, F features. A part is also a
+:class:`torch.nn.Module`; its streaming state is a value that only the part itself looks into.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    import torch
+
+
+class Part(Protocol):
+    """A causal map over time that can be run on a sweep or streamed."""
+
+    layers: tuple[str, ...]
+    """Names of what it can return, from input to output."""
+
+    @property
+    def features(self) -> int:
+        """Number of features of one answer."""
+        ...
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of matrix products and convolutions in the first step of one stimulus."""
+        ...
+
+    def init_state(
+        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Any:
+        """Return the state before the first step."""
+        ...
+
+    def step(self, x: torch.Tensor, state: Any) -> tuple[torch.Tensor, Any]:
+        """Advance by one step; return the answer [B, F] and the next state."""
+        ...
+
+    def __call__(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
+        """Return the answers [B, T, F], with activations also ``{layer: [B, T, ...]}``."""
+        ...
+
+
+class Encoder(Part, Protocol):
+    """Maps a sweep [B, T, C, H, W] to features [B, T, F]."""
+
+    @property
+    def input_shape(self) -> tuple[int, int, int]:
+        """(C, H, W) of one step of the stimulus."""
+        ...
+
+    @property
+    def latency(self) -> int:
+        """Steps before the stimulus can show in the features."""
+        ...
+
+    @property
+    def receptive_field(self) -> int | None:
+        """Steps of the stimulus that an answer can depend on, latency included; None: all so far."""
+        ...
+
+
+class Attender(Part, Protocol):
+    """Maps features [B, T, F] to [B, T, W], remembering what it needs."""
+
+    @property
+    def max_steps(self) -> int | None:
+        """Longest sweep it can read; None: any."""
+        ...
+
+
+def wanted(layers: tuple[str, ...], asked: bool | Collection[str]) -> Collection[str]:
+    """Return the layers that ``return_activations`` asks for: all, none, or those named."""
+    if isinstance(asked, bool):
+        return layers if asked else ()
+    return asked
