@@ -6,7 +6,9 @@ import dataclasses
 import math
 
 from brainbench.stimuli.collections import resolve_objects
+from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.frames import Frames
+from brainbench.stimuli.generation.plan import GenerationPlan, Settings
 from brainbench.stimuli.sweeps import GRIDS, SweepScenes
 
 GRID = dataclasses.replace(
@@ -19,9 +21,25 @@ GRID = dataclasses.replace(
     frames=Frames(count=10, interval=0.01),
     published="",
 )
-"""Four sweeps of .1 s per object, which C2 and C3 feel; from ``start`` = −6 mm some whiskers are hit when they start."""
+"""Four sweeps of .1 s per object, which C2 and C3 feel; from ``start`` = −6 mm some are hit at once."""
 
 
 def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):
     found = resolve_objects(objects, collision="hull")
     return SweepScenes(grid, {name: item.load for name, item in found.items()}, whiskers=whiskers)
+
+
+def small_plan(objects=("brick:2", "cone:2"), *, whiskers="C3", grid=GRID, fidelity=None, **settings):
+    found = resolve_objects(objects, collision="hull")
+    chosen = Settings(fidelity or Fidelity.preset("fast"), **settings)
+    return GenerationPlan("small", grid, found, chosen, whiskers)
+
+
+def killed_plan():
+    """Twenty-four shards, which take a second or two: long enough to be killed in between."""
+    return small_plan(("brick:8", "cone:8", "pyramid:8"), shard_size=4)
+
+
+def files_of(folder):
+    """Name → bytes of every file of a folder, hidden ones too."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

@@ -1,0 +1,255 @@
+"""One shard: build its objects, simulate its sweeps, write its file. The layout is described in ``docs/datasets.md``.
+
+The bytes of a shard depend on what was asked for alone: no time, no machine and no version of a library is in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import DataError, UsageError
+from brainbench.files import atomic_path, content_hash, to_json
+from brainbench.stimuli.generation.engine import simulate_sweeps
+from brainbench.stimuli.objects import Solid
+from brainbench.stimuli.sweep_grid import Sweep, default_array
+from brainbench.stimuli.sweeps import SweepScenes
+from brainbench.types import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.generation.engine import SweepBatch
+    from brainbench.stimuli.generation.plan import ShardTask
+
+OK, UNSTABLE, UNUSABLE = 0, 1, 2
+"""Values of ``status``: fine; the simulation failed; the object could not be built."""
+
+ALIGNMENT = 4096
+"""The forces begin at a multiple of this, so that pages of memory and of the file coincide."""
+
+_CONDITIONS = tuple(item.name for item in fields(Sweep))
+
+
+@dataclass(frozen=True, eq=False)
+class ShardContent:
+    """What a shard's file will hold."""
+
+    task: ShardTask
+    arrays: Mapping[str, NDArray[Any]]
+    """By name, in the order of the file; ``wrench`` is last."""
+    attributes: Mapping[str, Any]
+
+
+def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
+    """Build, simulate and write one shard with ``workers`` threads; return the number of its sweeps."""
+    return write_shard(simulate_shard(task, build_solids(task), workers), folder)
+
+
+def build_solids(task: ShardTask) -> tuple[Solid | str, ...]:
+    """Build the objects of a shard; in place of an object that cannot be used stands why."""
+    found: list[Solid | str] = []
+    for item in task.objects:
+        try:
+            found.append(item.load())
+        except DataError as error:
+            found.append(str(error) or type(error).__name__)
+    return tuple(found)
+
+
+def simulate_shard(task: ShardTask, solids: tuple[Solid | str, ...], workers: int | None = None) -> ShardContent:
+    """Simulate the sweeps of a shard past its solids."""
+    usable = [index for index, solid in enumerate(solids) if isinstance(solid, Solid)]
+    count, frames = task.grid.count, task.grid.frames
+    chosen = np.flatnonzero(np.isin(task.owner, usable))
+    whiskers = len(task.config["whiskers"]["names"])
+    wrench = np.full((len(task), frames.count, whiskers, 6), np.nan, dtype=np.float32)
+    contact = np.zeros((len(task), whiskers), dtype=np.float32)
+    status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
+    reasons = [str(solids[owner]) if owner not in usable else "" for owner in task.owner.tolist()]
+    steps = steps_in_full = 0
+    if len(chosen):
+        place = {owner: index for index, owner in enumerate(usable)}
+        named = {task.objects[owner].name: solid for owner in usable if isinstance(solid := solids[owner], Solid)}
+        scenes = SweepScenes(task.grid, named, whiskers=task.whiskers)
+        indices = [place[task.owner[i]] * count + int(task.within[i]) for i in chosen.tolist()]
+        settings = task.settings
+        batch = simulate_sweeps(
+            scenes,
+            indices,
+            fidelity=settings.fidelity,
+            backend=settings.backend,
+            device=settings.device,
+            workers=workers,
+        )
+        # The usual shard has no unusable object: its forces, hundreds of megabytes, need no copy.
+        wrench = _take(batch, wrench, chosen)
+        contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)
+        for index, reason in zip(chosen.tolist(), batch.reasons, strict=True):
+            reasons[index] = reason
+        steps, steps_in_full = batch.steps, batch.steps_in_full
+    arrays = {
+        **_tables(task, solids),
+        **_conditions(task),
+        "contact": contact,
+        "status": status,
+        "reason": _texts(reasons),
+        "wrench": wrench,
+    }
+    work = {
+        "steps": steps,
+        "steps_in_full": steps_in_full,
+        "unstable": int((status == UNSTABLE).any(axis=1).sum()),
+        "unusable": int((status == UNUSABLE).any(axis=1).sum()),
+    }
+    attributes = {
+        "format": SWEEPS_FORMAT,
+        "schema": SWEEPS_SCHEMA,
+        "split": task.split,
+        "axes": frames.axes,
+        "config": to_json(task.config, indent=None),
+        "config_hash": task.config_hash,
+        **work,
+    }
+    return ShardContent(task, arrays, attributes)
+
+
+def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
+    """Write the file of a shard so that it is there as a whole or not at all; return the number of its sweeps."""
+    import h5py
+
+    arrays, wrench = content.arrays, content.arrays["wrench"]
+    digest = hash_arrays(arrays)
+    with atomic_path(Path(folder) / content.task.name) as temporary:
+        with h5py.File(temporary, "w", alignment_threshold=ALIGNMENT, alignment_interval=ALIGNMENT) as file:
+            file.attrs.update({**content.attributes, "content_hash": digest})
+            for name, array in arrays.items():
+                if name != "wrench":
+                    file.create_dataset(name, data=array.astype(_stored(array)), track_times=False)
+            offset = _allocate(file, wrench.shape)
+            _name_axes(file)
+        # Past the library, which copies and lets no other thread write meanwhile.
+        with temporary.open("r+b", buffering=0) as stream:
+            stream.seek(offset)
+            _write_all(stream, wrench)
+    return len(content.task)
+
+
+def hash_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Hash arrays by name, type, shape and bytes (BLAKE2b, 128 bits, hexadecimal)."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, array in arrays.items():
+        digest.update(f"{name}:{array.dtype.str}:{array.shape}:".encode())
+        digest.update(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data)
+    return digest.hexdigest()
+
+
+def _take(batch: SweepBatch, empty: NDArray[np.float32], chosen: NDArray[np.intp]) -> NDArray[np.float32]:
+    if batch.wrench.shape[1:] != empty.shape[1:]:
+        raise UsageError(f"The engine gave wrenches {batch.wrench.shape[1:]} per sweep; expected {empty.shape[1:]}.")
+    if len(chosen) == len(empty):
+        return np.ascontiguousarray(batch.wrench, dtype="<f4")
+    empty[chosen] = batch.wrench
+    return empty
+
+
+def _tables(task: ShardTask, solids: tuple[Solid | str, ...]) -> dict[str, NDArray[Any]]:
+    """Return the names behind the numbers: times, whiskers, channels, classes and objects."""
+    mounts = list(default_array(task.grid.species).select(task.whiskers))
+    hashes = [_hash_solid(solid) if isinstance(solid, Solid) else "" for solid in solids]
+    number = {label: index for index, label in enumerate(task.classes)}
+    return {
+        "time": task.grid.frames.times,
+        "whisker": _texts([mount.name for mount in mounts]),
+        "row": np.array([mount.row for mount in mounts], dtype=np.int16),
+        "col": np.array([mount.col for mount in mounts], dtype=np.int16),
+        "channel": _texts(CHANNELS),
+        "class": _texts(task.classes),
+        "object": _texts([item.name for item in task.objects]),
+        "object_class": np.array([number[item.label] for item in task.objects], dtype=np.int32),
+        "object_hash": _texts(hashes),
+    }
+
+
+def _hash_solid(solid: Solid) -> str:
+    """Hash what whiskers touch of a solid; what a decomposition was made from stands for it on every machine."""
+    if solid.origin is not None:
+        return content_hash(solid.origin, round(solid.diagonal, 12))
+    if solid.surface is not None:
+        return content_hash(solid.surface.vertices, solid.surface.faces)
+    return str(solid.config()["hash"])
+
+
+def _conditions(task: ShardTask) -> dict[str, NDArray[Any]]:
+    """Return, for each sweep, its number, class, object and conditions."""
+    sweeps: list[Sweep] = []
+    for owner, item in enumerate(task.objects):
+        every = task.grid.sweeps(item.name)
+        sweeps += [every[within] for within in task.within[task.owner == owner].tolist()]
+    number = {label: index for index, label in enumerate(task.classes)}
+    labels = np.array([number[item.label] for item in task.objects], dtype=np.int32)
+    kinds = {name: np.int32 if name == "draw" else np.float64 for name in _CONDITIONS}
+    return {
+        "sweep": task.index.astype(np.int64),
+        "label": labels[task.owner],
+        "owner": task.owner.astype(np.int32),
+        **{name: np.array([getattr(sweep, name) for sweep in sweeps], dtype=kinds[name]) for name in _CONDITIONS},
+    }
+
+
+def _texts(values: Any) -> NDArray[np.bytes_]:
+    """Texts as UTF-8 of a fixed length, which has the same bytes in every file."""
+    encoded = [str(value).encode() for value in values]
+    return np.array(encoded, dtype=f"S{max(1, *map(len, encoded))}")
+
+
+def _stored(array: NDArray[Any]) -> Any:
+    import h5py
+
+    if array.dtype.kind == "S":
+        return h5py.string_dtype("utf-8", array.dtype.itemsize)
+    return array.dtype.newbyteorder("<")
+
+
+def _allocate(file: Any, shape: tuple[int, ...]) -> int:
+    """Make room for the forces, contiguous and not yet written; return where in the file it is."""
+    import h5py
+
+    create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    create.set_layout(h5py.h5d.CONTIGUOUS)
+    create.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    create.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    create.set_obj_track_times(False)
+    kind = h5py.h5t.py_create(np.dtype("<f4"))
+    dataset = h5py.h5d.create(file.id, b"wrench", kind, h5py.h5s.create_simple(shape), create)
+    h5py.Dataset(dataset).attrs["units"] = "N (F), N m (M)"
+    return int(dataset.get_offset())
+
+
+def _name_axes(file: Any) -> None:
+    """Attach the tables as dimension scales, so that xarray opens the file with named axes."""
+    axes = {
+        "wrench": ("sweep", "time", "whisker", "channel"),
+        **dict.fromkeys(("contact", "status"), ("sweep", "whisker")),
+        **dict.fromkeys(("label", "owner", "reason", *_CONDITIONS), ("sweep",)),
+        **dict.fromkeys(("row", "col"), ("whisker",)),
+        **dict.fromkeys(("object_class", "object_hash"), ("object",)),
+    }
+    for scale in ("sweep", "time", "whisker", "channel", "class", "object"):
+        file[scale].make_scale(scale)
+    for name, scales in axes.items():
+        for axis, scale in enumerate(scales):
+            file[name].dims[axis].attach_scale(file[scale])
+
+
+def _write_all(stream: Any, array: NDArray[np.float32]) -> None:
+    """Write all bytes of an array; one call of the system writes at most 2 GiB."""
+    rest = memoryview(array.view(np.uint8).reshape(-1).data)
+    while rest:
+        rest = rest[stream.write(rest) :]

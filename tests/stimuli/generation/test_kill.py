@@ -1,0 +1,89 @@
+"""A run that is killed at any instant and started again leaves the bytes of a run that was not."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from brainbench.stimuli.generation.run import generate
+from tests.stimuli.generation.fakes import files_of, killed_plan
+
+ROOT = Path(__file__).parents[3]
+CODE = """
+import sys
+from brainbench.stimuli.generation.run import generate
+from tests.stimuli.generation.fakes import killed_plan
+
+if __name__ == "__main__":
+    print("ready", flush=True)
+    generate(killed_plan(), sys.argv[1], workers=int(sys.argv[2]))
+"""
+
+
+def _start(folder: Path, workers: int) -> subprocess.Popen:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-c", CODE, str(folder), str(workers)], cwd=ROOT, env=environment, stdout=subprocess.PIPE
+    )
+
+
+def _kill_after(process: subprocess.Popen, seconds: float) -> bool:
+    """Kill a process so long after it is ready; return whether it still ran."""
+    with process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(seconds)
+        running = process.poll() is None
+        process.send_signal(signal.SIGKILL)
+    return running
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("unbroken")
+    generate(killed_plan(), folder, workers=1)
+    return folder
+
+
+def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(unbroken, tmp_path):
+    folder = tmp_path / "set"
+    assert _kill_after(_start(folder, 1), 0.3)
+    assert not (folder / "manifest.json").exists()
+    generate(killed_plan(), folder, workers=1)
+    assert files_of(folder) == files_of(unbroken)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_run_killed_at_many_instants_ends_with_the_same_bytes(unbroken, tmp_path, workers):
+    draw = random.Random(workers)
+    folder = tmp_path / "set"
+    cut = 0
+    for _ in range(12):
+        # Often within a moment of starting and of a shard's end; between two kills at least a little is done.
+        if not _kill_after(_start(folder, workers), draw.uniform(*(0.0, 0.7) if workers == 1 else (1.5, 5.0))):
+            break
+        cut += 1
+    assert cut >= 3
+    process = _start(folder, workers)
+    process.communicate(timeout=120)
+    assert process.returncode == 0
+    assert files_of(folder) == files_of(unbroken)
+
+
+@pytest.mark.slow
+def test_no_process_of_the_pool_outlives_its_parent(tmp_path):
+    process = _start(tmp_path / "set", 2)
+    time.sleep(4)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    assert children
+    _kill_after(process, 0)
+    deadline = time.monotonic() + 10
+    while any(Path(f"/proc/{child}").exists() for child in children):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
