@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.files import to_plain
 
 app = typer.Typer(no_args_is_help=True, help="List and describe the registered models.")
 
@@ -15,35 +16,81 @@ app = typer.Typer(no_args_is_help=True, help="List and describe the registered m
 def list_(
     pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln*'.")] = "*", as_json: JsonOption = False
 ) -> None:
-    """List the registered models with their sizes."""
+    """List the registered models with their sizes and the objectives that were published for them."""
+    from fnmatch import fnmatchcase
+
+    from brainbench.models.checkpoints import shipped
+    from brainbench.models.recipes import list_recipes
     from brainbench.models.registry import describe_model, list_models
 
-    records = [describe_model(name) for name in list_models(pattern)]
-    rows = [[item.name, f"{item.parameters:,}", _millions(item.multiply_adds), item.family] for item in records]
-    columns = ["model", "parameters", "multiply-adds/step", "family"]
-    emit(records, table("", columns, rows, right=(1, 2)), as_json=as_json)
+    names = [*list_models(pattern), *(name for name in shipped() if fnmatchcase(name, pattern))]
+    records = [describe_model(name) for name in names]
+    tags = {item.name: [recipe.partition(".")[2] for recipe in list_recipes(f"{item.name}.*")] for item in records}
+    rows = [
+        [item.name, f"{item.parameters:,}", _millions(item.multiply_adds), item.family, ", ".join(tags[item.name])]
+        for item in records
+    ]
+    columns = ["model", "parameters", "multiply-adds/step", "family", "published with"]
+    data = [{**to_plain(item), "recipes": tags[item.name]} for item in records]
+    emit(data, table("", columns, rows, right=(1, 2)), as_json=as_json)
+
+
+@app.command("recipes")
+def recipes(
+    pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*.simclr'.")] = "*", as_json: JsonOption = False
+) -> None:
+    """List the published combinations of architecture and objective, with their training settings."""
+    from brainbench.models.recipes import find_recipe, list_recipes
+    from brainbench.models.registry import describe_model
+
+    found = [find_recipe(name) for name in list_recipes(pattern)]
+    sizes = {name: describe_model(name) for name in {item.architecture for item in found}}
+    rows = [
+        [
+            item.name,
+            f"{sizes[item.architecture].parameters:,}",
+            _millions(sizes[item.architecture].multiply_adds),
+            str(item.setting),
+            str(item.batch_size),
+            str(len(item.search)),
+        ]
+        for item in found
+    ]
+    columns = ["recipe", "parameters", "multiply-adds/step", "default setting", "batch", "settings in the search"]
+    data = [{"name": item.name, **to_plain(item)} for item in found]
+    emit(data, table("", columns, rows, right=(1, 2, 4, 5)), as_json=as_json)
 
 
 @app.command("show")
-def show(name: Annotated[str, typer.Argument(help="A registry name.")], as_json: JsonOption = False) -> None:
-    """Describe one model: size, layers, input and citation."""
-    from brainbench.files import to_plain
+def show(
+    name: Annotated[str, typer.Argument(help="A registry name, a recipe's name or a folder of trained weights.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Describe one model: size, layers, citation and, with an objective, how it is trained."""
+    from brainbench.models.recipes import find_recipe, list_recipes
     from brainbench.models.registry import describe_model
 
-    record = describe_model(name)
-    rows = [[key.replace("_", " "), _text(value)] for key, value in to_plain(record).items()]
-    emit(record, table("", ["", ""], rows), as_json=as_json)
+    published = name in list_recipes()
+    record = describe_model(name.partition("-warmup")[0] if published else name)
+    data = to_plain(record)
+    if published:
+        recipe = find_recipe(name)
+        data["recipe"] = to_plain(recipe)
+        if not as_json:
+            data["recipe"] |= {"setting": str(recipe.setting), "search": [f"({item})" for item in recipe.search]}
+    rows = [[key.replace("_", " "), _text(value)] for key, value in data.items() if value is not None]
+    emit(data, table("", ["", ""], rows), as_json=as_json)
 
 
 def _millions(value: int | None) -> str:
-    return "–" if value is None else f"{value / 1e6:,.0f} M"
+    return "–" if value is None else f"{value / 1e6:,.1f} M"
 
 
 def _text(value: object) -> str:
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
     if isinstance(value, list):
-        return ", ".join(map(str, value))
+        return ", ".join(map(_text, value))
     if isinstance(value, dict):
-        return "; ".join(f"{key}: {_text(item)}" for key, item in value.items())
+        return "; ".join(f"{key.replace('_', ' ')} {_text(item)}" for key, item in value.items())
     return str(value)

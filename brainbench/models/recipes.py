@@ -1,0 +1,151 @@
+"""The published training recipes: which architecture is trained with which objective, and how.
+
+Tables 3.2 to 3.5 of the reference thesis (chapter 3): 20 supervised and 12 × 3 self-supervised combinations
+of encoder, attender and objective, and SimSiam again with a warmed-up schedule: 68 recipes. The thesis names
+search spaces, not winners: ``search`` is the published grid and ``setting`` the point of it that
+``brainbench train`` starts from. Importing this module imports no framework.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import cache
+from itertools import product
+
+from brainbench.errors import unknown_name
+
+SOURCE = "thesis, tables 3.2-3.5"
+EPOCHS = 100
+BATCH_SIZE = 256
+SIMSIAM_BATCH_SIZE = 1024
+_RATES = (1e-1, 1e-2, 1e-3, 1e-4)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point of a search space."""
+
+    optimizer: str
+    """A name of :data:`brainbench.models.optimizers.OPTIMIZERS`."""
+    schedule: str
+    """A name of :data:`brainbench.models.optimizers.SCHEDULES`."""
+    learning_rate: float
+    """Initial (highest) learning rate."""
+    warmup_epochs: int = 0
+    """Epochs over which a cosine schedule rises to it, from 1e-4 of it."""
+
+    def __str__(self) -> str:
+        warm = f", {self.warmup_epochs} epochs of warm-up" if self.warmup_epochs else ""
+        return f"{self.optimizer}, {self.schedule}{warm}, learning rate {self.learning_rate:g}"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one architecture is trained with one objective."""
+
+    architecture: str
+    """Registry name."""
+    objective: str
+    """``supervised``, ``simclr``, ``simsiam`` or ``ae``."""
+    setting: Setting
+    search: tuple[Setting, ...]
+    variant: str = ""
+    """``warmup`` for SimSiam with a warmed-up schedule."""
+    decoder: str = "linear"
+    """Decoder of the supervised objective; self-supervised networks are read by a linear probe."""
+    batch_size: int = BATCH_SIZE
+    epochs: int = EPOCHS
+    source: str = SOURCE
+
+    @property
+    def name(self) -> str:
+        """``architecture.objective[-variant]``."""
+        return f"{self.architecture}.{self.objective}" + (f"-{self.variant}" if self.variant else "")
+
+
+PROBE = Setting("sgd", "step", 0.1)
+"""The linear probe on a frozen network: 100 epochs, batch 256."""
+
+
+def list_recipes(pattern: str = "*") -> list[str]:
+    """Return the names of the recipes that match a shell pattern, such as ``*.simclr``."""
+    return [name for name in _recipes() if fnmatchcase(name, pattern)]
+
+
+def find_recipe(name: str) -> Recipe:
+    """Return the recipe ``architecture.objective[-warmup]``.
+
+    Raises:
+        UsageError: nobody published one of this name; the message names the nearest.
+    """
+    if name not in _recipes():
+        raise unknown_name("recipe", name, _recipes(), hint="See them all with: brainbench models recipes")
+    return _recipes()[name]
+
+
+def recipe_for(architecture: str, objective: str) -> Recipe:
+    """Return the published recipe, or for an architecture without one that of its nearest published relative.
+
+    A ``-small`` model is trained like the full one. Other architectures follow the row of their attender.
+
+    Raises:
+        UsageError: there is no such objective.
+    """
+    known = _recipes()
+    full = architecture.replace("-small", "")
+    if (name := f"{full}.{objective}") in known:
+        return replace(known[name], architecture=architecture)
+    objectives = tuple(dict.fromkeys(recipe.objective for recipe in known.values()))
+    if objective not in objectives:
+        raise unknown_name("objective", objective, objectives)
+    attender = full.partition("+")[2]
+    relative = f"zhuang{'+' + attender if attender in ('gpt', 'mamba') else ''}.{objective}"
+    if "-ln" in full and not attender and objective == "supervised":
+        relative = "zhuang-intersection-ln.supervised"
+    return replace(known[relative], architecture=architecture, source=f"as {relative} of {SOURCE}")
+
+
+@cache
+def _recipes() -> dict[str, Recipe]:
+    return {recipe.name: recipe for recipe in (*_supervised(), *_self_supervised())}
+
+
+def _grid(optimizers: tuple[str, ...], schedule: str, rates: tuple[float, ...], warmup: int = 0) -> tuple[Setting, ...]:
+    return tuple(Setting(optimizer, schedule, rate, warmup) for optimizer, rate in product(optimizers, rates))
+
+
+def _supervised() -> Iterator[Recipe]:
+    """Table 3.3, row by row."""
+    sgd = Setting("sgd", "step", 1e-2)
+    yield Recipe("resnet18", "supervised", sgd, _grid(("sgd",), "step", _RATES[:3]), decoder="all-steps")
+    search = (*_grid(("sgd",), "step", _RATES), *_grid(("sgd",), "constant", (1e-2, 5e-3)))
+    yield Recipe("zhuang", "supervised", sgd, search)
+    adamw = Setting("adamw", "step", 1e-3)
+    for cell in ("ugrnn", "intersection", "gru", "lstm"):
+        search = _grid(("sgd", "adam", "adamw"), "step", _RATES)
+        yield Recipe(f"zhuang-{cell}", "supervised", adamw, search)
+        yield Recipe(f"zhuang-{cell}-ln", "supervised", adamw, _grid(("adamw",), "step", _RATES))
+    cosine = Setting("adamw", "cosine", 1e-4, 10)
+    search = (cosine, *_grid(("sgd", "adamw"), "step", _RATES[:3]))
+    encoders = ("resnet18", "zhuang", "zhuang-ugrnn", "zhuang-intersection-ln", "zhuang-gru", "zhuang-lstm", "s4")
+    for encoder in encoders:
+        yield Recipe(f"{encoder}+gpt", "supervised", cosine, search)
+    for encoder in ("resnet18", "zhuang", "s4"):
+        yield Recipe(f"{encoder}+mamba", "supervised", cosine, search)
+
+
+def _self_supervised() -> Iterator[Recipe]:
+    """Table 3.4 for every architecture of table 3.5."""
+    names = ["zhuang", "zhuang-ugrnn", "zhuang-intersection-ln", "zhuang-gru", "zhuang-lstm"]
+    names += [f"{encoder}+gpt" for encoder in ("resnet18", "zhuang-intersection-ln", "zhuang", "s4")]
+    names += [f"{encoder}+mamba" for encoder in ("resnet18", "zhuang", "s4")]
+    for name in names:
+        warm = _grid(("lars",), "cosine", _RATES, 10)
+        yield Recipe(name, "simclr", warm[0], warm)
+        for variant, warmup in (("", 0), ("warmup", 10)):
+            search = _grid(("sgd",), "cosine", _RATES, warmup)
+            yield Recipe(name, "simsiam", search[1], search, variant, batch_size=SIMSIAM_BATCH_SIZE)
+        search = _grid(("sgd",), "step", _RATES)
+        yield Recipe(name, "ae", search[1], search)

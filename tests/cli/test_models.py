@@ -1,0 +1,35 @@
+import json
+
+
+def test_models_are_listed_with_size_cost_and_published_objectives(run):
+    listed = run("models", "list", "resnet18*")
+    assert listed.status == 0
+    assert "18,086,517" in listed.out
+    records = json.loads(run("models", "list", "s4*", "--json").out)
+    assert {item["name"]: item["recipes"] for item in records}["s4+gpt"] == [
+        "supervised",
+        "simclr",
+        "simsiam",
+        "simsiam-warmup",
+        "ae",
+    ]
+
+
+def test_recipes_are_listed_with_their_settings(run):
+    listed = run("models", "recipes", "zhuang-gru.*")
+    assert listed.status == 0
+    assert "lars, cosine, 10 epochs of warm-up, learning rate 0.1" in listed.out
+    assert len(json.loads(run("models", "recipes", "--json").out)) == 68
+
+
+def test_a_recipe_is_shown_with_its_architecture(run):
+    shown = json.loads(run("models", "show", "zhuang-ugrnn.simsiam-warmup", "--json").out)
+    assert shown["parameters"] == 30_688_416 + 60_021
+    assert shown["recipe"]["batch_size"] == 1024
+    assert "NeurIPS" in run("models", "show", "zhuang.ae").out
+
+
+def test_an_unknown_model_is_answered_in_one_line(run):
+    outcome = run("models", "show", "resnet81")
+    assert outcome.status == 2
+    assert "did you mean 'resnet18'" in outcome.err
