@@ -46,8 +46,10 @@ class BrainSide:
         names = ("content_hash", "window", "selection", "removed", "synthetic")
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}}
 
-    def animals(self, kept: tuple[str, ...], *, time: str = "mean", seed: int = 0) -> tuple[SubjectRDM, ...]:
-        """Every animal's RDM and its split halves over the labels ``kept``, in that order."""
+    def animals(
+        self, kept: tuple[str, ...], *, time: str = "mean", seed: int = 0, draws: int = 0
+    ) -> tuple[SubjectRDM, ...]:
+        """Every animal's RDM, its split halves and bootstrap draws over the labels ``kept``, in that order."""
         from brainbench.datasets import blocks
         from brainbench.metrics import TrialBlock, subject_rdm
 
@@ -62,7 +64,9 @@ class BrainSide:
                 trials.append(
                     TrialBlock(features, index[labels][rows], [key for key, row in zip(keys, rows, strict=True) if row])
                 )
-            animals.append(subject_rdm(subject, trials, len(kept), stimuli=kept, method=RDM_METHOD, seed=seed))
+            animals.append(
+                subject_rdm(subject, trials, len(kept), stimuli=kept, method=RDM_METHOD, seed=seed, draws=draws)
+            )
         return tuple(animals)
 
 

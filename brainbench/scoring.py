@@ -128,7 +128,7 @@ def score_record(
     pairs = join_labels(brain.vocabulary, network.labels, match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
-    animals = brain.animals(kept, time=time, seed=seed)
+    animals = brain.animals(kept, time=time, seed=seed, draws=metrics.DRAWS)
 
     def against_brain(name: str, rdms: Mapping[str, Any]) -> Score:
         return metrics.score_rdms(
@@ -157,11 +157,17 @@ def score_record(
         },
         seconds=round(clock.perf_counter() - started, 2),
     )
-    first, *others = (dataclasses.replace(item, provenance=origin) for item in scores)
+    first, *others = (_with_origin(item, origin) for item in scores)
     return ResultRecord(
         score=first,
-        animal_to_animal=between and dataclasses.replace(between, provenance=origin),
+        animal_to_animal=between and _with_origin(between, origin),
         baselines={item.name: item for item in others},
         card=network.card,
         synthetic=brain.synthetic,
     )
+
+
+def _with_origin(item: Score, origin: Mapping[str, Any]) -> Score:
+    """Add where a score comes from to what its statistics say."""
+    statistics = item.provenance.get("statistics")
+    return dataclasses.replace(item, provenance={**origin, **({"statistics": statistics} if statistics else {})})

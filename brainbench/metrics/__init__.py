@@ -2,34 +2,49 @@
 
 The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`split_half` reliability and
 :func:`noise_corrected`; :func:`noise_ceiling`; :func:`permutation_test`; :func:`subject_rdm`,
-:func:`score_rdms` and :func:`score_animals`, which join them.
+:func:`score_rdms` and :func:`score_animals`, which join them. Beyond one score: :func:`bootstrap_score`,
+:func:`compare_models`, :func:`layer_tests`, :func:`turing_test`.
 """
 
 from __future__ import annotations
 
 from brainbench.metrics.animal_to_animal import score_animals
+from brainbench.metrics.bootstrap import DRAWS, Bootstrap, bootstrap_ceiling, bootstrap_score
 from brainbench.metrics.ceiling import NoiseCeiling, noise_ceiling
 from brainbench.metrics.compare import COMPARISONS, compare
+from brainbench.metrics.equivalence import EquivalenceTest, equivalence_test, turing_test
 from brainbench.metrics.inference import PermutationTest, permutation_test
+from brainbench.metrics.multiple import LayerTest, ModelComparison, compare_models, layer_tests
 from brainbench.metrics.noise import ESTIMATORS, RELIABILITY_GATE, Corrected, noise_corrected, spearman_brown
 from brainbench.metrics.precision import noise_precision
 from brainbench.metrics.rdm import RDM_METHODS, rdm, rdm_problem
-from brainbench.metrics.reliability import SplitHalf, TrialBlock, split_half
+from brainbench.metrics.reliability import SUBJECT_METHODS, SplitHalf, TrialBlock, split_half
 from brainbench.metrics.score import score_rdms
 from brainbench.metrics.subject import SubjectRDM, subject_rdm
 
 __all__ = [
     "COMPARISONS",
+    "DRAWS",
     "ESTIMATORS",
     "RDM_METHODS",
     "RELIABILITY_GATE",
+    "SUBJECT_METHODS",
+    "Bootstrap",
     "Corrected",
+    "EquivalenceTest",
+    "LayerTest",
+    "ModelComparison",
     "NoiseCeiling",
     "PermutationTest",
     "SplitHalf",
     "SubjectRDM",
     "TrialBlock",
+    "bootstrap_ceiling",
+    "bootstrap_score",
     "compare",
+    "compare_models",
+    "equivalence_test",
+    "layer_tests",
     "noise_ceiling",
     "noise_corrected",
     "noise_precision",
@@ -41,4 +56,5 @@ __all__ = [
     "spearman_brown",
     "split_half",
     "subject_rdm",
+    "turing_test",
 ]

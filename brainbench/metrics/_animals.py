@@ -11,12 +11,10 @@ import numpy as np
 from brainbench.errors import UsageError
 from brainbench.metrics._pairs import Floats, stimulus_count
 from brainbench.metrics.ceiling import noise_ceiling
+from brainbench.metrics.intervals import VERIFIED_ANIMALS, t_interval
 from brainbench.metrics.noise import Corrected, noise_corrected
 from brainbench.metrics.subject import SubjectRDM, is_flat
 from brainbench.types import Ceiling, Interval, Status
-
-VERIFIED_ANIMALS = 5
-"""Coverage of the t interval was measured from this many animals up."""
 
 
 @dataclass(frozen=True)
@@ -98,26 +96,12 @@ def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
     return float(values.mean()), t_interval(values)
 
 
-def t_interval(values: Floats) -> Interval | None:
-    """Return the 95 % t interval of the mean over animals; None for fewer than two."""
-    # scipy.stats has the same quantile, but takes most of a second to import.
-    from scipy.special import stdtrit
-
-    if len(values) < 2 or not np.isfinite(values).all():
-        return None
-    half = float(stdtrit(len(values) - 1, 0.975) * values.std(ddof=1) / math.sqrt(len(values)))
-    caution = "" if len(values) >= VERIFIED_ANIMALS else f"; coverage not verified below {VERIFIED_ANIMALS} animals"
-    return Interval(
-        float(values.mean()) - half, float(values.mean()) + half, 0.95, f"t over {len(values)} animals{caution}"
-    )
-
-
 def interval_reasons(count: int) -> tuple[str, ...]:
     """Say what the number of animals means for the interval."""
     if count == 1:
         return ("one animal: no confidence interval, since nothing is known about other animals",)
     if count < VERIFIED_ANIMALS:
-        return (f"interval from {count} animals: coverage not verified below {VERIFIED_ANIMALS}",)
+        return (f"interval from {count} animals is unreliable: coverage not verified below {VERIFIED_ANIMALS}",)
     return ()
 
 

@@ -14,7 +14,7 @@ from brainbench.metrics._distances import (
     products_from_gram,
 )
 from brainbench.metrics._hashing import Hashes, draws
-from brainbench.metrics._pairs import Floats, Ints
+from brainbench.metrics._pairs import Floats, Ints, upper
 from brainbench.metrics.rdm import poisson_rates
 
 _CHUNK_BYTES = 1 << 24
@@ -36,11 +36,15 @@ class Session:
     """[R]"""
     complete: bool = field(init=False)
 
+    identity: int = field(init=False)
+    """A number that depends on the trials, not on their order."""
+
     def __post_init__(self) -> None:
-        order = np.argsort(self.codes, kind="stable")
+        order = np.lexsort((self.hashes, self.codes))
         for name in ("responses", "codes", "hashes"):
             object.__setattr__(self, name, getattr(self, name)[order])
         object.__setattr__(self, "complete", bool(np.isfinite(self.responses).all()))
+        object.__setattr__(self, "identity", int(self.hashes.sum(dtype=np.uint64)))
 
     def group(self, stimulus: int) -> slice:
         """Return the rows of a stimulus."""
@@ -50,7 +54,22 @@ class Session:
 
 def distances(patterns: Floats, method: str) -> Floats:
     """Return RDMs [..., P] of patterns [..., K, F] that may lack entries (NaN)."""
-    return SUBJECT_METHODS[method](patterns)
+    return _DISTANCES[method](patterns)
+
+
+def unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
+    """Return squared distances per unit [..., P] less what the noise of the patterns [..., K, F] adds to them.
+
+    With ``variances`` [..., K, F] of the patterns (sample variance over trials / trials) this is the
+    crossnobis distance with every trial as its own fold; units without either value are left out of a pair.
+    """
+    present = np.isfinite(patterns) & np.isfinite(variances)
+    weight = present.astype(np.float64)
+    own = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)
+    both = weight @ np.swapaxes(weight, -1, -2)
+    seen = np.where(present, patterns, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return product_distances(seen, seen, missing=True) - upper((own + np.swapaxes(own, -1, -2)) / both)
 
 
 def half_rdms(sessions: list[Session], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
@@ -68,13 +87,57 @@ def half_rdms(sessions: list[Session], count: int, method: str, index: Ints, see
     parts = []
     for start in range(0, len(index), step):
         chosen = index[start : start + step]
-        members = [_session_members(session, count, chosen, seed) for session in sessions]
+        members = [split_members(session, count, chosen, seed) for session in sessions]
         pair = _from_products(sessions, products, members, count, method) if by_products else None
         if pair is None:
-            first, second = _half_means(sessions, members, count)
-            pair = distances(first, method), distances(second, method)
+            pair = (
+                pattern_rdms(sessions, members, count, method),
+                pattern_rdms(sessions, [1.0 - member for member in members], count, method),
+            )
         parts.append(pair)
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def pattern_rdms(
+    sessions: list[Session], weights: list[Floats], count: int, method: str, copies: Ints | None = None
+) -> Floats:
+    """Return the RDMs [N, P] of patterns averaged with one weight per trial [N, R] of each session.
+
+    ``copies`` [J] counts the units of each session so many times; once by default.
+    """
+    unbiased = method == "crossnobis"
+    found = [weighted_patterns(s, w, count, variances=unbiased) for s, w in zip(sessions, weights, strict=True)]
+    if copies is not None:
+        found = [found[index] for index in np.repeat(np.arange(len(found)), copies)]
+    patterns = np.concatenate([item[0] for item in found], axis=-1)
+    if not unbiased:
+        return distances(patterns, method)
+    return unbiased_distances(patterns, np.concatenate([item[1] for item in found], axis=-1))
+
+
+def weighted_patterns(session: Session, weights: Floats, count: int, *, variances: bool) -> tuple[Floats, Floats]:
+    """Return mean patterns [N, K, F] over trials weighted by [N, R], and their variances (empty unless asked for).
+
+    A unit without a weighted trial of a stimulus is NaN there; a variance needs two.
+    """
+    shape = (len(weights), count, session.responses.shape[1])
+    means, spread = np.empty(shape), np.empty(shape if variances else (0, *shape[1:]))
+    filled = session.responses if session.complete else np.nan_to_num(session.responses)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for stimulus in range(count):
+            rows = session.group(stimulus)
+            weight = weights[:, rows]
+            # A unit unseen in these trials is missing here, not silent.
+            seen = np.ones((weight.shape[1], 1)) if session.complete else np.isfinite(session.responses[rows]) * 1.0
+            number = weight @ seen
+            number[number == 0] = np.nan
+            means[:, stimulus] = weight @ filled[rows] / number
+            if variances:
+                # Repeats of one trial tell nothing of its noise: only products of different trials count.
+                squares, pairs = weight**2 @ filled[rows] ** 2, number**2 - weight**2 @ seen
+                free = ((weight @ filled[rows]) ** 2 - squares) / np.where(pairs > 0, pairs, np.nan)
+                spread[:, stimulus] = means[:, stimulus] ** 2 - free
+    return means, spread
 
 
 def members(random: Hashes) -> Floats:
@@ -89,31 +152,10 @@ def members(random: Hashes) -> Floats:
     return member
 
 
-def _session_members(session: Session, count: int, index: Ints, seed: int) -> Floats:
-    """Return 1 for the trials [S, R] in the first half of their stimulus."""
+def split_members(session: Session, count: int, index: Ints, seed: int) -> Floats:
+    """Return 1 for the trials [S, R] in the first half of their stimulus, in the splits ``index`` [S]."""
     random = draws(session.hashes, index, seed)
     return np.concatenate([members(random[:, session.group(stimulus)]) for stimulus in range(count)], axis=1)
-
-
-def _half_means(sessions: list[Session], chosen: list[Floats], count: int) -> tuple[Floats, Floats]:
-    """Return the mean patterns [S, K, F] of both halves."""
-    units = sum(session.responses.shape[1] for session in sessions)
-    first, second = (np.empty((len(chosen[0]), count, units)) for _ in range(2))
-    offset = 0
-    for session, member in zip(sessions, chosen, strict=True):
-        columns = slice(offset, offset + session.responses.shape[1])
-        offset = columns.stop
-        filled = session.responses if session.complete else np.nan_to_num(session.responses)
-        for stimulus in range(count):
-            rows = session.group(stimulus)
-            for target, weight in ((first, member[:, rows]), (second, 1.0 - member[:, rows])):
-                number = weight.sum(axis=1, keepdims=True)
-                if not session.complete:
-                    number = weight @ np.isfinite(session.responses[rows]).astype(np.float64)
-                    # A unit unseen in this half is missing here, not silent.
-                    number[number == 0] = np.nan
-                target[:, stimulus, columns] = weight @ filled[rows] / number
-    return first, second
 
 
 def _from_products(
@@ -131,10 +173,16 @@ def _from_products(
             # A half's mean pattern is its trials weighted by these shares.
             share = weight / number[:, session.codes]
             sums[half] += (share * session.responses.sum(axis=1)) @ group
+            gram = np.empty((splits, count, count))
             for stimulus in range(count):
                 rows = session.group(stimulus)
-                grams[half][:, stimulus] += ((share[:, rows] @ product[rows]) * share) @ group
-    if method == "sqeuclidean":
+                gram[:, stimulus] = ((share[:, rows] @ product[rows]) * share) @ group
+            if method == "crossnobis":
+                # The product of a trial with itself holds its noise; those of different trials do not.
+                diagonal = np.einsum("sii->si", gram)
+                diagonal[...] = (number**2 * diagonal - (weight * np.diag(product)) @ group) / (number * (number - 1))
+            grams[half] += gram
+    if method in ("sqeuclidean", "crossnobis"):
         return products_from_gram(grams[0], units), products_from_gram(grams[1], units)
     # Correlation takes each pattern's mean over all units, which spans the sessions.
     common = sums[..., :, None] * sums[..., None, :] / units
@@ -158,7 +206,7 @@ def _poisson(patterns: Floats) -> Floats:
     return product_distances(rates, np.log(rates), missing=True)
 
 
-SUBJECT_METHODS: dict[str, Callable[[Floats], Floats]] = {
+_DISTANCES: dict[str, Callable[[Floats], Floats]] = {
     "correlation": _correlation,
     "sqeuclidean": _sqeuclidean,
     "poisson": _poisson,

@@ -10,6 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.errors import DataError, UsageError, listing
 from brainbench.metrics._pairs import Floats, Ints
 
+_SLICE_ELEMENTS = 1 << 20
+
+_OFFSET = 1e3
+"""Where means are this many times their spread over stimuli, sums are taken about a value within the data."""
+
 
 def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, tuple[str, ...]]:
     """Return integer codes [R] and the names of all stimuli.
@@ -69,20 +74,39 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     """
     if len(codes) != len(responses):
         raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+    numbers = np.bincount(codes, minlength=count)[:, None].astype(np.float64)
+    if (means := _complete_means(responses, codes, numbers)) is not None:
+        return means
+    check_finite(responses)
     member = np.zeros((count, len(codes)))
     member[codes, np.arange(len(codes))] = 1.0
-    numbers = np.bincount(codes, minlength=count)[:, None].astype(np.float64)
-    if np.isfinite(responses).all():
-        # Sums about a value from within the data keep the digits that a large offset would cost.
-        shift = float(responses.flat[0]) if responses.size else 0.0
-        totals = member @ (responses.astype(np.float64, copy=False) - shift)
-    else:
-        check_finite(responses)
-        present = ~np.isnan(responses)
-        shift = float(responses[present][0]) if present.any() else 0.0
-        totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
-        numbers = member @ present.astype(np.float64)
+    present = ~np.isnan(responses)
+    shift = float(responses[present][0]) if present.any() else 0.0
+    totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
+    numbers = member @ present.astype(np.float64)
     return np.where(numbers > 0, totals / np.where(numbers > 0, numbers, 1.0), np.nan) + shift
+
+
+def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats | None:
+    """Average in slices of units, so that nothing large is copied; None if an entry is missing."""
+    from scipy.sparse import csr_array
+
+    rows = np.arange(len(codes))
+    member = csr_array((1.0 / numbers[codes, 0], (codes, rows)), shape=(len(numbers), len(codes)))
+    means = np.empty((len(numbers), responses.shape[1]))
+    step = max(16, _SLICE_ELEMENTS // max(1, len(responses)))
+    for start in range(0, responses.shape[1], step):
+        columns = slice(start, start + step)
+        part = np.ascontiguousarray(responses[:, columns], dtype=np.float64)
+        found = member @ part
+        if not np.isfinite(found).all():
+            return None
+        if len(part) and (np.abs(found).max(axis=0) > _OFFSET * np.ptp(found, axis=0)).any():
+            # Sums about a value from within the data keep the digits that a large offset would cost.
+            found = member @ (part - part[0]) + part[0]
+        means[:, columns] = found
+    means[numbers[:, 0] == 0] = np.nan
+    return means
 
 
 def check_finite(responses: NDArray) -> None:

@@ -7,6 +7,7 @@ Pair p of K stimuli is the p-th entry of the upper triangle read row by row:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,7 +59,7 @@ def permuted_pairs(orders: Ints) -> Ints:
     return table[orders[..., rows], orders[..., cols]]
 
 
-def rdm_stack(rdms: ArrayLike, what: str) -> Floats:
+def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
     """Return float64 RDM vectors [..., P], checked.
 
     Raises:

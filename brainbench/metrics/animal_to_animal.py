@@ -16,12 +16,12 @@ from brainbench.metrics._animals import (
     interval_reasons,
     mean_rdm,
     mean_reliability,
-    t_interval,
 )
 from brainbench.metrics._pairs import Floats, permuted_pairs, stimulus_count
 from brainbench.metrics.compare import check_comparison
 from brainbench.metrics.compare import compare as compare_rdms
 from brainbench.metrics.inference import RANDOM_PERMUTATIONS, SMALLEST_STIMULI, TIE, canonical_order
+from brainbench.metrics.intervals import t_interval
 from brainbench.metrics.noise import RELIABILITY_GATE, Corrected, noise_corrected
 from brainbench.metrics.score import metric_name
 from brainbench.metrics.subject import SubjectRDM

@@ -56,6 +56,11 @@ class PermutationTest:
         return "undefined" if math.isnan(self.p) else "ok"
 
     @property
+    def monte_carlo_error(self) -> float:
+        """Standard error of p from the number of random orders; 0 when all orders were taken."""
+        return 0.0 if self.exact else math.sqrt(self.p * (1 - self.p) / self.count)
+
+    @property
     def method(self) -> str:
         """The test in words."""
         how = f"all {self.count:,} orders" if self.exact else f"{self.count - 1:,} random orders, (b+1)/(n+1)"
@@ -118,18 +123,7 @@ def permuted_statistic(
         reason = "an RDM has missing pairs, so its stimuli cannot be permuted"
     if reason:
         return PermutationTest(math.nan, smallest, exact, count, math.nan, np.empty(0), reason)
-    layers, brain = _canonical(layers, brain)
-    step = max(1, _CHUNK_ELEMENTS // layers.size)
-    null = np.concatenate(
-        [
-            statistic(
-                compare_all(
-                    layers[:, permuted_pairs(orders)].swapaxes(0, 1).reshape(-1, layers.shape[-1]), brain, method=method
-                ).reshape(len(orders), len(layers), len(brain))
-            )
-            for orders in label_orders(stimuli, step, seed)
-        ]
-    )
+    null = permuted_values(layers, brain, statistic, method=method, seed=seed)
     if not np.isfinite(null[0]):
         return PermutationTest(
             math.nan, smallest, exact, count, math.nan, null, "the comparison is undefined (a constant RDM)"
@@ -137,6 +131,23 @@ def permuted_statistic(
     # The given order comes first, so the observed statistic went through the same arithmetic.
     p = float(np.mean(null >= null[0] - TIE * max(1.0, abs(null[0]))))
     return PermutationTest(p, smallest, exact, count, float(null[0]), null)
+
+
+def permuted_values(
+    layers: Floats, brain: Floats, statistic: Callable[[Floats], Floats], *, method: str = "pearson", seed: int = 0
+) -> Floats:
+    """Return a statistic [N, ...] of comparisons [N, L, A] under every order of the stimuli, the given one first.
+
+    Orders depend on the brain's RDMs and the seed alone, so entry n of two models is the same relabelling.
+    """
+    layers, brain = _canonical(layers, brain)
+    step = max(1, _CHUNK_ELEMENTS // layers.size)
+    parts = []
+    for orders in label_orders(stimulus_count(layers.shape[-1]), step, seed):
+        relabelled = layers[:, permuted_pairs(orders)].swapaxes(0, 1).reshape(-1, layers.shape[-1])
+        r = compare_all(relabelled, brain, method=method)
+        parts.append(statistic(r.reshape(len(orders), len(layers), len(brain))))
+    return np.concatenate(parts)
 
 
 def smallest_p(stimuli: int) -> float:

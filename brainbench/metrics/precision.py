@@ -108,3 +108,6 @@ _METHODS: dict[str, Callable[[Floats, int], Floats]] = {
     "diag": _diag,
     "full": _full,
 }
+
+NOISE_METHODS = tuple(_METHODS)
+"""Names that ``method`` of :func:`noise_precision` takes."""

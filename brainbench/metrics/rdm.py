@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.errors import DataError, UsageError, unknown_name
-from brainbench.metrics._distances import correlation_distances, product_distances
+from brainbench.metrics._distances import correlation_distances, product_distances, products_from_gram
 from brainbench.metrics._labels import listed, response_matrix, stimulus_codes, stimulus_means
 from brainbench.metrics._pairs import Floats, Ints
 
@@ -24,14 +24,27 @@ POISSON_PRIOR_WEIGHT = 0.1
 
 @dataclass(frozen=True)
 class _Trials:
-    """What a method may use: patterns [K, U], and for labelled trials the trials behind them."""
+    """What a method may use: responses of K stimuli as given, and for labelled trials their codes."""
 
-    patterns: NDArray
-    missing: bool
-    trials: NDArray | None
+    responses: NDArray
+    count: int
     codes: Ints | None
     folds: ArrayLike | None
     precision: ArrayLike | None
+
+    @property
+    def missing(self) -> bool:
+        """Whether NaN means not recorded; a NaN activation makes its pattern useless instead."""
+        return self.codes is not None
+
+    @property
+    def trials(self) -> NDArray | None:
+        """[R, U] labelled trials."""
+        return None if self.codes is None else self.responses
+
+    def patterns(self) -> NDArray:
+        """Return patterns [K, U]."""
+        return self.responses if self.codes is None else stimulus_means(self.responses, self.codes, self.count)
 
 
 def rdm(
@@ -58,7 +71,7 @@ def rdm(
             Kullback-Leibler divergence of Poisson rates (Schütt 2023).
         folds: Cross-validation fold of each trial [R]; needed by ``crossnobis`` only. Every fold weighs
             the same; fold pairs in which a stimulus is missing are left out of its pairs.
-        precision: Inverse noise covariance [U, U] between units, see :func:`noise_precision`.
+        precision: Inverse noise covariance [U, U] between units, symmetric, see :func:`noise_precision`.
 
     Returns:
         Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no
@@ -111,31 +124,35 @@ def _prepare(
     responses: ArrayLike, labels: ArrayLike | None, folds: ArrayLike | None, precision: ArrayLike | None
 ) -> _Trials:
     if labels is None:
-        patterns = response_matrix(responses, "stimuli")
-        trials = codes = None
+        matrix, codes = response_matrix(responses, "stimuli"), None
+        count = len(matrix)
     else:
-        trials = response_matrix(responses, "trials")
+        matrix = response_matrix(responses, "trials")
         codes, names = stimulus_codes(labels)
-        patterns = stimulus_means(trials, codes, len(names))
-    if len(patterns) < 2:
-        raise UsageError(f"An RDM compares at least 2 stimuli; received {len(patterns)}.")
-    return _Trials(patterns, labels is not None, trials, codes, folds, precision)
+        count = len(names)
+        if len(codes) != len(matrix):
+            raise UsageError(f"There are {len(matrix)} trials but {len(codes)} labels; give one label per trial.")
+    if count < 2:
+        raise UsageError(f"An RDM compares at least 2 stimuli; received {count}.")
+    return _Trials(matrix, count, codes, folds, precision)
 
 
 def _correlation(given: _Trials) -> Floats:
-    return correlation_distances(given.patterns, missing=given.missing)
+    return correlation_distances(given.patterns(), missing=given.missing)
 
 
 def _sqeuclidean(given: _Trials) -> Floats:
-    return product_distances(given.patterns, given.patterns, missing=given.missing)
+    patterns = given.patterns()
+    return product_distances(patterns, patterns, missing=given.missing)
 
 
 def _mahalanobis(given: _Trials) -> Floats:
     if given.precision is None:
         return _sqeuclidean(given)
-    weight = _precision_matrix(given.precision, given.patterns.shape[1])
+    patterns = given.patterns()
+    weight = _precision_matrix(given.precision, patterns.shape[1])
     # The shift per unit must go before the product mixes units.
-    centred = given.patterns - given.patterns.mean(axis=0, dtype=np.float64)
+    centred = patterns - patterns.mean(axis=0, dtype=np.float64)
     return product_distances(centred, centred @ weight)
 
 
@@ -150,19 +167,32 @@ def _crossnobis(given: _Trials) -> Floats:
     names = np.unique(folds)
     if len(names) < 2:
         raise UsageError(f"method='crossnobis' compares at least 2 folds; received {len(names)}.")
-    units = given.patterns.shape[1]
+    units, count = given.trials.shape[1], given.count
     weight = None if given.precision is None else _precision_matrix(given.precision, units)
-    count = len(given.patterns)
     # Fold and stimulus together number the cells, so one pass over the trials averages all of them.
     cells = np.searchsorted(names, folds) * count + given.codes
     means = stimulus_means(given.trials, cells, len(names) * count).reshape(len(names), count, units)
-    if np.isfinite(given.patterns).all():
-        means = means - given.patterns.mean(axis=0)
+    if not np.isfinite(means).all():
+        return _crossnobis_of_present(means, weight)
+    means -= means.mean(axis=(0, 1))
+    # Products of all folds with all, less those of each with itself, are those of all pairs of folds.
+    if len(names) == 2:
+        gram = (means[0] if weight is None else means[0] @ weight) @ means[1].T
+        return products_from_gram(gram, units)
+    flat = means.reshape(-1, units)
+    weighted = flat if weight is None else flat @ weight
+    total = means.sum(axis=0) @ weighted.reshape(means.shape).sum(axis=0).T
+    gram = total - np.einsum("fiu,fju->ij", means, weighted.reshape(means.shape), optimize=True)
+    return products_from_gram(gram, units) / (len(names) * (len(names) - 1))
+
+
+def _crossnobis_of_present(means: Floats, weight: Floats | None) -> Floats:
+    """Average over the pairs of folds in which both stimuli have a value."""
     weighted = means if weight is None else means @ weight
-    total = np.zeros(count * (count - 1) // 2)
+    total = np.zeros(means.shape[1] * (means.shape[1] - 1) // 2)
     found = np.zeros_like(total)
-    for first in range(len(names)):
-        for second in range(first + 1, len(names)):
+    for first in range(len(means)):
+        for second in range(first + 1, len(means)):
             distance = product_distances(means[first], weighted[second], missing=True)
             known = np.isfinite(distance)
             total += np.where(known, distance, 0.0)
@@ -171,10 +201,11 @@ def _crossnobis(given: _Trials) -> Floats:
 
 
 def _poisson(given: _Trials) -> Floats:
-    low = float(np.nanmin(given.patterns, initial=np.inf))
+    patterns = given.patterns()
+    low = float(np.nanmin(patterns, initial=np.inf))
     if low < 0:
         raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
-    rates = poisson_rates(given.patterns)
+    rates = poisson_rates(patterns)
     return product_distances(rates, np.log(rates), missing=given.missing)
 
 

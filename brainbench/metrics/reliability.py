@@ -4,26 +4,32 @@ An animal is a sequence of sessions (:class:`TrialBlock`) with different units. 
 are joined after averaging trials, so an RDM spans them all.
 
 Rules for what cannot be split:
-a session that lacks two trials of some stimulus is left out, of the RDM too, so that the RDM and its
-reliability describe the same data; a unit with fewer than two recorded trials of some stimulus is
-left out of its session. What was left out is told in words. Without any session left the animal is
-undefined.
+a session that lacks two trials of some stimulus (four for ``crossnobis``, whose halves need two) is
+left out, of the RDM too, so that the RDM and its reliability describe the same data; a unit with fewer
+recorded trials of some stimulus is left out of its session. What was left out is told in words.
+Without any session left the animal is undefined.
+
+``mahalanobis`` and ``crossnobis`` divide by the noise of each session, see
+:mod:`brainbench.metrics._whitening`; ``crossnobis`` takes every trial as its own fold, so unequal
+numbers of trials leave it unbiased.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.errors import DataError, UsageError, unknown_name
-from brainbench.metrics._halves import SUBJECT_METHODS, Session, distances, half_rdms
+from brainbench.metrics._halves import Session, distances, half_rdms, pattern_rdms
 from brainbench.metrics._hashing import Hashes, content_hashes, key_hashes
 from brainbench.metrics._labels import check_finite, listed, response_matrix, stimulus_codes, stimulus_means
 from brainbench.metrics._pairs import Floats, Ints
+from brainbench.metrics._resampling import resample
+from brainbench.metrics._whitening import whitened
 from brainbench.metrics.compare import check_comparison, compare
 from brainbench.metrics.noise import spearman_brown
 from brainbench.types import Interval
@@ -31,8 +37,15 @@ from brainbench.types import Interval
 SPLITS = 1000
 """Random split halves per animal."""
 
+SUBJECT_METHODS = ("correlation", "sqeuclidean", "mahalanobis", "crossnobis", "poisson")
+"""RDM methods of an animal."""
+
+DRAW_SPLITS = 20
+"""Split halves in each bootstrap draw; more change its interval by less than the draws themselves do."""
+
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
+_DRAWS_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -69,6 +82,10 @@ class SplitHalf:
     """Why no reliability exists."""
     notes: tuple[str, ...] = ()
     """What was left out."""
+    draws: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    """[D, P] RDMs of bootstrap draws of sessions and trials."""
+    draws_r: Floats = field(default_factory=lambda: np.empty(0), repr=False)
+    """[D] mean split-half comparison within each draw; NaN where none exists."""
 
 
 def split_half(
@@ -80,6 +97,9 @@ def split_half(
     comparison: str = "pearson",
     splits: int = SPLITS,
     seed: int = 0,
+    noise: str = "shrinkage_diag",
+    draws: int = 0,
+    draw_splits: int = DRAW_SPLITS,
 ) -> SplitHalf:
     """Split each stimulus' trials of each session into random halves and compare the halves' RDMs.
 
@@ -90,10 +110,15 @@ def split_half(
         blocks: Sessions of one animal.
         n_stimuli: K.
         stimuli: Names of the stimuli, for messages.
-        method: RDM method: ``correlation``, ``sqeuclidean`` or ``poisson``.
+        method: RDM method, one of :data:`SUBJECT_METHODS`.
         comparison: Comparison between the halves' RDMs, see :func:`brainbench.metrics.compare`.
         splits: Number S of random splits.
-        seed: Seed of the splits.
+        seed: Seed of the splits and draws.
+        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``, see
+            :func:`brainbench.metrics.noise_precision`.
+        draws: Number D of bootstrap draws (sessions, then trials within them); fewer where their RDMs
+            would not fit in 256 MiB.
+        draw_splits: Split halves within each draw.
 
     Raises:
         UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
@@ -104,15 +129,19 @@ def split_half(
             "RDM method of an animal",
             method,
             SUBJECT_METHODS,
-            hint="Other methods of rdm() need folds or a precision.",
         )
     check_comparison(comparison)
-    if splits < 1 or n_stimuli < 2:
-        raise UsageError(f"Split halves need splits ≥ 1 and 2 or more stimuli; received {splits} and {n_stimuli}.")
+    if min(splits, draw_splits) < 1 or draws < 0 or n_stimuli < 2:
+        raise UsageError(
+            "Split halves need splits ≥ 1, draw_splits ≥ 1, draws ≥ 0 and 2 or more stimuli; received "
+            f"{splits}, {draw_splits}, {draws} and {n_stimuli}."
+        )
     names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
     if len(names) != n_stimuli:
         raise UsageError(f"There are {n_stimuli} stimuli but {len(names)} names.")
-    sessions, problem, notes = _usable(blocks, n_stimuli, names)
+    sessions, problem, notes = _usable(blocks, n_stimuli, names, least=4 if method == "crossnobis" else 2)
+    if method in ("mahalanobis", "crossnobis") and problem is None:
+        sessions, problem, notes = _without_noise(sessions, n_stimuli, noise, notes)
     pairs = n_stimuli * (n_stimuli - 1) // 2
     units = sum(session.responses.shape[1] for session in sessions)
     trials = sum(len(session.codes) for session in sessions)
@@ -122,9 +151,14 @@ def split_half(
     if method == "poisson" and any((session.responses < 0).any() for session in sessions):
         raise DataError("method='poisson' needs rates or counts, which are never negative; some responses are.")
     means = [stimulus_means(session.responses, session.codes, n_stimuli) for session in sessions]
-    full = distances(np.concatenate(means, axis=1), method)
+    # Trials without noise covariance left make squared distances Mahalanobis distances.
+    method = "sqeuclidean" if method == "mahalanobis" else method
     if method != "poisson":
-        sessions = _shifted(sessions, means, by_unit=method == "sqeuclidean")
+        sessions = _shifted(sessions, means, by_unit=method != "correlation")
+    if method == "crossnobis":
+        full = pattern_rdms(sessions, [np.ones((1, len(session.codes))) for session in sessions], n_stimuli, method)[0]
+    else:
+        full = distances(np.concatenate(means, axis=1), method)
     kept = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
     halves = np.empty((kept, 2, pairs))
     r = np.empty(splits)
@@ -146,11 +180,25 @@ def split_half(
     low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
     spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
     value = float(spearman_brown(finite.mean()))
-    return SplitHalf(full, r, halves, value, spread, units, trials, None, notes)
+    number = min(draws, _DRAWS_BYTES // (8 * pairs))
+    drawn = _draws(sessions, n_stimuli, method, comparison, number, draw_splits, seed)
+    return SplitHalf(full, r, halves, value, spread, units, trials, None, notes, *drawn)
+
+
+def _draws(
+    sessions: list[Session], count: int, method: str, comparison: str, number: int, splits: int, seed: int
+) -> tuple[Floats, Floats]:
+    """Return the RDMs [D, P] of bootstrap draws, and each draw's mean split-half comparison [D]."""
+    if not number:
+        return np.empty((0, count * (count - 1) // 2)), np.empty(0)
+    rdms, r = resample(sessions, count, method, comparison, draws=number, splits=splits, seed=seed)
+    present = np.isfinite(r)
+    total = np.where(present, r, 0.0).sum(axis=1)
+    return rdms, np.divide(total, present.sum(axis=1), out=np.full(number, np.nan), where=present.any(axis=1))
 
 
 def _usable(
-    blocks: Sequence[TrialBlock], count: int, names: list[str]
+    blocks: Sequence[TrialBlock], count: int, names: list[str], *, least: int
 ) -> tuple[list[Session], str | None, tuple[str, ...]]:
     """Check the sessions, leave out what cannot be split and say what."""
     sessions: list[Session] = []
@@ -169,27 +217,44 @@ def _usable(
         # A trial without any recorded unit is no trial, whatever its label.
         trials = np.bincount(codes, minlength=count)
         total += trials
-        if trials.min() < 2:
-            few = [f"{names[k]} ({trials[k]})" for k in np.flatnonzero(trials < 2)]
-            lacking.append(f"fewer than 2 trials of {', '.join(few[:4])}" + (" and others" if len(few) > 4 else ""))
+        if trials.min() < least:
+            few = [f"{names[k]} ({trials[k]})" for k in np.flatnonzero(trials < least)]
+            lacking.append(
+                f"fewer than {least} trials of {', '.join(few[:4])}" + (" and others" if len(few) > 4 else "")
+            )
             continue
         member = np.zeros((count, len(codes)))
         member[codes, np.arange(len(codes))] = 1.0
-        splittable = (member @ np.isfinite(responses) >= 2).all(axis=0)
+        splittable = (member @ np.isfinite(responses) >= least).all(axis=0)
         dropped += int((~splittable).sum())
         if splittable.any():
             sessions.append(Session(responses[:, splittable], codes, hashes))
         else:
-            lacking.append("no unit recorded in 2 trials of every stimulus")
+            lacking.append(f"no unit recorded in {least} trials of every stimulus")
     notes = [f"{len(lacking)} of {len(blocks)} sessions left out: {'; '.join(sorted(set(lacking)))}"] if lacking else []
     if dropped:
-        notes.append(f"{dropped} units or bins left out: recorded in fewer than 2 trials of some stimulus")
+        notes.append(f"{dropped} units or bins left out: recorded in fewer than {least} trials of some stimulus")
     problem = None
     if (total == 0).any():
         problem = f"no trials of {listed(names, total == 0)}"
     elif not sessions:
         problem = f"no session can be split into halves: {'; '.join(sorted(set(lacking)))}"
     return sessions, problem, tuple(notes)
+
+
+def _without_noise(
+    sessions: list[Session], count: int, noise: str, notes: tuple[str, ...]
+) -> tuple[list[Session], str | None, tuple[str, ...]]:
+    """Whiten every session, leave out what has no noise covariance and say what."""
+    found = [whitened(session, count, noise) for session in sessions]
+    kept = [session for session, _ in found if session is not None]
+    notes += tuple(dict.fromkeys(told for session, told in found if told and session is not None))
+    lost = sorted({told for session, told in found if session is None})
+    if not kept:
+        return sessions, f"no session has a noise covariance: {'; '.join(lost)}", notes
+    if lost:
+        notes += (f"{len(found) - len(kept)} sessions left out: {'; '.join(lost)}",)
+    return kept, None, notes
 
 
 def _hashes(block: TrialBlock, responses: Floats, codes: Ints) -> Hashes:

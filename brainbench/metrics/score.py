@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,11 +18,12 @@ from brainbench.metrics._animals import (
     interval_reasons,
     mean_rdm,
     mean_reliability,
-    t_interval,
 )
 from brainbench.metrics._pairs import Floats, rdm_stack
+from brainbench.metrics.bootstrap import bootstrap_animals
 from brainbench.metrics.compare import check_comparison, compare_all
 from brainbench.metrics.inference import SMALLEST_STIMULI, PermutationTest, permuted_statistic, smallest_p
+from brainbench.metrics.intervals import t_interval
 from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
 from brainbench.metrics.noise import RELIABILITY_GATE
 from brainbench.metrics.subject import SubjectRDM, is_flat
@@ -76,6 +78,22 @@ def score_rdms(
     Raises:
         UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
+    return score_with_test(
+        layer_rdms, subjects, name=name, stimuli=stimuli, estimator=estimator, compare=compare, seed=seed
+    )[0]
+
+
+def score_with_test(
+    layer_rdms: Mapping[str, ArrayLike],
+    subjects: Sequence[SubjectRDM],
+    *,
+    name: str,
+    stimuli: Sequence[str],
+    estimator: str = "default",
+    compare: str = "pearson",
+    seed: int = 0,
+) -> tuple[Score, PermutationTest | None]:
+    """Return what :func:`score_rdms` does, and its permutation test with all statistics."""
     check_comparison(compare)
     names, rdms = _layers(layer_rdms, stimuli)
     animals = gather(subjects, estimator=estimator, comparison=compare, pairs=rdms.shape[1])
@@ -89,7 +107,7 @@ def score_rdms(
     finite = [index for index in defined if math.isfinite(layers[index].value)]
     best = finite[first_best(np.array([layers[index].value for index in finite]))] if finite else None
     chosen = None if choice is None else defined[choice.overall]
-    return Score(
+    score = Score(
         name=name,
         value=math.nan if choice is None else float(choice.values.mean()),
         status=status,
@@ -114,11 +132,55 @@ def score_rdms(
         model_rdm=() if chosen is None else tuple(rdms[chosen].tolist()),
         brain_rdm=mean_rdm(animals),
         provenance={
+            "statistics": {}
+            if choice is None
+            else _statistics(rdms[defined], animals, choice, estimator, compare, seed),
             "seed": seed,
             "splits": max(len(subject.split_half_r) for subject in animals.subjects),
             "reliability_gate": RELIABILITY_GATE,
         },
     )
+    return score, None if choice is None else choice.test
+
+
+def _statistics(
+    rdms: Floats, animals: Animals, choice: _Choice, estimator: str, comparison: str, seed: int
+) -> dict[str, Any]:
+    """Return the Monte-Carlo errors, and the hierarchical bootstrap where the animals hold draws."""
+    scored = [animals.subjects[index] for index in animals.scored]
+    found: dict[str, Any] = {
+        "monte_carlo_error": {
+            "value": splits_error(choice.values, [subject.split_half_by(comparison) for subject in scored]),
+            "p": choice.test.monte_carlo_error,
+        }
+    }
+    held = min(len(subject.draws) for subject in scored)
+    if estimator == "default" and held and all(subject.comparison == comparison for subject in scored):
+        boot = bootstrap_animals(rdms, animals, comparison, draws=held, levels="all", seed=seed)
+        found["bootstrap"] = {
+            "levels": boot.levels,
+            "draws": held,
+            "undefined_draws": boot.undefined,
+            "standard_error": boot.standard_error,
+            "interval": boot.interval("percentile"),
+        }
+        found["monte_carlo_error"]["bootstrap_interval"] = boot.monte_carlo_error("percentile")
+    return found
+
+
+def splits_error(values: Floats, split_half_r: Sequence[Floats]) -> float:
+    """Return the standard error of the mean score over animals from the finite number of random splits.
+
+    Splits are independent draws given the trials, so the mean split-half correlation h has standard
+    error s/√S, and value ∝ √((1 + h)/2h) turns it into value · se / (2h(1 + h)).
+    """
+    errors = []
+    for value, r in zip(values, split_half_r, strict=True):
+        finite = r[np.isfinite(r)]
+        h = float(finite.mean()) if finite.size else math.nan
+        spread = float(finite.std(ddof=1)) / math.sqrt(finite.size) if finite.size > 1 else math.nan
+        errors.append(float(value) * spread / (2 * h * (1 + h)))
+    return math.sqrt(sum(error**2 for error in errors)) / len(errors)
 
 
 def metric_name(animals: Animals, comparison: str) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from brainbench.metrics._pairs import Floats
 from brainbench.metrics.compare import compare
-from brainbench.metrics.reliability import SPLITS, TrialBlock, split_half
+from brainbench.metrics.reliability import DRAW_SPLITS, SPLITS, TrialBlock, split_half
 from brainbench.types import Interval
 
 
@@ -39,6 +39,10 @@ class SubjectRDM:
     """Why the animal has no usable RDM, in words."""
     notes: tuple[str, ...] = ()
     """Sessions and units that were left out, in words."""
+    draws: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    """[D, P] RDMs of bootstrap draws of the animal's sessions and trials; empty without any."""
+    draws_r: Floats = field(default_factory=lambda: np.empty(0), repr=False)
+    """[D] mean split-half comparison (by ``comparison``) within each draw."""
 
     def split_half_by(self, comparison: str) -> Floats:
         """Return the split-half comparisons [S] by any comparison (from the stored halves if need be)."""
@@ -57,6 +61,9 @@ def subject_rdm(
     comparison: str = "pearson",
     splits: int = SPLITS,
     seed: int = 0,
+    noise: str = "shrinkage_diag",
+    draws: int = 0,
+    draw_splits: int = DRAW_SPLITS,
 ) -> SubjectRDM:
     """Build an animal's RDM and its split halves from the trials of its sessions.
 
@@ -68,17 +75,29 @@ def subject_rdm(
         blocks: Its sessions; see :class:`TrialBlock` and the rules of :mod:`brainbench.metrics.reliability`.
         n_stimuli: K.
         stimuli: Names of the stimuli, for messages.
-        method: RDM method: ``correlation``, ``sqeuclidean`` or ``poisson``.
+        method: RDM method: ``correlation``, ``sqeuclidean``, ``mahalanobis``, ``crossnobis`` or ``poisson``.
         comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
         splits: Number of random split halves.
-        seed: Seed of the splits.
+        seed: Seed of the splits and draws.
+        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``.
+        draws: Bootstrap draws of sessions and trials, for intervals; see :mod:`brainbench.metrics.bootstrap`.
+        draw_splits: Split halves within each draw.
 
     Raises:
         UsageError: unknown method, bad shapes or labels, repeated trial keys.
         DataError: infinite responses, or negative ones for ``poisson``.
     """
     found = split_half(
-        blocks, n_stimuli, stimuli=stimuli, method=method, comparison=comparison, splits=splits, seed=seed
+        blocks,
+        n_stimuli,
+        stimuli=stimuli,
+        method=method,
+        comparison=comparison,
+        splits=splits,
+        seed=seed,
+        noise=noise,
+        draws=draws,
+        draw_splits=draw_splits,
     )
     return SubjectRDM(
         subject=subject,
@@ -94,6 +113,8 @@ def subject_rdm(
         seed=seed,
         problem=found.problem,
         notes=found.notes,
+        draws=found.draws,
+        draws_r=found.draws_r,
     )
 
 

@@ -8,7 +8,7 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("module", ["rdm", "compare", "noise", "inference"])
+@pytest.mark.parametrize("module", ["rdm", "compare", "noise", "inference", "multiple", "equivalence"])
 def test_the_examples_of_the_docstrings_hold(module):
     result = doctest.testmod(importlib.import_module(f"brainbench.metrics.{module}"))
     assert result.attempted >= 2

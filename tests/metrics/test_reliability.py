@@ -204,8 +204,10 @@ def test_other_distances_split_too(method):
 
 def test_misuse_is_told_in_a_sentence():
     block = make_block(make_latent())
-    with pytest.raises(UsageError, match="Other methods of rdm"):
-        split_half([block], 6, method="crossnobis")
+    with pytest.raises(UsageError, match="did you mean 'crossnobis'"):
+        split_half([block], 6, method="crosnobis")
+    with pytest.raises(UsageError, match="Unknown noise covariance method"):
+        split_half([block], 6, method="mahalanobis", noise="shrinkage")
     with pytest.raises(UsageError, match="keys repeat"):
         split_half([TrialBlock(block.responses, block.labels, ["a"] * len(block.labels))], 6)
     with pytest.raises(UsageError, match="one key per trial"):

@@ -234,8 +234,8 @@ def test_splits_whose_halves_have_no_rdm_do_not_choose():
 def test_few_animals_say_that_coverage_is_not_verified():
     latent = make_latent(10)
     score = _score(_make_layers(latent), _make_animals(latent, 3))
-    assert score.interval.method == "t over 3 animals; coverage not verified below 5 animals"
-    assert "interval from 3 animals: coverage not verified below 5" in score.reasons
+    assert score.interval.method == "t over 3 animals; unreliable: coverage not verified below 5 animals"
+    assert "interval from 3 animals is unreliable: coverage not verified below 5" in score.reasons
 
 
 @pytest.mark.parametrize("estimator", ["thesis", "thesis-input"])
