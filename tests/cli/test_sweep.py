@@ -1,11 +1,10 @@
 import json
 
+import h5py
 import pytest
 import trimesh
 
-from brainbench.stimuli import read_stimulus_set
-
-SMALL = ("--whiskers", "C3", "--fidelity", "fast", "--limit", "2")
+SMALL = ("--whiskers", "C3", "--fidelity", "fast", "--limit", "2", "--workers", "1")
 
 
 def test_a_grid_is_counted_beside_the_published_counts(run):
@@ -21,22 +20,36 @@ def test_counts_and_labels_as_json(run):
     assert data["files"] == []
 
 
-def test_sweeps_are_simulated_once_into_one_file_per_object(run, tmp_path):
+def test_a_collection_is_counted_with_its_splits(run):
+    out = run("stimuli", "sweep", "thesis-low", "--objects", "procedural-24:40").out
+    assert "960 of 24 classes" in out
+    assert "15,360 sweeps" in out
+    assert "train 12,288, validation 1,536, test 1,536 (by object)" in out
+
+
+def test_sweeps_are_simulated_once_into_shards_with_a_manifest(run, tmp_path):
     trimesh.creation.box(extents=(1, 2, 1)).export(tmp_path / "cube.stl")
-    arguments = ("stimuli", "sweep", "thesis-low", "brick", str(tmp_path / "cube.stl"), "--unit", "cm")
-    result = run(*arguments, "--out", str(tmp_path / "out"), *SMALL, "--json")
+    folder = tmp_path / "out"
+    arguments = ("stimuli", "sweep", "thesis-low", "--objects", "brick:3", str(tmp_path / "cube.stl"), "--unit", "cm")
+    result = run(*arguments, "--out", str(folder), *SMALL, "--json")
     assert result.status == 0
-    files = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert files == ["brick-0.h5", "cube.h5"]
-    dataset = read_stimulus_set(tmp_path / "out" / "cube.h5")
-    assert list(dataset["stimulus"].values) == json.loads(result.out)["labels"][16:18]
-    before = [(tmp_path / "out" / name).stat().st_mtime_ns for name in files]
-    assert run(*arguments, "--out", str(tmp_path / "out"), *SMALL).status == 0
-    assert [(tmp_path / "out" / name).stat().st_mtime_ns for name in files] == before
+    data = json.loads(result.out)
+    assert data["sweeps"] == 8
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "config.json", "manifest.json", "test-00000.h5", "train-00000.h5", "validation-00000.h5",
+    ]  # fmt: skip
+    with h5py.File(folder / "train-00000.h5") as file:
+        assert set(file["object"].asstr()[:]) >= {"cube"}
+        assert file["class"].asstr()[:].tolist() == ["brick", "cube"]
+    before = [(folder / name).stat().st_mtime_ns for name in ("train-00000.h5", "test-00000.h5")]
+    again = run(*arguments, "--out", str(folder), *SMALL)
+    assert again.status == 0
+    assert "0 of 8 sweeps, marked" in again.out
+    assert [(folder / name).stat().st_mtime_ns for name in ("train-00000.h5", "test-00000.h5")] == before
     # What is there is never taken for something else.
-    other = run(*arguments, "--out", str(tmp_path / "out"), *SMALL[:-1], "3", "--whiskers", "C2")
+    other = run(*arguments, "--out", str(folder), *SMALL, "--whiskers", "C2", "--split", "sweep")
     assert other.status == 2
-    assert "is there already with other sweeps and whiskers" in other.err
+    assert "begun with other split, whiskers" in other.err
 
 
 @pytest.mark.parametrize(
@@ -45,12 +58,23 @@ def test_sweeps_are_simulated_once_into_one_file_per_object(run, tmp_path):
         (("thesis-lo", "torus"), "Unknown sweep grid 'thesis-lo'; did you mean 'thesis-low'"),
         (("thesis-low", "torsu"), "did you mean 'torus'"),
         (("thesis-low", "torus", "torus-0"), "Several objects have the same name"),
+        (("thesis-low",), "There is no object"),
+        (("thesis-low", "torus", "--split", "objects"), "did you mean 'object'"),
+        (("thesis-low", "torus", "--scheduler", "tcp://here:1"), "--out"),
+        (("thesis-low", "torus", "--backend", "mujocco"), "did you mean 'mujoco'"),
     ],
 )
 def test_what_cannot_be_swept_is_named(run, arguments, message):
     result = run("stimuli", "sweep", *arguments)
     assert result.status == 2
     assert message in result.err
+
+
+def test_a_device_that_the_backend_does_not_have_is_refused_before_anything_is_made(run, tmp_path):
+    result = run("stimuli", "sweep", "thesis-low", "torus", "--out", str(tmp_path / "set"), "--device", "cuda")
+    assert result.status == 2
+    assert "'mujoco' does not run on 'cuda'" in result.err
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_mesh_file_needs_its_unit(run, tmp_path):

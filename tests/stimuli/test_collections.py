@@ -1,5 +1,6 @@
 import pickle
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -33,6 +34,17 @@ def test_members_of_a_collection_have_2000_to_20000_triangles_and_travel_between
         counts.append(len(solid.mesh.faces))
     assert all(1_900 <= count <= 20_000 for count in counts)
     assert max(counts) > 2 * min(counts)
+
+
+def test_surfaces_alone_are_the_same_shapes_for_engines_that_collide_meshes():
+    (usual,) = resolve_objects(["mug-3"]).values()
+    (surface,) = resolve_objects(["mug-3"], surfaces=True).values()
+    solid, other = surface.load(), usual.load()
+    assert solid.parts == ()
+    assert solid.surface is not None
+    assert other.surface is not None
+    np.testing.assert_array_equal(solid.surface.vertices, other.surface.vertices)
+    assert surface.source != usual.source
 
 
 def test_equal_objects_have_equal_sources_and_others_have_not():

@@ -1,11 +1,10 @@
-"""``brainbench stimuli sweep``: count, list and simulate the sweeps of a published grid over some objects."""
+"""``brainbench stimuli sweep``: count and list the sweeps of a published grid over some objects, or make a data set."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,8 +13,7 @@ from brainbench.cli.stimuli._options import BackendOption, FidelityOption, Whisk
 from brainbench.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
-    from brainbench.stimuli import Solid
-    from brainbench.stimuli.sweeps import SweepScenes
+    from brainbench.stimuli.generation.plan import GenerationPlan
 
 _SHOWN = 8
 
@@ -23,117 +21,130 @@ _SHOWN = 8
 def sweep(
     grid: Annotated[str, typer.Argument(help="thesis-low or thesis-high.")],
     objects: Annotated[
-        list[str], typer.Argument(help="Shape families (torus, or torus-3 for seed 3) and mesh files (cup.obj).")
-    ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Simulate, into one stimulus-set file per object here.")
+        list[str] | None, typer.Argument(help="What moves past the whiskers; as --objects.", show_default=False)
     ] = None,
+    more_objects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--objects",
+            help="A shape family (torus), one member (torus-3) or the first ones (torus:20), a collection "
+            "(procedural-24:40), mesh files ('meshes/*/*.obj'), or shapenet:FOLDER[:N]. Can be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Simulate, into shards and a manifest in this folder.")
+    ] = None,
+    split: Annotated[str, typer.Option(help="Train, validation and test (80/10/10) by object or by sweep.")] = "object",
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first sweeps of each object.")] = None,
+    sample: Annotated[float | None, typer.Option(help="Only this fraction of all sweeps, drawn at random.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the split, the order of the objects and the sample.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) do it.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu, or cuda with a backend that runs there.")] = "cpu",
+    shard_size: Annotated[int | None, typer.Option(min=1, help="Sweeps per shard. [default: by backend]")] = None,
     unit: Annotated[str | None, typer.Option(help="Length unit of mesh files: m, cm, mm, …")] = None,
     collision: Annotated[str | None, typer.Option(help="What whiskers touch: hull, exact, decomposition, …")] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Simulate only the first sweeps of each object.")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
     backend: BackendOption = "mujoco",
     as_json: JsonOption = False,
 ) -> None:
-    """Count the sweeps of a grid beside the published counts; with --out simulate them.
+    """Count the sweeps of a grid beside the published counts; with --out make a data set of them.
 
-    Objects whose file is there already are left alone, so an interrupted run goes on where it stopped.
+    A run that was interrupted or killed goes on where it stopped when the same command is given again.
     """
-    from brainbench.stimuli import get_recipe
+    from brainbench.stimuli import Fidelity, get_backend
+    from brainbench.stimuli.collections import resolve_objects
+    from brainbench.stimuli.generation.plan import GenerationPlan, Settings
     from brainbench.stimuli.sweeps import GRIDS, SweepScenes, counts
 
     if grid not in GRIDS:
         raise unknown_name("sweep grid", grid, GRIDS)
-    loaders = {name: load for item in objects for name, load in [_object(item, unit, collision)]}
-    if len(loaders) < len(objects):
-        raise UsageError("Several objects have the same name; their files would replace one another.")
-    recipe = get_recipe(grid, objects=loaders, whiskers=whiskers)
-    scenes = recipe.scenes
-    if not isinstance(scenes, SweepScenes):
-        raise UsageError(f"{grid!r} is no grid of sweeps.")
+    if out is None and scheduler is not None:
+        raise UsageError("--scheduler simulates, and needs a folder for it: --out.")
+    surfaces = getattr(get_backend(backend), "surfaces", False)
+    found = resolve_objects(
+        [*(objects or ()), *(more_objects or ())], unit=unit, collision=collision, surfaces=surfaces
+    )
+    scenes = SweepScenes(GRIDS[grid], {name: item.load for name, item in found.items()}, whiskers=whiskers)
+    settings = Settings(
+        Fidelity.preset(fidelity),
+        backend=backend,
+        device=device,
+        split=split,  # type: ignore[arg-type]
+        seed=seed,
+        limit=limit,
+        sample=sample,
+        shard_size=shard_size,
+    )
+    plan = GenerationPlan(grid, GRIDS[grid], found, settings, whiskers)
     summary = counts(scenes)
-    data = {**summary, "labels": list(scenes.labels), "files": []}
     rows = [
-        ["objects", f"{summary['objects']}"],
+        ["objects", f"{summary['objects']} of {len(plan.classes)} classes"],
         ["sweeps per object", f"{summary['sweeps_per_object']}"],
         [
             "scenes",
             f"{summary['scenes']:,} of {summary['whiskers']} whiskers, {summary['bytes'] / 1e6:.3g} MB of forces",
         ],
         ["published", summary["published"]],
+        ["data set", _describe(plan)],
     ]
+    data: dict[str, Any] = {**summary, "classes": len(plan.classes), "shards": len(plan.shards), "files": []}
     text = table(grid, ["", ""], rows)
     if out is None:
-        first = "\n".join(scenes.labels[:_SHOWN])
+        data["labels"] = list(scenes.labels)
+        first = "\n".join(data["labels"][:_SHOWN])
         more = len(scenes) - _SHOWN
         text += f"\n\n{first}" + (f"\n… and {more:,} more (all with --json)" if more > 0 else "")
     else:
-        data["files"] = _simulate(scenes, out, limit, fidelity, backend)
-        text += "\n\n" + "\n".join(f"stimuli  {path}" for path in data["files"])
+        made, told = _generate(plan, out, workers, scheduler)
+        data |= made
+        text += f"\n\n{told}"
     emit(data, text, as_json=as_json)
 
 
-def _simulate(scenes: SweepScenes, out: Path, limit: int | None, fidelity: str, backend: str) -> list[Path]:
-    """Simulate object by object; return the files, those that were there already among them."""
-    from brainbench.stimuli import simulate, write_stimulus_set
+def _describe(plan: GenerationPlan) -> str:
+    """Return how many sweeps and shards a data set would have, by split."""
+    sizes: dict[str, int] = {}
+    for task in plan.shards:
+        sizes[task.split] = sizes.get(task.split, 0) + len(task)
+    parts = ", ".join(f"{split} {size:,}" for split, size in sizes.items())
+    size = sum(task.bytes for task in plan.shards)
+    return (
+        f"{plan.sweeps:,} sweeps in {len(plan.shards)} shards, {size / 1e6:.3g} MB: {parts} (by {plan.settings.split})"
+    )
 
-    size = scenes.grid.count
-    paths = []
+
+def _generate(
+    plan: GenerationPlan, out: Path, workers: int | None, scheduler: str | None
+) -> tuple[dict[str, Any], str]:
+    """Make the data set; return what --json says of it and what people read."""
+    from brainbench.stimuli.generation.run import generate
+
+    started = time.perf_counter()
     with progress_bar() as progress:
-        for index, name in enumerate(scenes.objects):
-            path = out / f"{name}.h5"
-            paths.append(path)
-            first = index * size
-            if path.exists():
-                _check_same(path, scenes, scenes.labels[first : first + min(size, limit or size)], fidelity, backend)
-                continue
-            dataset = simulate(
-                scenes[first : first + min(size, limit or size)],
-                fidelity=fidelity,
-                backend=backend,
-                cache=False,
-                progress=_named(progress, name),
-            )
-            write_stimulus_set(dataset, path)
-    return paths
-
-
-def _check_same(path: Path, scenes: SweepScenes, labels: tuple[str, ...], fidelity: str, backend: str) -> None:
-    """Refuse to take a file for something that it does not hold."""
-    from brainbench.files import to_json
-    from brainbench.stimuli import Fidelity, read_stimulus_set
-
-    dataset = read_stimulus_set(path)
-    found = {
-        "sweeps": [str(label) for label in dataset["stimulus"].values] == list(labels),
-        "whiskers": [str(name) for name in dataset["whisker"].values] == list(scenes.array.names),
-        "fidelity": dataset.attrs["fidelity"] == to_json(Fidelity.preset(fidelity), indent=None),
-        "backend": dataset.attrs["backend"] == backend,
+        manifest = generate(plan, out, workers=workers, scheduler=scheduler, progress=progress)
+    seconds = time.perf_counter() - started
+    saved = 1 - manifest["steps"] / max(1, manifest["steps_in_full"])
+    about = ("sweeps", "unstable", "unusable", "steps", "steps_in_full", "splits", "content_hash", "config_hash")
+    data = {
+        **{key: manifest[key] for key in about},
+        "seconds": seconds,
+        "folder": out,
+        "files": [out / shard["name"] for shard in manifest["shards"]],
     }
-    if other := [what for what, same in found.items() if not same]:
-        raise UsageError(
-            f"{str(path)!r} is there already with other {' and '.join(other)}; choose another folder, or remove it."
-        )
-
-
-def _named(progress: Callable[[int, int, str], None], name: str) -> Callable[[int, int, str], None]:
-    return lambda done, total, what: progress(done, total, f"{name}: {what}")
-
-
-def _object(text: str, unit: str | None, collision: str | None) -> tuple[str, Callable[[], Solid]]:
-    """Name and loader of one object: a mesh file, or a family with or without a seed.
-
-    Raises:
-        UsageError: a mesh file has no unit, or there is no such family.
-    """
-    from brainbench.stimuli.objects import mesh_solid, shape_solid
-    from brainbench.stimuli.shapes import describe_family, make
-
-    if Path(text).is_file():
-        if unit is None:
-            raise UsageError(f"The length unit of {text!r} is not in the file; say it with --unit (m, cm, mm, …).")
-        return Path(text).stem, lambda: mesh_solid(text, unit=unit, collision=collision or "hull")  # type: ignore[arg-type]
-    family, seed = (found[1], int(found[2])) if (found := re.fullmatch(r"(.+)-(\d+)", text)) else (text, 0)
-    describe_family(family)
-    return f"{family}-{seed}", lambda: shape_solid(make(family, seed), collision=collision)
+    unusable = {name: item["unusable"] for name, item in manifest["objects"].items() if "unusable" in item}
+    rows = [
+        ["steps", f"{manifest['steps']:,} of {manifest['steps_in_full']:,} computed ({saved:.0%} saved)"],
+        ["unstable", f"{manifest['unstable']:,} of {manifest['sweeps']:,} sweeps, marked in the shards"],
+        *([["unusable", f"{name}: {reason}"] for name, reason in unusable.items()]),
+        ["hash", manifest["content_hash"]],
+        ["time", f"{seconds:.1f} s in this run"],
+        ["data set", f"{out} (manifest.json, {len(manifest['shards'])} shards)"],
+    ]
+    return data, table("", ["", ""], rows)

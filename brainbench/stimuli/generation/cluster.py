@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from brainbench.errors import DataError, UsageError, missing_dependency
 from brainbench.stimuli.generation.shard import make_shard
@@ -34,7 +34,7 @@ def run_on_cluster(tasks: Sequence[ShardTask], folder: Path, scheduler: str, don
     except ImportError as error:
         raise missing_dependency("distributed", extra="cluster", purpose="A --scheduler") from error
     try:
-        client = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
+        client: Any = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise UsageError(f"No Dask scheduler answers at {scheduler!r} ({error}); start one: dask scheduler.") from error
     with client:

@@ -85,10 +85,7 @@ def simulate_sweeps(
     Raises:
         UsageError: the backend is unknown or does not run on the device.
     """
-    engine = get_backend(backend)
-    devices = getattr(engine, "devices", ("cpu",))
-    if device not in devices:
-        raise UsageError(f"The backend {backend!r} does not run on {device!r}; it runs on {listing(devices)}.")
+    engine = check_device(backend, device)
     if backend in FAST_PATHS:
         module, symbol = FAST_PATHS[backend]
         run = getattr(import_module(module), symbol)
@@ -98,6 +95,19 @@ def simulate_sweeps(
         for first in range(0, len(indices), _TOGETHER)
     ]
     return join_batches(parts)
+
+
+def check_device(name: str, device: str) -> Backend:
+    """Return the backend called ``name`` on a device.
+
+    Raises:
+        UsageError: the backend is unknown or does not run on the device.
+    """
+    engine = get_backend(name)
+    devices = getattr(engine, "devices", ("cpu",))
+    if device not in devices:
+        raise UsageError(f"The backend {name!r} does not run on {device!r}; it runs on {listing(devices)}.")
+    return type(engine)(device=device) if len(devices) > 1 else engine  # type: ignore[call-arg]
 
 
 def join_batches(parts: Sequence[SweepBatch]) -> SweepBatch:

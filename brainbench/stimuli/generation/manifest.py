@@ -36,7 +36,7 @@ def is_whole(path: Path, task: ShardTask) -> bool:
     try:
         with h5py.File(path, "r") as file:
             found = str(file.attrs["config_hash"])
-            wrench = file["wrench"]
+            wrench: Any = file["wrench"]
             end = wrench.id.get_offset() + wrench.size * wrench.dtype.itemsize
             shape = wrench.shape
     except (OSError, KeyError):
@@ -101,7 +101,8 @@ def _read(path: Path, task: ShardTask, objects: _Objects) -> dict[str, Any]:
     import h5py
 
     try:
-        with h5py.File(path, "r") as file:
+        opened: Any = h5py.File(path, "r")
+        with opened as file:
             counts = {name: int(file.attrs[name]) for name in _COUNTS}
             digest = str(file.attrs["content_hash"])
             hashes = [value.decode() for value in file["object_hash"][:]]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.errors import DataError, UsageError
 from brainbench.files import read_json, to_plain, write_json
+from brainbench.stimuli.generation.engine import check_device
 from brainbench.stimuli.generation.manifest import MANIFEST, is_whole, make_manifest
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ def generate(
         progress: called as ``progress(sweeps done, sweeps in all, what)``, without those that were there already.
 
     Raises:
-        UsageError: the folder holds another data set, or another process is writing it.
+        UsageError: the folder holds another data set, another process is writing it, or the backend does not run on
+            the device.
         DataError: the disk is too small, or a worker or shard failed; finished shards are kept.
         MissingDependencyError: a scheduler is given and Dask is not installed.
     """
@@ -56,6 +58,7 @@ def generate(
 
     if workers is not None and workers < 1:
         raise UsageError(f"workers must be at least 1; received {workers}.")
+    check_device(plan.settings.backend, plan.settings.device)
     folder = Path(out).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     with _alone(folder):
