@@ -162,12 +162,6 @@ def window_rates(
     return result
 
 
-def correlation_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Correlation distance between rows [K, U] as an upper triangle [P]."""
-    rows, columns = np.triu_indices(len(responses), 1)
-    return 1.0 - np.atleast_2d(np.corrcoef(responses))[rows, columns]
-
-
 def _mixture(random: np.random.Generator, afferents: Afferents, centre: NDArray[np.int64]) -> NDArray[np.float64]:
     """Draw a sparse mixture [W, A, U] of afferents around each unit's whisker ``centre`` [U]."""
     whiskers, channels = afferents.values.shape[2:]

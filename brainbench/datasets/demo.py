@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from brainbench.datasets import rodgers
 from brainbench.datasets._demo_neurons import (
     Afferents,
-    correlation_rdm,
     draw_population,
     make_afferents,
     window_rates,
@@ -37,6 +36,7 @@ from brainbench.datasets._demo_session import (
     tracked_runs,
     write_session,
 )
+from brainbench.datasets._truth import TRUTH, correlation_rdm, read_truth
 from brainbench.errors import DataError, UsageError, listing
 from brainbench.files import cache_dir, content_hash, file_hash, read_json, write_json
 from brainbench.types import Progress, check_stimulus_set
@@ -44,9 +44,10 @@ from brainbench.types import Progress, check_stimulus_set
 if TYPE_CHECKING:
     import xarray as xr
 
+__all__ = ["TRUTH", "VERSION", "demo_folder", "ensure_demo", "make_demo", "read_truth"]
+
 VERSION = 2
 """Raised when the same stimuli give other spikes, so that old caches are not reused."""
-TRUTH = "truth.json"
 
 _ANIMALS = (
     (SessionPlan("demo01", "01", 34, 170, detection=True), SessionPlan("demo01", "02", 30, 140)),
@@ -184,18 +185,6 @@ def ensure_demo(
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return target
-
-
-def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the truth of demo recordings: labels, and RDMs [P] of ``shared`` and ``subjects``.
-
-    Raises:
-        DataError: there is none.
-    """
-    truth = read_json(Path(folder) / TRUTH)
-    truth["shared"] = np.array(truth["shared"])
-    truth["subjects"] = {name: np.array(values) for name, values in truth["subjects"].items()}
-    return truth
 
 
 def _animal(index: int) -> list[SessionPlan]:

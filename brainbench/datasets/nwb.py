@@ -96,13 +96,14 @@ def _series(parent: Any) -> Iterator[tuple[str, Series]]:
     import h5py
 
     for _, group in _groups(parent):
-        data, stamps, begin = group.get("data"), group.get("timestamps"), group.get("starting_time")
+        data, stamps = group.get("data"), group.get("timestamps")
         if not isinstance(data, h5py.Dataset):
             yield from _series(group)
             continue
         path = (group.name or "").strip("/")
-        regular = isinstance(begin, h5py.Dataset) and begin.shape == ()
-        start, rate = (float(begin[()]), float(begin.attrs.get("rate", math.nan))) if regular else (0.0, math.nan)
+        start, rate, begin = 0.0, math.nan, group.get("starting_time")
+        if isinstance(begin, h5py.Dataset) and begin.shape == ():
+            start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
         yield path, Series(path, _type(group), data, stamps, start, rate)
 
 
