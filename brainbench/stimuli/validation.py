@@ -19,7 +19,7 @@ from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.backends.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.obstacle import Capsule, Obstacle
+from brainbench.stimuli.obstacle import Capsule, Cylinder, Obstacle
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from brainbench.stimuli.backends.protocol import Trace
     from brainbench.stimuli.obstacle import RigidMotion
     from brainbench.stimuli.whisker import Whisker
+
+
+_CLEARANCE = 1.2
+"""Half width of a pulley's groove in base radii of the whisker."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +208,10 @@ def slip_off(
 ) -> SlipOff:
     """Raise a frictionless round peg at distance ``at`` (m) from the base until the whisker slips off it.
 
-    The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity.
+    The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity. It carries a
+    flange on either side, as a pulley does, which keeps the whisker in the plane of the elastica. Bent round a bare
+    rod by 90° at the contact, a whisker may turn about the axis of its base at no cost of energy; beyond 90°, as
+    before most slip-offs at small ``at``, that pays, and any disturbance makes it swing out sideways.
 
     Raises:
         UsageError: the whisker is curved, or ``at`` lies beyond it.
@@ -229,7 +236,7 @@ def slip_off(
 
     times = np.linspace(0, duration, 2001)[1:]
     critical = replace(whisker, damping_ratio=1.0)
-    rod = _peg_obstacle(whisker, peg_radius, motion)
+    rod = _pulley(whisker, peg_radius, motion)
     trace = _run(backend, Job(critical, StillFollicle(), (rod,), times), fidelity)
     held = np.flatnonzero(trace.contact)
     if not len(held) or held[-1] == len(times) - 1:
@@ -245,6 +252,7 @@ def ringdown(
     *,
     modes: int = 3,
     deflection: float = 1e-3,
+    own_step: bool = False,
     backend: str = "mujoco",
     fidelity: Fidelity | str = "accurate",
 ) -> Ringdown:
@@ -255,7 +263,10 @@ def ringdown(
     after the higher modes have died. Modes 2 … ``modes`` would not ring with the whisker's own damping, which is
     proportional to stiffness, and the presets' steps are not made for them. Each is rung alone, by loads
     that bend the chain in its shape, with damping ratio .05 and at most 1/100 of its period per step, and read
-    at the tip: these frequencies test the chain of links, not the time step.
+    at the tip: these frequencies test the chain of links, not the time step. With ``own_step`` the higher modes keep
+    the fidelity's step too, and what rings then shows what that step makes of them; a mode of fewer than six steps per
+    period is damped away within one of them and counts as NaN. (A backward Euler step h turns an undamped mode ω
+    into one of frequency |ln(1 + i ω h)|/h, damped by the ratio ln(1 + ω² h²)/(2 |ln(1 + i ω h)|).)
 
     Raises:
         UsageError: the whisker is curved, its damping ratio is not between 0 and 1, so nothing rings, or ``modes``
@@ -288,7 +299,7 @@ def ringdown(
     # Stiffness-proportional damping kills the second mode much sooner: one period is enough.
     kept = times > 1 / expected
     fits = [_fit_decay(times[kept], trace.wrench[kept, 5], expected, whisker.damping_ratio)]
-    fits += [_ring_mode(whisker, mode, references_hz, backend, fidelity) for mode in range(1, modes)]
+    fits += [_ring_mode(whisker, mode, references_hz, backend, fidelity, own_step) for mode in range(1, modes)]
     frequencies, ratios = np.array(fits).T
     return Ringdown(
         frequency=fits[0][0],
@@ -302,9 +313,14 @@ def ringdown(
     )
 
 
-def _ring_mode(whisker: Whisker, mode: int, expected: NDArray, backend: str, fidelity: Fidelity) -> tuple[float, float]:
+def _ring_mode(
+    whisker: Whisker, mode: int, expected: NDArray, backend: str, fidelity: Fidelity, own_step: bool
+) -> tuple[float, float]:
     """Frequency (Hz) and damping ratio of one mode (0 = first), rung alone by a constant load in its shape."""
     ratio, period = 0.05, 1 / float(expected[mode])
+    step = fidelity.step(float(expected[0])) if own_step else min(fidelity.time_step, period / 100)
+    if period < 6 * step:
+        return math.nan, math.nan
     chain = build_chain(whisker, fidelity.link_count(whisker.arc_length))
     if mode >= chain.links:
         raise UsageError(f"A chain of {chain.links} links has no mode {mode + 1}; ask for fewer modes or more links.")
@@ -313,10 +329,11 @@ def _ring_mode(whisker: Whisker, mode: int, expected: NDArray, backend: str, fid
     levers = np.triu(chain.nodes[None, 1:] - chain.nodes[:-1, None])
     bends = bends * (1e-3 * whisker.arc_length / np.abs(levers.T @ bends).max())
     forces = np.linalg.solve(levers, chain.stiffness * bends)
-    fine = replace(fidelity, time_step=min(fidelity.time_step, period / 100), steps_per_period=None)
+    fine = replace(fidelity, time_step=step, steps_per_period=None)
     # Damping proportional to stiffness grows with frequency.
     light = replace(whisker, damping_ratio=ratio * float(expected[0] / expected[mode]))
-    times = np.asarray(np.arange(1, 1201) * (period / 100), dtype=np.float64)
+    interval = step if own_step else period / 100
+    times = np.asarray(np.arange(1, math.ceil(12 * period / interval) + 1) * interval, dtype=np.float64)
     loads = tuple(
         Load(float(arc), (0.0, float(force), 0.0)) for arc, force in zip(chain.nodes[1:], forces, strict=True)
     )
@@ -331,6 +348,14 @@ def _peg_obstacle(whisker: Whisker, radius: float, motion: RigidMotion) -> Obsta
     """Return a frictionless round rod along z, longer than the whisker."""
     half = whisker.arc_length
     return Obstacle((Capsule((0.0, 0.0, -half), (0.0, 0.0, half), radius),), motion, friction=0.0)
+
+
+def _pulley(whisker: Whisker, radius: float, motion: RigidMotion) -> Obstacle:
+    """Return a frictionless rod along z between two flanges, which an undisturbed whisker does not touch."""
+    groove = _CLEARANCE * whisker.base_radius
+    rim, half = radius + 10 * whisker.base_radius, whisker.arc_length
+    flanges = (Cylinder((0.0, 0.0, side * groove), (0.0, 0.0, side * half), rim) for side in (-1, 1))
+    return Obstacle((*_peg_obstacle(whisker, radius, motion).parts, *flanges), motion, friction=0.0)
 
 
 def _check_peg(whisker: Whisker, peg_radius: float) -> None:

@@ -24,6 +24,19 @@ def test_a_peg_reproduces_the_elastica(preset, promise, at, offset):
     assert result.force_error < promise
 
 
+@pytest.mark.slow
+def test_a_bare_rod_loses_the_whisker_sideways_before_the_depth_of_the_plane_and_a_pulley_does_not(monkeypatch):
+    # The planar equilibrium is unstable once the contact slope passes 90°; here round-off is disturbance enough.
+    a4 = _gate_whiskers()["A4"]
+    at = 0.3 * a4.arc_length
+    held = validation.slip_off(a4, at, fidelity="accurate")
+    monkeypatch.setattr(validation, "_pulley", validation._peg_obstacle)
+    bare = validation.slip_off(a4, at, fidelity="accurate")
+    assert np.abs(held.trace.link_positions[..., 2]).max() < 0.01 * a4.arc_length
+    assert np.abs(bare.trace.link_positions[..., 2]).max() > 0.1 * a4.arc_length
+    assert bare.error < -0.02 < held.error
+
+
 def _gate_whiskers():
     mouse, rat = WhiskerArray.mouse(), WhiskerArray.rat()
     published = [mouse["C2"], mouse["A4"], mouse["E5"], rat["C1"]]
@@ -71,7 +84,7 @@ def test_every_preset_rings_as_the_rod_and_is_damped_as_asked(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", _gate_whiskers())
-@pytest.mark.parametrize("share", [0.5, 0.8])
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
 @pytest.mark.parametrize(("preset", "promise"), [("fast", 0.15), ("balanced", 0.05), ("accurate", 0.03)])
 def test_the_whisker_slips_off_at_the_depth_of_the_elastica(request, name, share, preset, promise):
     if (name, share, preset) == ("steep", 0.8, "balanced"):
@@ -100,6 +113,21 @@ def test_modes_are_rung_one_by_one():
     ring = validation.ringdown(C2, modes=2, fidelity=Fidelity(links=20, time_step=5e-5))
     np.testing.assert_allclose(ring.frequencies, ring.reference_frequencies, rtol=0.01)
     assert ring.damping_ratios[1] == pytest.approx(0.05, rel=0.01)
+
+
+@pytest.mark.parametrize("fidelity", [Fidelity.preset("balanced"), Fidelity(links=12, time_step=6e-5)])
+def test_the_second_mode_at_a_presets_own_step_is_the_rods_as_a_backward_euler_step_shows_it(fidelity):
+    ring = validation.ringdown(C2, modes=2, own_step=True, fidelity=fidelity)
+    step = fidelity.step(float(ring.reference_frequencies[0]))
+    pole = np.log(1 + 2j * np.pi * ring.reference_frequencies[1] * step) / step
+    assert ring.frequencies[1] == pytest.approx(abs(pole) / (2 * np.pi), rel=5e-3)
+    assert ring.damping_ratios[1] == pytest.approx(max(pole.real / abs(pole), 0.05), rel=0.02)
+
+
+def test_a_mode_that_a_presets_own_step_cannot_show_is_nan():
+    ring = validation.ringdown(C2, modes=3, own_step=True, fidelity="fast")
+    assert np.isfinite(ring.frequencies[0])
+    assert np.isnan(ring.frequencies[2])
 
 
 def test_a_peg_pushing_up_pushes_the_base_up_and_turns_it_left():
