@@ -9,7 +9,7 @@ The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`spli
 from __future__ import annotations
 
 from brainbench.metrics.animal_to_animal import score_animals
-from brainbench.metrics.bootstrap import DRAWS, Bootstrap, bootstrap_ceiling, bootstrap_score
+from brainbench.metrics.bootstrap import DRAWS, Bootstrap, bootstrap_ceiling, bootstrap_comparisons, bootstrap_score
 from brainbench.metrics.ceiling import NoiseCeiling, noise_ceiling
 from brainbench.metrics.compare import COMPARISONS, compare
 from brainbench.metrics.equivalence import EquivalenceTest, equivalence_test, turing_test
@@ -40,6 +40,7 @@ __all__ = [
     "SubjectRDM",
     "TrialBlock",
     "bootstrap_ceiling",
+    "bootstrap_comparisons",
     "bootstrap_score",
     "compare",
     "compare_models",

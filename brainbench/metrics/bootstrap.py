@@ -171,6 +171,24 @@ def animal_counts(generator: np.random.Generator, animals: int, draws: int) -> F
     return generator.multinomial(animals, np.full(animals, 1 / animals), size=draws).astype(np.float64)
 
 
+def bootstrap_comparisons(
+    model_rdms: ArrayLike, brain_rdms: ArrayLike, *, method: str = "pearson", draws: int = DRAWS, seed: int = 0
+) -> Floats:
+    """Return the mean raw comparison [D, M] of models [M, P] with animals [A, P] drawn with replacement.
+
+    All models meet the same draws (rsatoolbox's ``eval_bootstrap_rdm``).
+
+    Raises:
+        UsageError: unknown method, or RDMs of different numbers of stimuli.
+    """
+    check_comparison(method)
+    models, brain = (
+        np.atleast_2d(rdm_stack(rdms, what)) for rdms, what in ((model_rdms, "model_rdms"), (brain_rdms, "brain_rdms"))
+    )
+    r = compare_rdms(models[:, None], brain[None], method=method)
+    return animal_counts(np.random.default_rng(seed), len(brain), draws) @ r.T / len(brain)
+
+
 def bootstrap_ceiling(rdms: ArrayLike, *, method: str = "pearson", draws: int = DRAWS, seed: int = 0) -> Floats:
     """Return noise ceilings (lower, upper) [D, 2] of animals drawn with replacement from RDMs [A, P].
 

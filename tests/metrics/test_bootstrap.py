@@ -14,6 +14,7 @@ from brainbench.metrics import (
     TrialBlock,
     bootstrap_ceiling,
     bootstrap_score,
+    compare,
     noise_ceiling,
     rdm,
     score_rdms,
@@ -22,7 +23,7 @@ from brainbench.metrics import (
 from brainbench.metrics import _resampling as resampling
 from brainbench.metrics._halves import Session
 from brainbench.metrics._hashing import key_hashes
-from brainbench.metrics.bootstrap import ceilings
+from brainbench.metrics.bootstrap import animal_counts, bootstrap_comparisons, ceilings
 from tests.metrics.fakes import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 
@@ -196,6 +197,16 @@ def test_ceilings_of_draws_equal_rsatoolbox(ours, theirs):
         drawn = RDMs(rdms[rows], rdm_descriptors={"animal": rows})
         expected = boot_noise_ceiling(drawn, method=theirs, rdm_descriptor="animal")
         np.testing.assert_allclose(ceilings(rdms, np.array([counts], dtype=float), ours)[0], expected, atol=1e-10)
+
+
+def test_models_meet_the_same_draws_of_animals():
+    rng = np.random.default_rng(4)
+    models, brain = np.stack([make_rdm(rng) for _ in range(3)]), np.stack([make_rdm(rng) for _ in range(5)])
+    found = bootstrap_comparisons(models, brain, draws=2000, seed=3)
+    counts = animal_counts(np.random.default_rng(3), 5, 2000)
+    drawn = np.repeat(np.arange(5), counts[7].astype(int))
+    np.testing.assert_allclose(found[7], compare(models[:, None], brain[drawn]).mean(axis=1), atol=1e-12)
+    np.testing.assert_allclose(found.mean(axis=0), compare(models[:, None], brain).mean(axis=1), atol=0.03)
 
 
 def test_a_draw_of_one_animal_has_no_lower_ceiling():

@@ -1,0 +1,198 @@
+"""Speed and memory of the metrics beside rsatoolbox 0.3.2, same definitions, one run.
+
+    PYTHONPATH=. python benchmarks/metrics.py [--large] [--write]
+
+``--large`` adds the RDM of 2,000 stimuli and 100,000 units; ``--write`` puts the tables into RESULTS.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import time
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from benchmarks.results import table, write_section
+from brainbench.metrics import (
+    TrialBlock,
+    bootstrap_ceiling,
+    bootstrap_comparisons,
+    compare_models,
+    noise_precision,
+    rdm,
+    score_animals,
+    score_rdms,
+    subject_rdm,
+)
+
+STIMULI = [f"s{k}" for k in range(6)]
+
+
+def median_seconds(job: Callable[[], object], repeats: int) -> float:
+    """Return the median wall time of several runs after one that warms up."""
+    job()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        job()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def rsatoolbox_rows() -> list[list[str]]:
+    """Time both libraries on the same numbers, and measure how far they differ."""
+    import tqdm
+    from rsatoolbox.data import Dataset
+    from rsatoolbox.data.noise import prec_from_unbalanced
+    from rsatoolbox.inference.bootstrap import bootstrap_sample_rdm
+    from rsatoolbox.inference.evaluate import eval_bootstrap_rdm
+    from rsatoolbox.inference.noise_ceiling import boot_noise_ceiling
+    from rsatoolbox.model import ModelFixed
+    from rsatoolbox.rdm import RDMs, calc_rdm
+
+    tqdm.trange = lambda n, **_: range(n)
+    rng = np.random.default_rng(0)
+    rows = []
+
+    def add(what: str, theirs: Callable[[], object], ours: Callable[[], object], goal: str, difference: str) -> None:
+        slow, fast = median_seconds(theirs, 1), median_seconds(ours, 15)
+        rows.append([what, f"{slow * 1e3:.3g}", f"{fast * 1e3:.3g}", f"{slow / fast:.0f}×", goal, difference])
+
+    brain = np.stack([rdm(rng.normal(size=(6, 12))) for _ in range(11)])
+    models = np.stack([rdm(rng.normal(size=(6, 12))) for _ in range(10)])
+    animals = RDMs(brain, rdm_descriptors={"index": np.arange(11)})
+    fixed = [ModelFixed(str(i), RDMs(model[None])) for i, model in enumerate(models)]
+    for ours, theirs in (("pearson", "corr"), ("rho-a", "rho-a")):
+
+        def their_ceilings(method: str = theirs) -> None:
+            for _ in range(1000):
+                boot_noise_ceiling(bootstrap_sample_rdm(animals)[0], method=method, rdm_descriptor="index")
+
+        plain = np.abs(np.subtract(boot_noise_ceiling(animals, method=theirs), _ceiling(brain, ours))).max()
+        add(
+            f"1,000 ceiling bootstraps, 11 animals, {ours}",
+            their_ceilings,
+            lambda m=ours: bootstrap_ceiling(brain, method=m),
+            "50×",
+            f"{plain:.0e}",
+        )
+        theirs_mean = eval_bootstrap_rdm(fixed, animals, method=theirs, N=1000, boot_noise_ceil=False).evaluations
+        ours_mean = bootstrap_comparisons(models, brain, method=ours)
+        error = np.abs(theirs_mean.mean(axis=0) - ours_mean.mean(axis=0)).max()
+        add(
+            f"1,000 bootstrap evaluations of 10 models, {ours}",
+            lambda m=theirs: eval_bootstrap_rdm(fixed, animals, method=m, N=1000, boot_noise_ceil=False),
+            lambda m=ours: bootstrap_comparisons(models, brain, method=m),
+            "50×",
+            f"{error:.0e} (random draws)",
+        )
+    responses, labels = rng.normal(size=(600, 999)), np.repeat(np.arange(6), 100)
+    precision = noise_precision(responses, labels)
+    for count in (2, 5, 10):
+        folds = np.tile(np.arange(count), 600 // count)
+        data = Dataset(responses, obs_descriptors={"stimulus": labels, "fold": folds})
+        for name, weight in (("", None), (", with noise precision", precision)):
+
+            def theirs_crossnobis(data: Dataset = data, weight: object = weight) -> np.ndarray:
+                found = calc_rdm(data, method="crossnobis", descriptor="stimulus", cv_descriptor="fold", noise=weight)
+                return found.dissimilarities[0]
+
+            def ours_crossnobis(folds: np.ndarray = folds, weight: np.ndarray | None = weight) -> np.ndarray:
+                return rdm(responses, labels, method="crossnobis", folds=folds, precision=weight)
+
+            error = np.abs(theirs_crossnobis() - ours_crossnobis()).max()
+            what = f"crossnobis, 999 units × 600 trials, {count} folds{name}"
+            add(what, theirs_crossnobis, ours_crossnobis, "20×", f"{error:.0e}")
+    data = Dataset(responses, obs_descriptors={"stimulus": labels})
+    error = np.abs(prec_from_unbalanced(data, "stimulus", method="shrinkage_diag") - precision).max()
+    add(
+        "shrinkage precision, 999 units × 600 trials",
+        lambda: prec_from_unbalanced(data, "stimulus", method="shrinkage_diag"),
+        lambda: noise_precision(responses, labels),
+        "",
+        f"{error:.0e}",
+    )
+    return rows
+
+
+def _ceiling(brain: np.ndarray, method: str) -> tuple[float, float]:
+    from brainbench.metrics import noise_ceiling
+
+    return tuple(noise_ceiling(brain, method=method))
+
+
+def make_animals(count: int = 11, units: int = 91, repeats: int = 60) -> list[TrialBlock]:
+    """Sessions of the size of the Rodgers recordings: 999 units over 11 animals."""
+    rng = np.random.default_rng(1)
+    latent = rng.normal(size=(6, 4))
+    labels = np.repeat(np.arange(6), repeats)
+    blocks = []
+    for animal in range(count):
+        means = latent @ rng.normal(size=(4, units))
+        responses = means[labels] + 4 * rng.normal(size=(len(labels), units))
+        blocks.append(TrialBlock(responses, labels, [f"{animal}/{i}" for i in range(len(labels))]))
+    return blocks
+
+
+def score_rows() -> list[list[str]]:
+    """Time a whole score and sixty-four models on one brain side."""
+    rng = np.random.default_rng(2)
+    blocks = make_animals()
+    models = {f"m{j}": {f"l{i}": rdm(rng.normal(size=(6, 12))) for i in range(12)} for j in range(64)}
+    rows = []
+
+    start = time.perf_counter()
+    subjects = [subject_rdm(f"a{i}", [block], 6, draws=1000, draw_splits=20) for i, block in enumerate(blocks)]
+    brain = time.perf_counter() - start
+    rows.append(["brain side: 11 animals, 1,000 splits, 1,000 draws × 20 splits", f"{brain:.2f}", ""])
+    start = time.perf_counter()
+    score = score_rdms(models["m0"], subjects, name="m0", stimuli=STIMULI)
+    between = score_animals(subjects, stimuli=STIMULI)
+    one = time.perf_counter() - start
+    rows.append(["one model: 12 layers, 720 orders, bootstrap; animal to animal, 10,000 orders", f"{one:.2f}", ""])
+    rows.append(["**full score**", f"**{brain + one:.2f}**", "3"])
+    start = time.perf_counter()
+    compare_models(models, subjects, stimuli=STIMULI)
+    many = time.perf_counter() - start
+    rows.append(["**64 models, corrected and paired, with the brain side**", f"**{brain + many:.2f}**", "60"])
+    errors = score.provenance["statistics"]["monte_carlo_error"]
+    print("Monte-Carlo errors:", {key: f"{value:.2g}" for key, value in errors.items()}, between.status)
+    return rows
+
+
+def large_row() -> list[str]:
+    """Time and measure the RDM of 2,000 stimuli and 100,000 units, float32."""
+    responses = np.empty((2000, 100_000), dtype=np.float32)
+    rng = np.random.default_rng(3)
+    for row in responses:
+        rng.standard_normal(out=row, dtype=np.float32)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.perf_counter()
+    rdm(responses)
+    seconds = time.perf_counter() - start
+    extra = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**20
+    return ["RDM of 2,000 stimuli × 100,000 units, float32", f"{seconds:.1f}", f"{extra:.2f} GiB above the input (2)"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--large", action="store_true")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    large = [large_row()] if options.large else []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        first = table(["job", "rsatoolbox ms", "ours ms", "ratio", "goal", "largest difference"], rsatoolbox_rows())
+    second = table(["job", "s", "goal"], score_rows() + large)
+    body = f"{first}\n\n{second}"
+    print(body)
+    if options.write:
+        write_section("Metrics beside rsatoolbox", "PYTHONPATH=. python benchmarks/metrics.py --large --write", body)
+
+
+if __name__ == "__main__":
+    main()
