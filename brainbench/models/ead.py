@@ -134,14 +134,19 @@ class EAD(nn.Module):
             limits.append(self.decoder.steps)
         return [limit for limit in limits if limit is not None]
 
-    def encode(self, x: torch.Tensor) -> torch.Tensor:
+    def encode(self, x: torch.Tensor, *, last: bool = False) -> torch.Tensor:
         """Return the features [B, T, F] that the decoder or the head of another objective reads.
+
+        Args:
+            x: Sweeps in SI.
+            last: Return only those of the last step [B, F], which spares what no later step reads.
 
         Raises:
             UsageError: as for :meth:`forward`.
         """
         features = self.encoder(self._normalise(x), **self._unroll)
-        return features if self.attender is None else self.attender(features)
+        features = features if self.attender is None else self.attender(features)
+        return features[:, -1] if last else features
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the decoder's output at the last step [B, classes].
@@ -149,8 +154,7 @@ class EAD(nn.Module):
         Raises:
             UsageError: ``x`` is not [B, T, C, H, W] as :attr:`spec` says, or too long for the attender.
         """
-        features = self.encode(x)
-        return self.decoder(features if isinstance(self.decoder, AllStepsDecoder) else features[:, -1])
+        return self.decoder(self.encode(x, last=not isinstance(self.decoder, AllStepsDecoder)))
 
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{layer: [B, T, ...]}`` for the layers asked for (all by default), in the order of ``layers``.

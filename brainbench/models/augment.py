@@ -1,0 +1,179 @@
+"""Augmentations of sweeps [B, T, S·C, H, W] in SI, drawn anew for every sample.
+
+``physical`` mirrors the scene: dorsal and ventral (vertical), rostral and caudal (horizontal), both (a half turn),
+and plays it backwards. Whiskers, forces and moments go together: forces are polar vectors, moments axial ones
+(about each base point), and whiskers change places only among cells that hold one, so no signal is lost.
+
+``thesis`` is the published behaviour: the same flips, quarter turns and time reversal of the grid of numbers, drawn
+once per batch, without turning the vectors; a quarter turn of 5 × 7 is cropped and loses 28.6 % of the cells.
+
+``image`` is the negative control: noise, blur, jitter and grey scale of pictures, which mean nothing to forces.
+
+Axes are those of the stimuli: x to the right, y rostral, z dorsal; rows A–E run ventrally and columns 0–6 rostrally.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch.nn import functional
+
+from brainbench.errors import UsageError, unknown_name
+from brainbench.models.normaliser import Normaliser
+from brainbench.types import CHANNELS, GRID_SHAPE
+
+LAST_COLUMNS = (4, 4, 6, 6, 5)
+"""Last whisker of rows A–E of the mouse (Bresee et al. 2023); columns count from 0, the other cells are empty."""
+
+_MIRRORED = {"vertical": "z", "horizontal": "y"}
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What is done to every sample at training time.
+
+    Raises:
+        UsageError: there is no such kind, or the masked share is not in [0, 1).
+    """
+
+    kind: str = "none"
+    """``none``, ``physical``, ``thesis`` or ``image``."""
+    masking: float = 0.0
+    """Share of the time steps that are set to zero (temporal masking; published with 0.75)."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise unknown_name("augmentation", self.kind, KINDS)
+        if not 0.0 <= self.masking < 1.0:
+            raise UsageError(
+                f"The share of masked time steps lies between 0 and 1, 1 excluded; received {self.masking!r}."
+            )
+
+    def __str__(self) -> str:
+        return self.kind + (f" + {self.masking:.0%} masking" if self.masking else "")
+
+    def __call__(self, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Return an augmented copy of sweeps [B, T, S·C, 5, 7].
+
+        Args:
+            x: Sweeps in SI; unchanged.
+            generator: Generator on the CPU; equal states give equal results on every device.
+        """
+        y = KINDS[self.kind](x, generator)
+        return mask_steps(y, self.masking, generator) if self.masking else y
+
+
+def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
+    """Mirror sweeps physically: ``vertical`` (z → −z) or ``horizontal`` (y → −y).
+
+    Raises:
+        UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
+    """
+    if direction not in _MIRRORED:
+        raise unknown_name("direction of a flip", direction, _MIRRORED)
+    if x.ndim != 5 or x.shape[2] % len(CHANNELS) or tuple(x.shape[3:]) != GRID_SHAPE:
+        raise UsageError(
+            f"A physical flip needs sweeps [batch, time, sub-steps × {len(CHANNELS)}, {GRID_SHAPE[0]}, "
+            f"{GRID_SHAPE[1]}]; received {list(x.shape)}."
+        )
+    # A mirror turns the normal part of a polar vector (force) and the tangential part of an axial one (moment).
+    normal = _MIRRORED[direction]
+    signs = [-1.0 if (name[1] == normal) == (name[0] == "F") else 1.0 for name in CHANNELS]
+    turned = torch.tensor(signs * (x.shape[2] // len(CHANNELS)), dtype=x.dtype, device=x.device)
+    places = torch.tensor(_places(direction), device=x.device)
+    return (x.flatten(3)[..., places] * turned[:, None]).unflatten(3, GRID_SHAPE)
+
+
+def reverse_time(x: torch.Tensor) -> torch.Tensor:
+    """Play sweeps backwards, sub-steps included; forces of slow contact do not know the direction of time."""
+    samples = x.unflatten(2, (-1, len(CHANNELS))).flatten(1, 2)
+    return samples.flip(1).reshape(x.shape)
+
+
+def mask_steps(x: torch.Tensor, share: float, generator: torch.Generator) -> torch.Tensor:
+    """Set a share of the time steps of each sample to zero (rounded to whole steps, at least one step stays)."""
+    batch, steps = x.shape[:2]
+    count = min(round(share * steps), steps - 1)
+    order = torch.rand(batch, steps, generator=generator).argsort(1)
+    kept = (order >= count).to(device=x.device, dtype=x.dtype)
+    return x * kept.view(batch, steps, *(1,) * (x.ndim - 2))
+
+
+def _places(direction: str) -> list[int]:
+    """Return for every cell of the grid the cell whose whisker comes to it: the order of a row or column reversed."""
+    rows, columns = GRID_SHAPE
+    lines = (
+        [[row * columns + column for column in range(LAST_COLUMNS[row] + 1)] for row in range(rows)]
+        if direction == "horizontal"
+        else [
+            [row * columns + column for row in range(rows) if column <= LAST_COLUMNS[row]] for column in range(columns)
+        ]
+    )
+    places = list(range(rows * columns))
+    for line in lines:
+        for cell, source in zip(line, reversed(line), strict=True):
+            places[cell] = source
+    return places
+
+
+def _coins(x: torch.Tensor, generator: torch.Generator, probability: float = 0.5) -> torch.Tensor:
+    drawn = torch.rand(len(x), generator=generator) < probability
+    return drawn.to(x.device).view(-1, *(1,) * (x.ndim - 1))
+
+
+def _physical(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    # Both flips together are the half turn, so three fair coins draw the eight motions evenly.
+    for direction in _MIRRORED:
+        x = torch.where(_coins(x, generator), flip(x, direction), x)
+    return torch.where(_coins(x, generator), reverse_time(x), x)
+
+
+def _thesis(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    draw = torch.rand(3, generator=generator) < 0.5
+    turns = int(torch.randint(4, (1,), generator=generator))
+    dims = [axis for axis, drawn in zip((3, 4, 1), draw, strict=True) if drawn]
+    x = x.flip(dims) if dims else x
+    turned = torch.rot90(x, turns, (3, 4))
+    if turns % 2:
+        rows, columns = x.shape[3:]
+        margin = (columns - rows) // 2
+        turned = functional.pad(turned[:, :, :, margin : margin + rows], (margin, margin))
+    return turned
+
+
+def _image(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    # Pictures have one unit per pixel: work in the units the networks see.
+    scale = Normaliser.physical(x.shape[2] // len(CHANNELS)).scale.to(device=x.device, dtype=x.dtype)
+    y = x / scale
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.rand(len(x), *shape, generator=generator).to(device=x.device, dtype=x.dtype)
+
+    # Colour jitter: every channel its own brightness (offset) and contrast (gain).
+    spread = y.flatten(1).std(1).view(-1, 1, 1, 1, 1)
+    offset, gain = drawn(1, x.shape[2], 1, 1), drawn(1, x.shape[2], 1, 1)
+    y = torch.where(_coins(x, generator, 0.8), y * (0.6 + 0.8 * gain) + 0.4 * spread * (2 * offset - 1), y)
+    y = torch.where(_coins(x, generator, 0.2), y.mean(2, keepdim=True).expand_as(y), y)
+    kernel = torch.tensor([1.0, 2.0, 1.0], dtype=x.dtype, device=x.device)
+    kernel = (kernel[:, None] * kernel / 16.0).expand(x.shape[2], 1, 3, 3)
+    blurred = functional.conv2d(y.flatten(0, 1), kernel, padding=1, groups=x.shape[2]).unflatten(0, x.shape[:2])
+    y = torch.where(_coins(x, generator), blurred, y)
+    noise = torch.randn(x.shape, generator=generator).to(device=x.device, dtype=x.dtype)
+    y = torch.where(_coins(x, generator), y + 0.1 * spread * noise, y)
+    return y * scale
+
+
+def _none(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    del generator
+    return x
+
+
+KINDS: Mapping[str, Callable[[torch.Tensor, torch.Generator], torch.Tensor]] = {
+    "none": _none,
+    "physical": _physical,
+    "thesis": _thesis,
+    "image": _image,
+}
+"""Augmentations by name."""
