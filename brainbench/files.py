@@ -122,6 +122,21 @@ def file_hash(path: str | os.PathLike[str], *, length: int = 16) -> str:
     return digest.hexdigest()[:length]
 
 
+def hash_arrays(arrays: Mapping[str, Any]) -> str:
+    """Hash arrays by name, type, shape and bytes, in alphabetical order of their names (SHA-256, 32 digits).
+
+    Unlike :func:`content_hash` it copies nothing: for hundreds of megabytes.
+    """
+    import numpy as np
+
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name}:{array.dtype.str}:{array.shape}:".encode())
+        digest.update(array.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()[:32]
+
+
 def _update(digest: Any, value: Any) -> None:
     if isinstance(value, (bytes, bytearray, memoryview)):
         digest.update(b"bytes:")

@@ -5,7 +5,6 @@ The bytes of a shard depend on what was asked for alone: no time, no machine and
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import DataError, UsageError
-from brainbench.files import atomic_path, content_hash, to_json
+from brainbench.files import atomic_path, content_hash, hash_arrays, to_json
 from brainbench.stimuli.generation.engine import simulate_sweeps
 from brainbench.stimuli.objects import Solid
 from brainbench.stimuli.sweep_grid import Sweep, default_array
@@ -139,15 +138,6 @@ def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
             stream.seek(offset)
             _write_all(stream, wrench)
     return len(content.task)
-
-
-def hash_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Hash arrays by name, type, shape and bytes (BLAKE2b, 128 bits, hexadecimal)."""
-    digest = hashlib.blake2b(digest_size=16)
-    for name, array in arrays.items():
-        digest.update(f"{name}:{array.dtype.str}:{array.shape}:".encode())
-        digest.update(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data)
-    return digest.hexdigest()
 
 
 def _take(batch: SweepBatch, empty: NDArray[np.float32], chosen: NDArray[np.intp]) -> NDArray[np.float32]:

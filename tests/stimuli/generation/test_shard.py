@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from brainbench.errors import DataError
+from brainbench.files import hash_arrays
 from brainbench.stimuli import simulate
 from brainbench.stimuli.generation.manifest import is_whole
 from brainbench.stimuli.generation.shard import (
@@ -13,7 +14,6 @@ from brainbench.stimuli.generation.shard import (
     UNSTABLE,
     UNUSABLE,
     build_solids,
-    hash_arrays,
     make_shard,
     simulate_shard,
     write_shard,
