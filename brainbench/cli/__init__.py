@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from brainbench import __version__
-from brainbench.cli import doctor, leaderboard, models, recordings, score, stimuli, tradeoff
+from brainbench.cli import doctor, leaderboard, models, power, recordings, score, stimuli, tradeoff
 from brainbench.errors import BrainbenchError
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("score")(score.score)
+app.command("power")(power.power)
 app.command("doctor")(doctor.doctor)
 app.add_typer(models.app, name="models")
 app.add_typer(recordings.app, name="recordings")
