@@ -19,10 +19,10 @@ def distances(real: type) -> SimpleNamespace:
     primitive is least, that gap (negative inside), and the direction out of the primitive there.
 
     ``segment_triangle(a, b, p, q, r)`` → (squared distance, share, barycentric q, barycentric r): closest points of a
-    segment and a triangle, found among the segment's ends over the face and the segment against the three edges; a
-    segment that pierces the face has distance 0 at the piercing point.
+    segment and the edges of a triangle; a segment that pierces the face has distance 0 at the piercing point.
 
-    ``point_triangle(x, p, q, r)`` → (barycentric q, barycentric r) of the closest point.
+    ``point_triangle(x, p, q, r)`` → (barycentric q, barycentric r) of the closest point. Both together give the
+    distance of a segment from a triangle: it is least at an end of the segment or on an edge.
     """
     import warp as wp
 
@@ -168,25 +168,18 @@ def distances(real: type) -> SimpleNamespace:
 
     @wp.func
     def segment_triangle(a: vec3, b: vec3, p: vec3, q: vec3, r: vec3) -> vec4:
-        """Squared distance, share of the segment, barycentric q and r of the closest points."""
+        """Squared distance, share of the segment, barycentric q and r of the closest points of edges and interior.
+
+        The segment's ends over the face are left to ``point_triangle``.
+        """
         along = b - a
         pq = q - p
         pr = r - p
         zero = real(0.0)
         one = real(1.0)
-        at = point_triangle(a, p, q, r)
-        gap = a - (p + pq * at[0] + pr * at[1])
-        best = vec4(wp.dot(gap, gap), zero, at[0], at[1])
-        at = point_triangle(b, p, q, r)
-        gap = b - (p + pq * at[0] + pr * at[1])
-        square = wp.dot(gap, gap)
-        if square < best[0]:
-            best = vec4(square, one, at[0], at[1])
         pair = segments(a, along, p, pq)
         gap = a + along * pair[0] - (p + pq * pair[1])
-        square = wp.dot(gap, gap)
-        if square < best[0]:
-            best = vec4(square, pair[0], pair[1], zero)
+        best = vec4(wp.dot(gap, gap), pair[0], pair[1], zero)
         pair = segments(a, along, p, pr)
         gap = a + along * pair[0] - (p + pr * pair[1])
         square = wp.dot(gap, gap)

@@ -17,7 +17,7 @@ from brainbench.stimuli.backends.rod._tracks import tracks
 
 CONTACTS = 6
 """Contacts of one whisker that are solved together; the tightest are kept when there are more."""
-SWEEPS = 60
+SWEEPS = 150
 """Most Gauss-Seidel sweeps over the contacts of one step."""
 LARGEST_BEND = 1.5
 """Bend of one joint (rad) beyond which a chain means nothing."""
@@ -49,8 +49,8 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
     mat33: Any = wp.types.matrix((3, 3), real)
     shape = distances(real)
     track = tracks(real)
-    segment_primitive, segment_triangle = shape.segment_primitive, shape.segment_triangle
-    primitive = shape.primitive
+    segment_primitive, primitive = shape.segment_primitive, shape.primitive
+    segment_triangle, point_triangle = shape.segment_triangle, shape.point_triangle
     Tracks, pose_at = track.Tracks, track.pose_at
     single = real is wp.float32
     rows = 3 * CONTACTS
@@ -240,17 +240,43 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
 
     @wp.struct
     class Touch:
-        found: wp.int32
+        """How near a link comes to a shape: between its ends, and at its far end."""
+
+        between: wp.int32
+        """Whether something between the ends is near."""
         share: real
         gap: real
+        normal: vec3
+        end: wp.int32
+        """Whether the far end is near."""
+        end_gap: real
+        end_normal: vec3
         clear: real
         """Lower bound of the distance of the link's axis from the surface."""
-        normal: vec3
+
+    @wp.func
+    def corner_point(bodies: Bodies, face: int, v: real, w: real) -> vec3:
+        p = bodies.corner[face, 0]
+        return p + (bodies.corner[face, 1] - p) * v + (bodies.corner[face, 2] - p) * w
+
+    @wp.func
+    def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
+        """Direction out of a mesh and signed distance, given the way from the closest point and the pseudo-normal."""
+        if distance < real(1e-3) * radius:
+            return vec4(outward[0], outward[1], outward[2], distance)
+        side = real(1.0) / distance
+        signed = distance
+        if wp.dot(away, outward) < real(0.0):
+            side = -side
+            signed = -distance
+        return vec4(away[0] * side, away[1] * side, away[2] * side, signed)
 
     @wp.func
     def near_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, margin: real) -> Touch:
         """Look at the triangles around a link whose axis a–b lies within ``margin`` + radius of a mesh."""
         touch = Touch()
+        touch.between = 0
+        touch.end = 0
         mesh = bodies.mesh[s]
         reach = wp.max(ra, rb) + margin
         low = wp.vec3f(
@@ -270,64 +296,56 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         share = real(0.0)
         v = real(0.0)
         w = real(0.0)
+        end_nearest = real(1e20)
+        end_face = wp.int32(-1)
+        end_v = real(0.0)
+        end_w = real(0.0)
+        start_nearest = real(1e20)
         first = bodies.face[s]
         while wp.mesh_query_aabb_next(query, candidate):
             row = first + candidate
-            at = segment_triangle(a, b, bodies.corner[row, 0], bodies.corner[row, 1], bodies.corner[row, 2])
+            p = bodies.corner[row, 0]
+            q = bodies.corner[row, 1]
+            r = bodies.corner[row, 2]
+            at = segment_triangle(a, b, p, q, r)
             if at[0] < nearest:
                 nearest = at[0]
                 share = at[1]
                 v = at[2]
                 w = at[3]
                 face = row
-        touch.found = 0
-        touch.clear = reach
+            spot = point_triangle(b, p, q, r)
+            square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
+            if square < end_nearest:
+                end_nearest = square
+                end_v = spot[0]
+                end_w = spot[1]
+                end_face = row
+            spot = point_triangle(a, p, q, r)
+            start_nearest = wp.min(start_nearest, wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1]))
+        touch.clear = wp.min(reach, wp.sqrt(wp.min(nearest, wp.min(end_nearest, start_nearest))))
         if face >= 0:
-            distance = wp.sqrt(nearest)
-            normal = outward_of(bodies, face, v, w)
-            radius = ra + (rb - ra) * share
-            if distance < real(0.3) * radius:
-                # The axis itself is at the surface: an end that lies inside tells where out is.
-                deepest = real(0.0)
-                for end in range(2):
-                    point = a
-                    if end == 1:
-                        point = b
-                    hit = wp.mesh_query_point_sign_normal(mesh, single3(point), wp.float32(1.0))
-                    if hit.result:
-                        if hit.sign < 0.0:
-                            on = wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v)
-                            away = vec3(real(on[0]), real(on[1]), real(on[2])) - point
-                            depth = wp.length(away)
-                            if depth > deepest:
-                                deepest = depth
-                                share = real(end)
-                                if depth > real(1e-4) * radius:
-                                    normal = away / depth
+            if share > real(1e-3) and share < real(1.0 - 1e-3):
                 radius = ra + (rb - ra) * share
-                touch.gap = -deepest - radius
-                if deepest == real(0.0):
-                    touch.gap = distance - radius
-                touch.normal = normal
-            else:
-                p = bodies.corner[face, 0]
-                on = p + (bodies.corner[face, 1] - p) * v + (bodies.corner[face, 2] - p) * w
-                away = (a + (b - a) * share - on) / distance
-                side = real(1.0)
-                if wp.dot(away, normal) < real(0.0):
-                    side = real(-1.0)
-                touch.normal = away * side
-                touch.gap = distance * side - radius
-            touch.share = share
-            touch.clear = distance
-            touch.found = 1
+                away = a + (b - a) * share - corner_point(bodies, face, v, w)
+                out = direction(away, wp.sqrt(nearest), outward_of(bodies, face, v, w), radius)
+                touch.between = 1
+                touch.share = share
+                touch.gap = out[3] - radius
+                touch.normal = vec3(out[0], out[1], out[2])
+            away = b - corner_point(bodies, end_face, end_v, end_w)
+            out = direction(away, wp.sqrt(end_nearest), outward_of(bodies, end_face, end_v, end_w), rb)
+            touch.end = 1
+            touch.end_gap = out[3] - rb
+            touch.end_normal = vec3(out[0], out[1], out[2])
         return touch
 
     @wp.func
     def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real) -> Touch:
         """Distance bound of a link from a mesh, and a contact when its middle lies inside."""
         touch = Touch()
-        touch.found = 0
+        touch.between = 0
+        touch.end = 0
         middle = real(0.5) * (a + b)
         half = real(0.5) * wp.length(b - a)
         far = real(wp.static(FAR)) / bodies.scale[s]
@@ -339,7 +357,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
             distance = wp.length(away)
             touch.clear = distance - half
             if hit.sign < 0.0 and distance > real(0.0):
-                touch.found = 1
+                touch.between = 1
                 touch.share = real(0.5)
                 touch.normal = -away / distance
                 touch.gap = -distance - real(0.5) * (ra + rb)
@@ -385,6 +403,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         # Contacts of one step.
         c_link = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
         c_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
+        c_ahead = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_gap = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_mu = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_at = wp.zeros(wp.static(CONTACTS), dtype=vec3)
@@ -395,8 +414,14 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         ju = wp.zeros(wp.static(rows), dtype=vec2)
         free = wp.zeros(wp.static(rows), dtype=real)
         force = wp.zeros(wp.static(rows), dtype=real)
+        held_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
+        held_force = wp.zeros(wp.static(CONTACTS), dtype=vec3)
+        held_count = int(0)
         comply = wp.zeros(wp.static(rows * rows), dtype=real)
 
+        object_speed = zero
+        for s in range(shapes_from, shapes_to):
+            object_speed = wp.max(object_speed, bodies.speed[s])
         jump = zero
         deepest = zero
         steps = int(0)
@@ -468,79 +493,116 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                 # Contacts that may close within this step.
                 contacts = int(0)
                 closing = int(0)
-                for s in range(shapes_from, shapes_to):
-                    body = pose_at(tr, bodies.track[s], now)
-                    turn_s = bodies.turn[s]
-                    scale = bodies.scale[s]
-                    travel = h * (quickest + wp.length(body.velocity) + wp.length(body.spin) * bodies.radius[s])
-                    margin = real(1.5) * travel + h * jump + real(0.001)
-                    mu = bodies.friction[s]
-                    if mu < zero:
-                        mu = ch.friction[who]
+                travel = h * (quickest + object_speed)
+                margin = real(1.5) * travel + h * jump + real(0.001)
+                near = int(0)
+                if shapes_to > shapes_from:
                     for i in range(links):
+                        clear[i] = clear[i] - real(1.02) * travel
+                        if clear[i] <= margin + ch.taper[i, who][0]:
+                            near = 1
+                if near == 1:
+                    cvw = bw
+                    cvv = bv
+                    for i in range(links):
+                        rate = qd[i]
+                        cvw = cvw + e1[i] * rate[0] + e2[i] * rate[1]
+                        cvv = cvv + wp.cross(node[i], e1[i] * rate[0] + e2[i] * rate[1])
                         taper = ch.taper[i, who]
-                        ra = taper[0] / scale
-                        rb = taper[1] / scale
-                        thick = wp.max(taper[0], taper[1])
-                        if s == shapes_from:
-                            clear[i] = clear[i] - travel * real(1.02)
-                        if clear[i] > margin + thick:
-                            continue
-                        a = (unrotate(turn_s, unrotate(body.turn, node[i] + origin - body.place) - bodies.place[s])) / scale
-                        b = (
-                            unrotate(turn_s, unrotate(body.turn, node[i + 1] + origin - body.place) - bodies.place[s])
-                        ) / scale
-                        touch = Touch()
-                        touch.found = 0
-                        if bodies.kind[s] == wp.static(MESH):
-                            touch = far_mesh(bodies, s, a, b, ra, rb)
-                            if touch.found == 0 and touch.clear * scale <= margin + thick:
-                                touch = near_mesh(bodies, s, a, b, ra, rb, margin / scale)
-                        else:
-                            found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
-                            touch.found = 1
-                            touch.share = found[0]
-                            touch.gap = found[1]
-                            touch.clear = found[1] + wp.min(ra, rb)
-                            touch.normal = vec3(found[2], found[3], found[4])
-                        if s == shapes_from:
-                            clear[i] = touch.clear * scale
-                        else:
-                            clear[i] = wp.min(clear[i], touch.clear * scale)
-                        gap = touch.gap * scale
-                        if touch.found == 1 and gap < margin and not (touch.share > real(0.9999) and i < links - 1):
-                            deepest = wp.max(deepest, -gap)
-                            slot = contacts
-                            if contacts < wp.static(CONTACTS):
-                                contacts = contacts + 1
-                            else:
-                                crowded = crowded + 1
-                                slot = int(0)
-                                for c in range(1, wp.static(CONTACTS)):
-                                    if c_gap[c] > c_gap[slot]:
-                                        slot = c
-                                if c_gap[slot] <= gap:
-                                    slot = int(-1)
-                            if slot >= 0:
-                                normal = rotate(body.turn, rotate(turn_s, touch.normal))
-                                radius = taper[0] + (taper[1] - taper[0]) * touch.share
-                                point = node[i] + (node[i + 1] - node[i]) * touch.share - normal * radius
-                                c_link[slot] = i
-                                c_gap[slot] = gap
-                                c_mu[slot] = mu
-                                c_at[slot] = point
-                                c_arc[slot] = taper[2] + taper[3] * touch.share
-                                half = pose_at(tr, bodies.track[s], now + real(0.5) * h)
-                                c_move[slot] = half.velocity + wp.cross(half.spin, point + origin - half.place)
-                                # One tangent along the whisker, where it tends to slide.
-                                along = node[i + 1] - node[i]
-                                tangent = along - normal * wp.dot(along, normal)
-                                if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
-                                    tangent = e1[i] - normal * wp.dot(e1[i], normal)
-                                tangent = wp.normalize(tangent)
-                                axis[3 * slot] = normal
-                                axis[3 * slot + 1] = tangent
-                                axis[3 * slot + 2] = wp.cross(normal, tangent)
+                        if clear[i] <= margin + taper[0]:
+                            closest = real(1e20)
+                            for s in range(shapes_from, shapes_to):
+                                body = pose_at(tr, bodies.track[s], now)
+                                turn_s = bodies.turn[s]
+                                scale = bodies.scale[s]
+                                local = unrotate(body.turn, node[i] + origin - body.place) - bodies.place[s]
+                                a = unrotate(turn_s, local) / scale
+                                local = unrotate(body.turn, node[i + 1] + origin - body.place) - bodies.place[s]
+                                b = unrotate(turn_s, local) / scale
+                                ra = taper[0] / scale
+                                rb = taper[1] / scale
+                                touch = Touch()
+                                if bodies.kind[s] == wp.static(MESH):
+                                    touch = far_mesh(bodies, s, a, b, ra, rb)
+                                    if touch.between == 0 and touch.clear * scale <= margin + taper[0]:
+                                        touch = near_mesh(bodies, s, a, b, ra, rb, margin / scale)
+                                else:
+                                    found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
+                                    touch.clear = found[1] + wp.min(ra, rb)
+                                    touch.share = found[0]
+                                    touch.gap = found[1]
+                                    touch.normal = vec3(found[2], found[3], found[4])
+                                    touch.between = 0
+                                    if found[0] > real(1e-3) and found[0] < real(1.0 - 1e-3):
+                                        touch.between = 1
+                                    tip = primitive(bodies.kind[s], bodies.size[s] / scale, b)
+                                    touch.end = 1
+                                    touch.end_gap = tip[3] - rb
+                                    touch.end_normal = vec3(tip[0], tip[1], tip[2])
+                                closest = wp.min(closest, touch.clear * scale)
+                                for which in range(2):
+                                    offered = touch.between
+                                    share = touch.share
+                                    gap = touch.gap * scale
+                                    way = touch.normal
+                                    if which == 1:
+                                        offered = touch.end
+                                        share = one
+                                        gap = touch.end_gap * scale
+                                        way = touch.end_normal
+                                    if offered == 1 and gap < margin:
+                                        deepest = wp.max(deepest, -gap)
+                                        normal = rotate(body.turn, rotate(turn_s, way))
+                                        radius = taper[0] + (taper[1] - taper[0]) * share
+                                        point = node[i] + (node[i + 1] - node[i]) * share - normal * radius
+                                        half = pose_at(tr, bodies.track[s], now + real(0.5) * h)
+                                        carried = half.velocity + wp.cross(half.spin, point + origin - half.place)
+                                        approach = wp.dot(normal, cvv + wp.cross(cvw, point) - carried)
+                                        # Where the gap will be: tells apart what only passes by.
+                                        ahead = gap + real(1.5) * h * wp.min(approach, zero)
+                                        if ahead < h * jump + real(0.001):
+                                            slot = contacts
+                                            # The same contact seen from two links, or from both ends of a short gap.
+                                            for c in range(contacts):
+                                                apart = wp.length_sq(c_at[c] - point)
+                                                same = wp.dot(axis[3 * c], normal) > real(0.85)
+                                                if same and apart < real(0.0625) * wp.length_sq(node[i + 1] - node[i]):
+                                                    slot = c
+                                            if slot < contacts:
+                                                if c_ahead[slot] <= ahead:
+                                                    slot = int(-1)
+                                            elif contacts < wp.static(CONTACTS):
+                                                contacts = contacts + 1
+                                            else:
+                                                slot = int(0)
+                                                for c in range(1, wp.static(CONTACTS)):
+                                                    if c_ahead[c] > c_ahead[slot]:
+                                                        slot = c
+                                                if wp.max(gap, c_gap[slot]) < zero:
+                                                    crowded = crowded + 1
+                                                if c_ahead[slot] <= ahead:
+                                                    slot = int(-1)
+                                            if slot >= 0:
+                                                mu = bodies.friction[s]
+                                                if mu < zero:
+                                                    mu = ch.friction[who]
+                                                c_link[slot] = i
+                                                c_gap[slot] = gap
+                                                c_ahead[slot] = ahead
+                                                c_mu[slot] = mu
+                                                c_at[slot] = point
+                                                c_arc[slot] = taper[2] + taper[3] * share
+                                                c_move[slot] = carried
+                                                # One tangent along the whisker, where it tends to slide.
+                                                along = node[i + 1] - node[i]
+                                                tangent = along - normal * wp.dot(along, normal)
+                                                if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
+                                                    tangent = e1[i] - normal * wp.dot(e1[i], normal)
+                                                tangent = wp.normalize(tangent)
+                                                axis[3 * slot] = normal
+                                                axis[3 * slot + 1] = tangent
+                                                axis[3 * slot + 2] = wp.cross(normal, tangent)
+                            clear[i] = closest
 
                 # Up the chain: articulated inertia, bias and what each joint does with them.
                 ia = vec6(zero, zero, zero, zero, zero, zero)
@@ -660,8 +722,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                             moved = vv + av * h + opt.gravity * h + wp.cross(vw + aw * h, point) - c_move[c]
                             for d in range(3):
                                 free[3 * c + d] = wp.dot(axis[3 * c + d], moved)
-                jump_now = h * wp.length(av + wp.cross(aw, node[links]))
-                jump = wp.max(jump_now, real(0.5) * jump)
+                tip_push = av + wp.cross(aw, node[links])
 
                 if contacts > 0:
                     # Contacts that would open anyway cost nothing more.
@@ -676,8 +737,18 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                         top = wp.max(top, c_link[c])
                     if closing == 1:
                         rows_used = 3 * contacts
+                        # The forces of the last step are a good first guess.
+                        for c in range(contacts):
+                            guess = none
+                            for e in range(held_count):
+                                apart = wp.abs(held_arc[e] - c_arc[c])
+                                if apart < real(0.3) * ch.taper[c_link[c], who][3]:
+                                    guess = held_force[e]
+                            force[3 * c] = wp.max(zero, wp.dot(guess, axis[3 * c]))
+                            force[3 * c + 1] = wp.dot(guess, axis[3 * c + 1])
+                            force[3 * c + 2] = wp.dot(guess, axis[3 * c + 2])
+                        held_count = int(0)
                         for r in range(rows_used):
-                            force[r] = zero
                             for e in range(rows_used):
                                 comply[r * wp.static(rows) + e] = zero
                         for back in range(top + 1):
@@ -713,10 +784,10 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 comply[e * wp.static(rows) + r] = comply[r * wp.static(rows) + e]
                         # Forces of rigid contacts with Coulomb friction: projected Gauss-Seidel, one contact at a time.
                         settled = int(0)
+                        change = zero
                         for turn in range(wp.static(SWEEPS)):
                             if settled == 0:
                                 change = zero
-                                largest = zero
                                 for c in range(contacts):
                                     r = 3 * c
                                     n0 = force[r]
@@ -775,18 +846,33 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                                     if size > bound:
                                                         s1_ = s1_ * (bound / size)
                                                         s2_ = s2_ * (bound / size)
+                                                    moved_by = wp.abs(f1 - s1_) + wp.abs(f2 - s2_)
                                                     f1 = s1_
                                                     f2 = s2_
+                                                    if moved_by <= real(1e-4) * bound:
+                                                        break
                                                 fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
                                     force[r] = fn
                                     force[r + 1] = f1
                                     force[r + 2] = f2
-                                    change = wp.max(change, wp.abs(fn - n0) + wp.abs(f1 - p0) + wp.abs(f2 - q0))
-                                    largest = wp.max(largest, fn)
-                                if change <= real(1e-5) * largest:
+                                    # By how much (mm) the forces so far miss the gap that they should leave.
+                                    missed = bn + nn * n0 + n1 * p0 + n2 * q0
+                                    if n0 == zero:
+                                        missed = wp.min(missed, zero)
+                                    slipped = c11 * wp.abs(f1 - p0) + c22 * wp.abs(f2 - q0)
+                                    change = wp.max(change, h * (wp.abs(missed) + slipped))
+                                if change <= real(1e-5):
                                     settled = 1
-                        if settled == 0:
+                        if settled == 0 and change > real(1e-3):
                             unsolved = unsolved + 1
+                        held_count = contacts
+                        for c in range(contacts):
+                            held_arc[c] = c_arc[c]
+                            held_force[c] = (
+                                axis[3 * c] * force[3 * c]
+                                + axis[3 * c + 1] * force[3 * c + 1]
+                                + axis[3 * c + 2] * force[3 * c + 2]
+                            )
                         # Apply them: forces up the chain, then the change of acceleration down.
                         tw = none
                         tv = none
@@ -824,8 +910,9 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                             aw = aw + s1 * a1 + s2 * a2
                             av = av + wp.cross(node[i], s1) * a1 + wp.cross(node[i], s2) * a2
                             push[i] = push[i] + vec2(a1, a2)
-                        jump = wp.max(jump, h * wp.length(av + wp.cross(aw, node[links])))
+                        tip_push = tip_push + av + wp.cross(aw, node[links])
 
+                jump = wp.max(h * wp.length(tip_push), real(0.5) * jump)
                 touched = int(0)
                 if sub == count - 1:
                     arc_sum = zero
