@@ -25,11 +25,14 @@ def whisker(
     links: Annotated[str, typer.Option(help="Links per whisker, comma-separated; the default grid if empty.")] = "",
     time_steps: Annotated[str, typer.Option(help="Time steps in ms, comma-separated; the default grid if empty.")] = "",
     backends: Annotated[str, typer.Option(help="Backends, comma-separated.")] = "mujoco",
+    collisions: Annotated[
+        str, typer.Option(help="Collision geometries of a concave object to measure too, comma-separated, or all.")
+    ] = "",
     csv: Annotated[Path | None, typer.Option(help="Also write the table as CSV.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Also draw error against cost (.png, .svg, .pdf).")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure error and cost of whisker simulations over links, time step and backend, beside the presets.
+    """Measure error and cost of whisker simulations over links, time step, backend and collision geometry.
 
     The table that ships with the package (brainbench/stimuli/fidelity_table.json) is made by this command.
     """
@@ -42,7 +45,13 @@ def whisker(
     except ValueError as error:
         raise UsageError(f"--links and --time-steps take numbers separated by commas ({error}).") from error
     names = tuple(item.strip() for item in backends.split(",") if item.strip())
-    chosen = tradeoff.settings(links=counts, time_steps=steps or tradeoff.TIME_STEPS, backends=names)
+    shapes = tuple(item.strip() for item in collisions.split(",") if item.strip())
+    chosen = tradeoff.settings(
+        links=counts,
+        time_steps=steps or tradeoff.TIME_STEPS,
+        backends=names,
+        collisions=tradeoff.COLLISIONS if shapes == ("all",) else shapes,
+    )
     with progress_bar() as progress:
         points = tradeoff.measure_tradeoff(out, chosen, progress=progress)
     if csv is not None:
@@ -61,9 +70,26 @@ def whisker(
         for point in best
     ]
     text = table(
-        f"{len(points)} settings measured; those that no other beats in both error and cost:",
+        f"{len(points)} settings measured; bench tests that no other beats in both error and cost:",
         ["error", "processor s / whisker-s", "links", "step ms", "backend"],
         rows,
         right=(0, 1, 2, 3),
     )
+    hollow = tradeoff.collision_points(points)
+    if hollow:
+        rows = [
+            [
+                f"{point['error']:.2%}" if point["error"] is not None else "—",
+                f"{point['cost']:.3g}" if point["cost"] is not None else "—",
+                point["collision"],
+                str(point.get("pieces", "")),
+                str(point["links"]),
+                f"{point['time_step'] * 1e3:g}",
+                point["backend"],
+                point["note"],
+            ]
+            for point in hollow
+        ]
+        columns = ["error", "processor s / whisker-s", "collision", "pieces", "links", "step ms", "backend", "note"]
+        text += "\n\n" + table("whisking into the hollow of a concave object:", columns, rows, right=(0, 1, 3, 4, 5))
     emit({"points": points, "front": best, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)

@@ -52,7 +52,7 @@ def mesh_solid(
     """
     _check_collision(collision)
     repaired = repair(load_mesh(path, unit=unit))
-    solid = _touchable(repaired.mesh, collision, decomposition)
+    solid = touchable(repaired.mesh, collision, decomposition)
     # Separate bodies are what "pieces" is for.
     expected = collision == "pieces" and repaired.mesh.diagnosis.watertight
     solid = replace(solid, notes=(*repaired.done, *solid.notes, *(() if expected else repaired.remaining)))
@@ -88,7 +88,7 @@ def shape_solid(
     name = f"{shape.label}-{shape.seed}"
     mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, name)
     if collision != "exact" or not shape.part_points:
-        return _touchable(mesh, collision, decomposition).to_diagonal(diagonal)
+        return touchable(mesh, collision, decomposition).to_diagonal(diagonal)
     notes: tuple[str, ...] = ()
     if len(shape.parts) > 1:
         found = deviation(mesh, shape.parts, samples=1000)
@@ -139,8 +139,8 @@ def _check_collision(collision: str) -> None:
         raise unknown_name("collision geometry", collision, COLLISIONS)
 
 
-def _touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
-    """Make the parts of a solid from its mesh."""
+def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
+    """Return a mesh as a solid that is touched as ``collision`` says; see :func:`mesh_solid`."""
     if collision == "decomposition":
         cut = decompose(mesh, settings)
         origin = {"mesh": mesh.content_hash, "decomposition": cut.key}

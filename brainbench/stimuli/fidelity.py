@@ -62,18 +62,18 @@ class Fidelity:
         return cls(**_PRESETS[name])
 
     @classmethod
-    def auto(cls, *, error: float = 0.05) -> Fidelity:
-        """Return the cheapest measured setting whose relative error is at most ``error``.
+    def auto(cls, *, error: float = 0.05, backend: str = "mujoco") -> Fidelity:
+        """Return the cheapest measured setting of a backend whose relative error is at most ``error``.
 
         The error is the worst over bench tests of mouse whiskers: pegs against the elastica, ring-downs, and whisking
         against a post, with and without friction. Sharp-edged objects at high speed are harder than that.
 
         Raises:
-            UsageError: ``error`` is not positive, or no measured setting is that accurate.
+            UsageError: ``error`` is not positive, the backend was not measured, or no setting is that accurate.
         """
         if not error > 0:
             raise UsageError(f"error must be positive (0.05 = 5 %); received {error!r}.")
-        return cls(**cheapest(measured(), error).settings)
+        return cls(**cheapest(measured(backend), error).settings)
 
     def step(self, frequency: float) -> float:
         """Time step [s] of a whisker whose first mode has this frequency [Hz]."""
@@ -114,17 +114,25 @@ def list_presets() -> tuple[str, ...]:
 
 
 @cache
-def measured() -> tuple[TradeoffPoint, ...]:
-    """Return the measured settings: error as stated in the table, cost in processor seconds per whisker-second."""
+def measured(backend: str = "mujoco") -> tuple[TradeoffPoint, ...]:
+    """Return the measured settings of a backend: error as the table states, cost in processor s per whisker-second.
+
+    Raises:
+        UsageError: the backend was not measured.
+    """
     import json
 
     text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
+    points = [point for point in json.loads(text)["points"] if not point.get("collision")]
+    backends = {point.get("backend", "mujoco") for point in points}
+    if backend not in backends:
+        raise unknown_name("measured backend", backend, backends)
     return tuple(
         TradeoffPoint(
             point["error"] if point["error"] is not None else math.inf,
             point["cost"] if point["cost"] is not None else math.inf,
             {name: point.get(name) for name in ("links", "links_per_mm", "time_step", "steps_per_period")},
         )
-        for point in json.loads(text)["points"]
-        if point.get("backend", "mujoco") == "mujoco"
+        for point in points
+        if point.get("backend", "mujoco") == backend
     )

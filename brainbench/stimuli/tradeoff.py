@@ -11,6 +11,13 @@ Subject: mouse whisker C2, straightened; for the ring-down also the stiffest mou
 - ``error``: the worst of these five; null when a run failed, with the reason in ``note``;
 - ``cost``: processor seconds per simulated second of one whisker in contact, over the three whisking runs.
 
+Points with a ``collision`` measure instead what the collision geometry of a concave object costs and does: C2 whisks
+without friction into the hollow of the Rodgers solid (30 mm), which is touched exactly, cut into convex pieces at a
+threshold, or as its hull:
+
+- ``concave_error``, which is also ``error``: base moment as above, against the exact solid in the converged simulation;
+- ``cost``: the same over this run; ``pieces``: convex parts or triangles that stand for the solid.
+
 A table is a JSON file; points that it holds already are kept, so an interrupted run goes on where it stopped.
 """
 
@@ -26,13 +33,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import BrainbenchError, DataError, missing_dependency
+from brainbench.errors import BrainbenchError, DataError, missing_dependency, unknown_name
 from brainbench.fidelity import TradeoffPoint, pareto_front
 from brainbench.files import atomic_path, read_json, write_json, write_text
+from brainbench.geometry import DecompositionSettings
+from brainbench.stimuli._mesh_solids import touchable
+from brainbench.stimuli._tradeoff_figure import draw_bench, draw_collisions
 from brainbench.stimuli.backends import get_backend
+from brainbench.stimuli.backends._reach import touched
 from brainbench.stimuli.backends.protocol import Job
 from brainbench.stimuli.fidelity import Fidelity, list_presets
 from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.stimuli.objects import PlacedObject, rodgers_solid
 from brainbench.stimuli.obstacle import Capsule, Obstacle
 from brainbench.stimuli.validation import peg, ringdown
 
@@ -52,6 +64,8 @@ TIME_STEPS = ((2e-4, 10.0), (1e-4, 25.0), (5e-5, 120.0), (2e-5, 250.0))
 """Time step [s] with the least steps per period of the first mode, which short whiskers need."""
 CONVERGED = Fidelity(links=40, time_step=1e-5)
 """Setting of the dynamic reference."""
+COLLISIONS = ("exact", "decomposition-0.02", "decomposition-0.1", "hull")
+"""Collision geometries of the concave object; a decomposition with its threshold."""
 PARTS = ("static_error", "ring_error", "dynamic_error", "sliding_error", "flick_error")
 
 
@@ -61,6 +75,12 @@ class Setting:
 
     fidelity: Fidelity
     backend: str = "mujoco"
+    collision: str | None = None
+    """How a concave object is touched, as in :data:`COLLISIONS`; None for the bench tests without one."""
+
+    def __post_init__(self) -> None:
+        if self.collision is not None:
+            _collision(self.collision)
 
 
 def settings(
@@ -68,18 +88,24 @@ def settings(
     links: Sequence[int] = LINKS,
     time_steps: Sequence[tuple[float, float | None]] = TIME_STEPS,
     backends: Sequence[str] = ("mujoco",),
+    collisions: Sequence[str] = (),
 ) -> list[Setting]:
     """Return every combination (``time_steps`` pairs a step [s] with steps per period), after the presets.
 
+    Args:
+        links, time_steps, backends: axes of the bench tests.
+        collisions: geometries of a concave object to measure as well, at each preset, as in :data:`COLLISIONS`.
+
     Raises:
-        UsageError: a value lies outside the range of :class:`Fidelity`.
+        UsageError: a value lies outside the range of :class:`Fidelity`, or a collision geometry is unknown.
     """
     grid = [
         Fidelity(links=count, time_step=step, steps_per_period=periods)
         for count, (step, periods) in itertools.product(links, time_steps)
     ]
     presets = [Fidelity.preset(name) for name in list_presets()]
-    return [Setting(fidelity, name) for name in backends for fidelity in dict.fromkeys([*presets, *grid])]
+    plain = [Setting(fidelity, name) for name in backends for fidelity in dict.fromkeys([*presets, *grid])]
+    return plain + [Setting(*point) for point in itertools.product(presets, backends, collisions)]
 
 
 def measure_tradeoff(
@@ -88,7 +114,8 @@ def measure_tradeoff(
     """Measure the settings that the table at ``path`` lacks, writing it (atomically) after each.
 
     Returns:
-        All points of the table: the fields of the module's text, ``backend`` and the fields of :class:`Fidelity`.
+        All points of the table: the fields of the module's text, ``backend`` and the fields of :class:`Fidelity`;
+        ``collision`` only where a concave object was touched.
 
     Raises:
         DataError: ``path`` holds something else, or points of other experiments or of another MuJoCo.
@@ -108,12 +135,13 @@ def measure_tradeoff(
         points = list(table["points"])
     known = {_key(point) for point in points}
     missing = [setting for setting in wanted if _key(_fields(setting)) not in known]
-    # The reference costs more than most points, so it is run only when something is missing.
-    reference = _whisking(Setting(CONVERGED)) if missing else ()
+    # The references cost more than most points, so they are run only when something is missing.
+    reference = _whisking(Setting(CONVERGED)) if any(item.collision is None for item in missing) else ()
+    hollow = [_into_hollow(Setting(CONVERGED, collision="exact"))[0]] if any(item.collision for item in missing) else []
     for done, setting in enumerate(missing):
         if progress is not None:
             progress(done, len(missing), "measuring settings")
-        points.append(_measure(setting, reference))
+        points.append(_measure_collision(setting, *hollow) if setting.collision else _measure(setting, reference))
         write_json(path, {**head, "points": points})
     if progress is not None and missing:
         progress(len(missing), len(missing), "measuring settings")
@@ -133,19 +161,31 @@ def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) ->
     return write_text(path, text.getvalue())
 
 
-def front(points: Iterable[dict[str, Any]]) -> list[TradeoffPoint]:
-    """Return the points that none beats in both error and cost, cheapest first."""
+def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> list[TradeoffPoint]:
+    """Return the points of the bench tests that none beats in both error and cost, cheapest first.
+
+    Args:
+        points: a table; its points with a collision geometry are other experiments and are left out.
+        backend: of this backend only; of all when None.
+    """
     return pareto_front(
         TradeoffPoint(
             math.inf if p["error"] is None else p["error"], p["cost"], {n: p[n] for n in (*_NAMES, "backend")}
         )
         for p in points
-        if p["cost"] is not None
+        if p["cost"] is not None and not p.get("collision") and backend in (None, p["backend"])
     )
 
 
+def collision_points(points: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the points of a table that touch a concave object."""
+    return [point for point in points if point.get("collision")]
+
+
 def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
-    """Draw error against cost with the front and the presets, to an image whose suffix is the format.
+    """Draw error against cost, with the front of each backend and the presets, to an image whose suffix is the format.
+
+    A second panel has the collision geometries of a concave object, where the table has any.
 
     Raises:
         MissingDependencyError: matplotlib is not installed (extra ``report``).
@@ -154,26 +194,18 @@ def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]
         from matplotlib.figure import Figure
     except ImportError as error:
         raise missing_dependency("matplotlib", extra="report", purpose="Plotting the trade-off") from error
-    usable = [point for point in points if point["error"] is not None]
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    for steps in sorted({point["time_step"] for point in usable}):
-        some = [point for point in usable if point["time_step"] == steps]
-        axes.scatter([p["cost"] for p in some], [p["error"] for p in some], s=18, label=f"{steps * 1e3:g} ms")
-    best = front(usable)
-    axes.step([p.cost for p in best], [p.error for p in best], where="post", color="0.4", lw=1, zorder=0, label="front")
-    for name in list_presets():
-        fields = _key(_fields(Setting(Fidelity.preset(name))))
-        for point in usable:
-            if _key(point) == fields:
-                axes.annotate(name, (point["cost"], point["error"]), xytext=(5, 5), textcoords="offset points")
-    axes.set(
-        xscale="log",
-        yscale="log",
-        xlabel="processor seconds per whisker-second in contact",
-        ylabel="largest relative error",
-    )
-    axes.legend(title="longest step", frameon=False, fontsize="small")
+    chosen = list(points)
+    hollow = [point for point in collision_points(chosen) if point["error"] is not None]
+    figure = Figure(figsize=(11 if hollow else 7, 4.5), layout="constrained")
+    axes = figure.subplots(1, 2 if hollow else 1, squeeze=False)[0]
+    presets = {_key(_fields(Setting(Fidelity.preset(name))))[: len(_NAMES)]: name for name in list_presets()}
+    for number, backend in enumerate(sorted({point["backend"] for point in chosen})):
+        some = [point for point in chosen if point["backend"] == backend and not point.get("collision")]
+        usable = [point for point in some if point["error"] is not None]
+        names = [presets.get(_key(point)[: len(_NAMES)], "") for point in usable]
+        draw_bench(axes[0], usable, names, front(usable), f"C{number}")
+    if hollow:
+        draw_collisions(axes[1], hollow)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150)
     return Path(path)
@@ -183,11 +215,12 @@ _NAMES = ("links", "links_per_mm", "time_step", "steps_per_period")
 
 
 def _fields(setting: Setting) -> dict[str, Any]:
-    return {**asdict(setting.fidelity), "backend": setting.backend}
+    fields = {**asdict(setting.fidelity), "backend": setting.backend}
+    return fields if setting.collision is None else {**fields, "collision": setting.collision}
 
 
 def _key(point: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(point.get(name) for name in (*_NAMES, "backend"))
+    return tuple(point.get(name) for name in (*_NAMES, "backend", "collision"))
 
 
 def _header() -> dict[str, Any]:
@@ -224,6 +257,51 @@ def _measure(setting: Setting, reference: Sequence[Trace]) -> dict[str, Any]:
     except BrainbenchError as error:
         values["note"] = str(error)
     return values
+
+
+def _measure_collision(setting: Setting, reference: Trace) -> dict[str, Any]:
+    values: dict[str, Any] = {**_fields(setting), **dict.fromkeys(("concave_error", "error", "cost")), "note": ""}
+    try:
+        trace, values["pieces"] = _into_hollow(setting)
+        values["cost"] = trace.seconds / float(_FRAMES[-1])
+        values["concave_error"] = values["error"] = _difference(trace, reference)
+    except BrainbenchError as error:
+        values["note"] = str(error)
+    return values
+
+
+def _collision(text: str) -> tuple[str, DecompositionSettings | None]:
+    """Return the kind of collision geometry that a text names, and how it is cut."""
+    kind, _, threshold = text.partition("-")
+    try:
+        settings = DecompositionSettings(threshold=float(threshold)) if threshold else None
+    except ValueError:
+        settings = None
+    if kind not in ("exact", "hull", "decomposition") or (kind == "decomposition") != (settings is not None):
+        raise unknown_name("collision geometry", text, COLLISIONS, hint="Another threshold is possible.")
+    return kind, settings
+
+
+def _into_hollow(setting: Setting) -> tuple[Trace, int]:
+    """Run C2 whisking into the hollow of the Rodgers solid; return the trace and of how much the solid consists.
+
+    Raises:
+        DataError: it was unstable.
+    """
+    kind, settings = _collision(setting.collision or "exact")
+    solid = rodgers_solid(0.03)
+    if kind != "exact" and solid.mesh is not None:
+        solid = touchable(solid.mesh, kind, settings)
+    # The hollow is a trough along the whisker, turned a little and aside, so that the whisker slides down its slope.
+    obstacle = PlacedObject(solid, (0.01, 0.0042, 0.002), (0.0, math.pi / 2, 0.3), friction=0.0).obstacle()
+    job = Job(_straight("C2"), _Whisk(math.radians(22)), (obstacle,), _FRAMES)
+    engine = get_backend(setting.backend)
+    body = touched(obstacle, surfaces=getattr(engine, "surfaces", False))
+    pieces = len(body.parts) if body.surface is None else len(body.surface.faces)
+    (trace,) = engine.run([job], setting.fidelity, workers=1)
+    if trace.status != "ok":
+        raise DataError(f"The simulation was unstable: {trace.reason}.")
+    return trace, pieces
 
 
 def _ring_error(whisker: Whisker, setting: Setting) -> float:

@@ -31,6 +31,8 @@ def test_auto_refuses_what_was_never_measured():
         Fidelity.auto(error=1e-6)
     with pytest.raises(UsageError, match="error must be positive"):
         Fidelity.auto(error=0)
+    with pytest.raises(UsageError, match="Unknown measured backend 'mujocco'; did you mean 'mujoco'"):
+        Fidelity.auto(backend="mujocco")
 
 
 def test_links_per_mm_give_long_whiskers_more_links():

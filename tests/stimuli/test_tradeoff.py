@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -53,6 +54,40 @@ def test_a_table_of_other_experiments_is_refused(tmp_path):
 def test_an_unknown_backend_is_refused_before_anything_is_measured(tmp_path):
     with pytest.raises(UsageError, match="did you mean 'mujoco'"):
         tradeoff.measure_tradeoff(tmp_path / "table.json", [Setting(COARSE.fidelity, "mujocco")])
+
+
+def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_tests(quick, tmp_path):
+    path = tmp_path / "table.json"
+    chosen = [FINE, *(replace(FINE, collision=name) for name in ("exact", "decomposition-0.02", "hull"))]
+    bench, exact, cut, hull = tradeoff.measure_tradeoff(path, chosen)
+    assert exact["concave_error"] == exact["error"] == 0
+    assert exact["pieces"] == 24
+    # A hull fills the hollow that the whisker moves in.
+    assert cut["error"] < 0.2 < 1 < hull["error"]
+    assert 1 < cut["pieces"] < 24
+    assert hull["pieces"] == 1
+    assert [point.settings["links"] for point in tradeoff.front([bench, exact, cut, hull])] == [8]
+    assert tradeoff.collision_points([bench, exact, cut, hull]) == [exact, cut, hull]
+    # Kept points are not measured again.
+    assert tradeoff.measure_tradeoff(path, chosen[1:]) == [bench, exact, cut, hull]
+    if importlib.util.find_spec("matplotlib"):
+        assert tradeoff.plot_tradeoff([bench, exact, cut, hull], tmp_path / "plot.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("text", ["hul", "decomposition", "decomposition-fine", "hull-0.1"])
+def test_an_unknown_collision_geometry_is_refused(text):
+    with pytest.raises(UsageError, match=f"Unknown collision geometry '{text}'.*'decomposition-0.02'"):
+        Setting(COARSE.fidelity, collision=text)
+
+
+def test_every_backend_and_collision_geometry_that_is_asked_for_is_in_the_grid():
+    chosen = tradeoff.settings(links=(), backends=("mujoco", "bullet"), collisions=("hull", "exact"))
+    assert len([item for item in chosen if item.collision is None]) == 2 * 3
+    hollow = [item for item in chosen if item.collision is not None]
+    assert {(item.backend, item.collision) for item in hollow} == {
+        (backend, collision) for backend in ("mujoco", "bullet") for collision in ("hull", "exact")
+    }
+    assert len(hollow) == 3 * 4
 
 
 def test_the_front_leaves_out_failed_and_beaten_settings():

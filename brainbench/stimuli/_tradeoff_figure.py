@@ -1,0 +1,40 @@
+"""The panels of a trade-off plot: error against cost, per backend and per collision geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from brainbench.fidelity import TradeoffPoint
+
+
+def draw_bench(
+    axes: Any, points: Sequence[Mapping[str, Any]], names: Sequence[str], best: Sequence[TradeoffPoint], colour: str
+) -> None:
+    """Draw the bench tests of one backend, each named or not, with its front."""
+    if not points:
+        return
+    label = str(points[0]["backend"])
+    axes.scatter([p["cost"] for p in points], [p["error"] for p in points], s=16, color=colour, label=label)
+    axes.step([p.cost for p in best], [p.error for p in best], where="post", color=colour, lw=1, zorder=0)
+    for point, name in zip(points, names, strict=True):
+        place = (point["cost"], point["error"])
+        axes.annotate(name, place, xytext=(5, 5), textcoords="offset points", color=colour, fontsize="small")
+    _label(axes, "bench tests, and the front of each backend", "largest relative error")
+
+
+def draw_collisions(axes: Any, points: Sequence[Mapping[str, Any]]) -> None:
+    """Draw one colour per collision geometry and one marker per backend."""
+    geometries = sorted({point["collision"] for point in points})
+    for marker, backend in zip("os^Dv", sorted({point["backend"] for point in points}), strict=False):
+        for number, geometry in enumerate(geometries):
+            some = [point for point in points if (point["backend"], point["collision"]) == (backend, geometry)]
+            costs, errors = [p["cost"] for p in some], [p["error"] for p in some]
+            axes.scatter(costs, errors, s=22, marker=marker, color=f"C{number}", label=f"{geometry}, {backend}")
+    _label(axes, "whisking into a hollow, by collision geometry", "relative error of the base moment")
+
+
+def _label(axes: Any, title: str, error: str) -> None:
+    axes.set(xscale="log", yscale="log", title=title, xlabel="processor seconds per whisker-second", ylabel=error)
+    axes.legend(frameon=False, fontsize="small")
