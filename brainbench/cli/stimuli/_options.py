@@ -75,3 +75,15 @@ def numbers(text: str, count: int, what: str) -> tuple[float, ...]:
     if len(values) != count:
         raise UsageError(f"{what} takes {count} numbers joined by commas; received {text!r}.")
     return values
+
+
+def whole_numbers(text: str, what: str) -> tuple[int, ...]:
+    """Return whole numbers written with commas between them.
+
+    Raises:
+        UsageError: it is something else.
+    """
+    try:
+        return tuple(int(item) for item in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"{what} takes whole numbers joined by commas; received {text!r}.") from error
