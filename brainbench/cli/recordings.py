@@ -40,13 +40,18 @@ def rdm(
     ] = None,
     select: SelectOption = None,
     window: WindowOption = None,
+    pool: Annotated[str, typer.Option(help="One RDM per 'subject', per 'session', or of 'all' together.")] = "subject",
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Compute every animal's RDM (correlation distance) and its split-half reliability."""
+    from dataclasses import replace
+
     from brainbench._brain_side import brain_side
+    from brainbench.datasets import pooled
 
     brain = brain_side(source, conditions=conditions, select=select, window=window, progress=None)
+    brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, time="mean", seed=seed)
     data = {
@@ -77,6 +82,34 @@ def rdm(
         for item in animals:
             text += "\n\n" + _matrix(f"RDM of {item.subject}", labels, item.rdm)
     emit(data, text, as_json=as_json)
+
+
+@app.command("check")
+def check(
+    source: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
+    conditions: Annotated[
+        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] whose labels are checked; the recipe's by default.")
+    ] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Fail on warnings too.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Look for what would make scores wrong: clock, coverage, labels, units, tables, times. Worst first.
+
+    Exit status: 0 nothing wrong (notes and warnings may be there), 1 errors (or warnings with --strict),
+    2 no such file.
+    """
+    from brainbench.datasets import check as check_files
+
+    checkup = check_files(source, conditions=conditions)
+    data = {
+        "verdict": checkup.verdict,
+        "source": checkup.source,
+        "sessions": checkup.sessions,
+        "findings": checkup.findings,
+    }
+    emit(data, str(checkup), as_json=as_json)
+    if checkup.count("error") or (strict and checkup.count("warning")):
+        raise typer.Exit(1)
 
 
 @app.command("export")

@@ -5,6 +5,7 @@
 """
 
 from brainbench.datasets.blocks import SessionBlock, blocks
+from brainbench.datasets.checks import Checkup, check
 from brainbench.datasets.conditions import Conditions
 from brainbench.datasets.exports import export
 from brainbench.datasets.hdf5 import write_recordings
@@ -14,9 +15,11 @@ from brainbench.datasets.recipes import Recipe, get_recipe, list_recipes, regist
 from brainbench.datasets.recordings import open_recordings
 from brainbench.datasets.selection import Rule, Selection
 from brainbench.datasets.sessions import Session, make_session
+from brainbench.datasets.whisking import WhiskingDataset
 from brainbench.datasets.window import Window
 
 __all__ = [
+    "Checkup",
     "Conditions",
     "Inspection",
     "Recipe",
@@ -24,8 +27,10 @@ __all__ = [
     "Selection",
     "Session",
     "SessionBlock",
+    "WhiskingDataset",
     "Window",
     "blocks",
+    "check",
     "export",
     "get_recipe",
     "inspect",

@@ -225,7 +225,7 @@ def _coverage(
         ends = units.ends(OBSERVED)
         spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)
         for index, own in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
-            for low, high in _merged(own):
+            for low, high in merged_spans(own):
                 covered[:, index] |= (edges[:, 0] >= low) & (edges[:, 1] <= high)
     elif (span := recorded_span(spikes)) is not None:
         low, high = span
@@ -237,7 +237,8 @@ def _coverage(
     return covered & kept if kept.any() else covered, kept
 
 
-def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
+def merged_spans(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """Join the recorded spans [n, 2] (s) that touch or overlap."""
     merged: list[tuple[float, float]] = []
     for low, high in sorted(map(tuple, spans.tolist())):
         if merged and low <= merged[-1][1]:

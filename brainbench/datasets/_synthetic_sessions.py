@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 CONDITIONS = Conditions("trials", ("stimulus",))
 _BEFORE = 0.5
 """From trial start to contact, s."""
-_AFTER = 0.25
-"""From the end of the window to the end of the trial, s."""
+_AFTER = (0.25, 1.25)
+"""Least and most time from the end of the window to the end of the trial, s: no two trials are alike in
+length, so that a shifted clock cannot hide behind a regular rhythm."""
 _LATENCY, _JITTER = 0.012, 0.003
 """Onset response after contact, s."""
 _ONSET = 0.15
@@ -61,7 +62,7 @@ def as_recordings(geometry: Geometry, design: Design | None = None, *, seed: int
     for animal in range(design.animals):
         for number in range(design.sessions):
             drawn = draw_session(geometry, design, animal, number, seed)
-            begin, _ = _times(design, len(drawn.labels))
+            begin, _ = _times(design, len(drawn.labels), (*entropy(seed), animal, number))
             labels = tuple(geometry.labels[index] for index in drawn.labels)
             parts.append(
                 Part(
@@ -150,9 +151,13 @@ def write_files(
 
 
 def place_spikes(
-    random: np.random.Generator, counts: NDArray[np.int64], begin: NDArray[np.float64], length: float, onset: float
+    random: np.random.Generator,
+    counts: NDArray[np.int64],
+    begin: NDArray[np.float64],
+    length: float | NDArray[np.float64],
+    onset: float,
 ) -> NDArray[np.float64]:
-    """Place counted spikes [R] in windows of one length (s), none within the refractory time of another.
+    """Place counted spikes [R] in windows, none within the refractory time of another.
 
     Positions are drawn in the window shortened by all refractory times, sorted, and spread apart by
     them: exactly ``counts`` spikes, at least the refractory time between any two.
@@ -161,16 +166,17 @@ def place_spikes(
         random: source of the draws.
         counts: spikes of each window.
         begin: begin of each window, s.
-        length: length of all windows, s.
+        length: length of all windows, or of each [R], s.
         onset: share of the spikes at the latency after the begin.
 
     Returns:
         spike times, s, window after window.
     """
-    dead = min(_DEAD, 0.5 * length / max(int(counts.max(initial=0)), 1))
+    long = np.broadcast_to(np.asarray(length, dtype=np.float64), counts.shape)
+    dead = min(_DEAD, float(np.min(0.5 * long / np.maximum(counts, 1))))
     which = np.repeat(np.arange(len(counts)), counts)
     # A hair less than the window, which is half open and must hold the last spike after rounding.
-    free = (length - counts[which] * dead) * (1 - 1e-9)
+    free = (long[which] - counts[which] * dead) * (1 - 1e-9)
     position = random.random(len(which)) * free
     early = random.random(len(which)) < onset
     latency = _LATENCY + _JITTER * random.standard_normal(int(early.sum()))
@@ -180,27 +186,29 @@ def place_spikes(
     return begin[which] + position[order] + rank * dead
 
 
-def _times(design: Design, trials: int) -> tuple[NDArray[np.float64], float]:
-    """Contact of every trial and length of a trial, s."""
-    length = _BEFORE + design.window + _AFTER
-    return 1.0 + _BEFORE + length * np.arange(trials, dtype=np.float64), length
+def _times(design: Design, trials: int, stream: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Contact and end of every trial, s."""
+    pause = np.round(np.random.default_rng([*stream, 2]).uniform(*_AFTER, trials), 4)
+    stop = 1.0 + np.cumsum(_BEFORE + design.window + pause)
+    return stop - pause - design.window, stop
 
 
 def _session(geometry: Geometry, design: Design, animal: int, number: int, seed: int | Sequence[int]) -> Session:
     drawn = draw_session(geometry, design, animal, number, seed)
-    random = np.random.default_rng([*entropy(seed), animal, number, 1])
-    begin, length = _times(design, len(drawn.labels))
-    start, stop = begin - _BEFORE, begin + design.window + _AFTER
-    end = float(stop[-1]) if len(stop) else 1.0
+    stream = (*entropy(seed), animal, number)
+    random = np.random.default_rng([*stream, 1])
+    begin, stop = _times(design, len(drawn.labels), stream)
+    start = begin - _BEFORE
+    end = float(stop[-1])
     # The margins keep the refractory time between the spikes of a window and those around it.
-    pause = length - design.window - 2 * _DEAD
-    rest = _REST * drawn.expected.mean(axis=0) * pause
-    between = np.concatenate([[begin[0] - length + design.window + _DEAD], begin + design.window + _DEAD])
+    opened = np.concatenate([[0.0], begin + design.window]) + _DEAD
+    pause = np.concatenate([begin, [end]]) - _DEAD - opened
+    rest = _REST * drawn.expected.mean(axis=0)
     spikes = []
     for unit in range(drawn.counts.shape[1]):
         window = place_spikes(random, drawn.counts[:, unit], begin, design.window, _ONSET)
-        idle = place_spikes(random, random.poisson(rest[unit], len(between)), between, pause, 0.0)
-        spikes.append(np.sort(np.concatenate([window, idle[(idle >= 0) & (idle < end)]])))
+        idle = place_spikes(random, random.poisson(rest[unit] * pause), opened, pause, 0.0)
+        spikes.append(np.sort(np.concatenate([window, idle])))
     tables: dict[str, dict[str, Any]] = {
         "trials": {
             "id": np.arange(len(begin)),

@@ -175,6 +175,7 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
             | {"synthetic": session.synthetic}
         )
         _write_table(group.create_group("units"), session.units)
+        group.create_group("tables")
         for key, table in session.tables.items():
             _write_table(group.create_group(f"tables/{key.replace('/', '_')}"), table)
 

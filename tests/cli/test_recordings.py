@@ -1,0 +1,51 @@
+"""``brainbench recordings check | export | fetch`` and pooling, from the command line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from brainbench.datasets.synthetic import Design, Geometry, write_files
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("synthetic")
+    geometry = Geometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
+    write_files(folder, geometry, Design(animals=2, sessions=2, units=15, trials=12))
+    return folder
+
+
+def test_check_passes_good_recordings_and_says_why(run, folder):
+    result = run("recordings", "check", str(folder), "--conditions", "trials:stimulus", "--strict")
+    assert result.status == 0
+    assert result.out.startswith(f"{folder}: 4 sessions, 0 errors, 0 warnings, 4 notes")
+    assert "spikes answer touch (first-contact) within 5 to 30 ms" in result.out
+
+
+def test_check_fails_on_errors_and_lists_them_as_json(run, folder, tmp_path):
+    (tmp_path / "broken.nwb").write_bytes(b"")
+    result = run("recordings", "check", str(tmp_path), "--json")
+    assert result.status == 1
+    data = json.loads(result.out)
+    assert data["verdict"] == "error"
+    assert data["findings"][0]["check"] == "file"
+    assert "it is empty" in data["findings"][0]["message"]
+    assert run("recordings", "check", str(tmp_path / "nothing.nwb")).status == 2
+
+
+def test_a_copy_scores_the_same(run, folder, tmp_path):
+    options = ("--conditions", "trials:stimulus", "--window", "first-contact..choice", "--json")
+    result = run("recordings", "export", str(folder), str(tmp_path / "copy"))
+    assert result.status == 0
+    assert result.out.count(".nwb") == 4
+    one, two = (json.loads(run("recordings", "rdm", str(path), *options).out) for path in (folder, tmp_path / "copy"))
+    assert one["animals"] == two["animals"]
+    assert one["recordings"]["content_hash"] == two["recordings"]["content_hash"]
+
+
+@pytest.mark.parametrize(("pool", "names"), [("session", 4), ("all", 1)])
+def test_sessions_and_animals_are_pooled_on_request(run, folder, pool, names):
+    result = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", pool, "--json")
+    assert len(json.loads(result.out)["animals"]) == names
+    assert run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", "al").status == 2
