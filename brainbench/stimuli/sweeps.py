@@ -82,12 +82,13 @@ class SweepScenes(Sequence[Scene]):
         which, within = divmod(range(len(self))[index], self.grid.count)
         name = self._names[which]
         sweep = self.grid.sweeps(name)[within]
-        return self.grid.scene(self._solid(name), sweep, label=f"{name}/{sweep.label}", array=self.array)
+        return self.grid.scene(self.solid(name), sweep, label=f"{name}/{sweep.label}", array=self.array)
 
     def __repr__(self) -> str:
         return f"SweepScenes({len(self._names)} objects × {self.grid.count} sweeps = {len(self)} scenes)"
 
-    def _solid(self, name: str) -> Solid:
+    def solid(self, name: str) -> Solid:
+        """Return one of the objects; neighbouring calls for the same object load it once."""
         # Neighbouring scenes share their object, and loading one may mean decomposing a mesh.
         if self._last is None or self._last[0] != name:
             item = self._objects[name]

@@ -113,6 +113,10 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         """[lane] motion of the base."""
         step: wp.array(dtype=real)
         """[lane] longest time step."""
+        row: wp.array(dtype=wp.int32)
+        """[lane] first index of its results."""
+        column: wp.array(dtype=wp.int32)
+        """[lane] third index of its results."""
         load_first: wp.array(dtype=wp.int32)
         """[lane + 1] first load of each lane."""
         load_link: wp.array(dtype=wp.int32)
@@ -128,15 +132,17 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
     class Options:
         start: real
         gravity: vec3
+        axes: mat33
+        """Rotation of the results."""
         quasistatic: wp.int32
         shape: wp.int32
 
     @wp.struct
     class Results:
-        wrench: wp.array3d(dtype=real)
-        """[reading, 6, lane] action of the whisker on its base."""
-        contact: wp.array2d(dtype=real)
-        """[reading, lane] arc of the contact, negative without."""
+        wrench: wp.array4d(dtype=real)
+        """[row, reading, column, 6] action of the whisker on its base (N, N m)."""
+        contact: wp.array3d(dtype=real)
+        """[row, reading, column] arc of the contact (m), negative without."""
         points: wp.array3d(dtype=vec3)
         """[reading, node, lane] when shapes are recorded."""
         depth: wp.array(dtype=real)
@@ -341,14 +347,14 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         return touch
 
     @wp.func
-    def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real) -> Touch:
+    def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, look: real) -> Touch:
         """Distance bound of a link from a mesh, and a contact when its middle lies inside."""
         touch = Touch()
         touch.between = 0
         touch.end = 0
         middle = real(0.5) * (a + b)
         half = real(0.5) * wp.length(b - a)
-        far = real(wp.static(FAR)) / bodies.scale[s]
+        far = look + half
         hit = wp.mesh_query_point_sign_normal(bodies.mesh[s], single3(middle), wp.float32(far))
         touch.clear = far - half
         if hit.result:
@@ -372,6 +378,8 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         none = vec3(zero, zero, zero)
         who = ln.whisker[lane]
         scene = ln.scene[lane]
+        row = ln.row[lane]
+        column = ln.column[lane]
         base = ln.base[lane]
         links = ch.links[who]
         beta = ch.beta[who]
@@ -431,16 +439,71 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         status = int(0)
         failed = zero
         before = opt.start
-        resting = int(0)
+        resting = may_rest
         idle = opt.start
         closing = int(0)
         for reading in range(readings.shape[0]):
             upto = readings[reading]
             span = upto - before
+            if span <= zero:
+                # A reading at the very start: unbent and silent.
+                if opt.shape == 1:
+                    pose0 = pose_at(tr, base, before)
+                    x = rotate(pose0.turn, vec3(one, zero, zero))
+                    y = rotate(pose0.turn, vec3(zero, one, zero))
+                    at = pose0.place
+                    out.points[reading, 0, lane] = at
+                    for i in range(links):
+                        b4 = ch.build[i, who]
+                        turned = x * b4[1] + y * b4[2]
+                        y = y * b4[1] - x * b4[2]
+                        x = turned
+                        at = at + x * b4[0]
+                        out.points[reading, i + 1, lane] = at
+                continue
+            if resting == 1 and upto > idle:
+                # When may an object come near at the earliest? The whisker stands straight out of its base.
+                idle = real(1e30)
+                if object_speed > zero or before == opt.start:
+                    pose0 = pose_at(tr, base, before)
+                    x = rotate(pose0.turn, vec3(one, zero, zero))
+                    y = rotate(pose0.turn, vec3(zero, one, zero))
+                    at = pose0.place
+                    # Nothing can come near after the last reading.
+                    look = object_speed * (readings[readings.shape[0] - 1] - before) + real(0.5)
+                    for i in range(links):
+                        b4 = ch.build[i, who]
+                        turned = x * b4[1] + y * b4[2]
+                        y = y * b4[1] - x * b4[2]
+                        x = turned
+                        ahead_at = at + x * b4[0]
+                        for s in range(shapes_from, shapes_to):
+                            body = pose_at(tr, bodies.track[s], before)
+                            turn_s = bodies.turn[s]
+                            scale = bodies.scale[s]
+                            local = unrotate(body.turn, at - body.place) - bodies.place[s]
+                            a = unrotate(turn_s, local) / scale
+                            local = unrotate(body.turn, ahead_at - body.place) - bodies.place[s]
+                            b = unrotate(turn_s, local) / scale
+                            slack = zero
+                            if bodies.kind[s] == wp.static(MESH):
+                                touch = far_mesh(bodies, s, a, b, zero, zero, look / scale)
+                                slack = touch.clear * scale
+                            else:
+                                tip = primitive(bodies.kind[s], bodies.size[s] / scale, real(0.5) * (a + b))
+                                slack = tip[3] * scale - real(0.5) * b4[0]
+                            slack = slack - ch.taper[i, who][0] - real(0.05)
+                            if slack <= zero:
+                                idle = before
+                            elif object_speed > zero:
+                                idle = wp.min(idle, before + slack / (real(1.02) * object_speed))
+                        at = ahead_at
             if resting == 1 and upto <= idle:
                 # At rest, and nothing can have come near: the wrench stays zero.
                 for i in range(links):
                     clear[i] = zero
+                    q[i] = vec2(zero, zero)
+                    qd[i] = vec2(zero, zero)
                 before = upto
                 continue
             count = wp.max(1, int(wp.ceil(span / longest - real(1e-3))))
@@ -523,7 +586,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 rb = taper[1] / scale
                                 touch = Touch()
                                 if bodies.kind[s] == wp.static(MESH):
-                                    touch = far_mesh(bodies, s, a, b, ra, rb)
+                                    touch = far_mesh(bodies, s, a, b, ra, rb, real(wp.static(FAR)) / scale)
                                     if touch.between == 0 and touch.clear * scale <= margin + taper[0]:
                                         touch = near_mesh(bodies, s, a, b, ra, rb, margin / scale)
                                 else:
@@ -863,7 +926,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                     change = wp.max(change, h * (wp.abs(missed) + slipped))
                                 if change <= real(1e-5):
                                     settled = 1
-                        if settled == 0 and change > real(1e-3):
+                        if settled == 0 and change > real(1e-2):
                             unsolved = unsolved + 1
                         held_count = contacts
                         for c in range(contacts):
@@ -947,21 +1010,15 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                 resting = int(0)
                 if busy == 0 and worst < real(wp.static(REST)) and may_rest == 1:
                     resting = 1
-                    idle = real(1e30)
-                    for s in range(shapes_from, shapes_to):
-                        if bodies.speed[s] > zero:
-                            for i in range(links):
-                                thick = wp.max(ch.taper[i, who][0], ch.taper[i, who][1]) + real(0.05)
-                                idle = wp.min(idle, now + h + (clear[i] - thick) / (real(1.02) * bodies.speed[s]))
+                    idle = zero
                 if sub == count - 1 and status == 0:
-                    out.wrench[reading, 0, lane] = -reaction_v[0]
-                    out.wrench[reading, 1, lane] = -reaction_v[1]
-                    out.wrench[reading, 2, lane] = -reaction_v[2]
-                    out.wrench[reading, 3, lane] = -reaction_w[0]
-                    out.wrench[reading, 4, lane] = -reaction_w[1]
-                    out.wrench[reading, 5, lane] = -reaction_w[2]
+                    acting = opt.axes * reaction_v * real(-1e-3)
+                    turning = opt.axes * reaction_w * real(-1e-6)
+                    for d in range(3):
+                        out.wrench[row, reading, column, d] = acting[d]
+                        out.wrench[row, reading, column, 3 + d] = turning[d]
                     if force_sum > zero:
-                        out.contact[reading, lane] = arc_sum / force_sum
+                        out.contact[row, reading, column] = real(1e-3) * arc_sum / force_sum
                     if opt.shape == 1:
                         x = rotate(pose1.turn, vec3(one, zero, zero))
                         y = rotate(pose1.turn, vec3(zero, one, zero))
@@ -1002,6 +1059,6 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         Results=Results,
         Tracks=Tracks,
         vec3=vec3,
-        vec4=vec4,
+        mat33=mat33,
         primitive=primitive,
     )

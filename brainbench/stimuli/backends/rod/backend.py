@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError
-from brainbench.stimuli.backends._engines import MICRO, MILLI, warn_overdamped
+from brainbench.stimuli.backends._engines import MILLI, warn_overdamped
 from brainbench.stimuli.backends._reach import Reach, reachable
 from brainbench.stimuli.backends.protocol import Trace
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
@@ -175,8 +175,8 @@ def _simulate(
     def empty(*shape: int, fill: float | None = None, kind: Any = dtype) -> Any:
         return wp.full(shape, fill, dtype=kind, device=device) if fill else wp.zeros(shape, dtype=kind, device=device)
 
-    out.wrench = empty(frames, 6, count)
-    out.contact = empty(frames, count, fill=-1.0)
+    out.wrench = empty(count, frames, 1, 6)
+    out.contact = empty(count, frames, 1, fill=-1.0)
     out.points = empty(*((frames, capacity + 1, count) if record_shape else (1, 1, 1)), kind=kernels.vec3)
     out.depth, out.failed = empty(count), empty(count)
     for name in ("status", "steps", "touching", "crowded", "unsolved"):
@@ -184,6 +184,7 @@ def _simulate(
     options = kernels.Options()
     options.start = first.start * MILLI
     options.gravity = kernels.vec3(*np.divide(first.gravity, MILLI).tolist())
+    options.axes = kernels.mat33(*np.eye(3).ravel().tolist())
     options.shape = int(record_shape)
     wp.launch(
         kernels.run,
@@ -224,6 +225,8 @@ def batch_structs(batch: _Batch, kernels: Any, device: Any) -> list[Any]:
                 "scene": lanes[:, 1],
                 "base": lanes[:, 2],
                 "step": np.array([lane[3] for lane in batch.lanes]),
+                "row": np.arange(len(lanes), dtype=np.int32),
+                "column": np.zeros(len(lanes), dtype=np.int32),
                 **loads,
             },
             device,
@@ -247,8 +250,8 @@ def _trace(results: dict[str, NDArray], lane: int, job: Job, shape: NDArray | No
     status = int(results["status"][lane])
     failed = float(results["failed"][lane]) / MILLI
     good = np.ones(len(job.times), dtype=bool) if not status else job.times < failed - 1e-9
-    wrench = results["wrench"][:, :, lane].astype(float) * np.repeat([1 / MILLI, 1 / MICRO], 3)
-    arc = results["contact"][:, lane].astype(float)
+    wrench = results["wrench"][lane, :, 0].astype(float)
+    arc = results["contact"][lane, :, 0].astype(float)
     touching = (arc >= 0) & good
     reason = ""
     if status:
@@ -259,7 +262,7 @@ def _trace(results: dict[str, NDArray], lane: int, job: Job, shape: NDArray | No
         )
         reason = f"{what} at {failed:.6g} s; choose a smaller time step"
     unsolved, crowded, steps = (int(results[name][lane]) for name in ("unsolved", "crowded", "steps"))
-    if not reason and unsolved > 0.01 * steps:
+    if not reason and unsolved > 0.02 * steps:
         status, reason = 1, f"the contact forces of {unsolved} of {steps} steps did not converge"
         good[:] = False
     if not reason and crowded > 0.01 * steps:
@@ -268,7 +271,7 @@ def _trace(results: dict[str, NDArray], lane: int, job: Job, shape: NDArray | No
     return Trace(
         wrench=np.where(good[:, None], wrench, np.nan),
         contact=touching & good,
-        contact_arc=np.where(touching & good, arc / MILLI, np.nan),
+        contact_arc=np.where(touching & good, arc, np.nan),
         penetration=float(results["depth"][lane]) / MILLI,
         status="unstable" if status else "ok",
         reason=reason,

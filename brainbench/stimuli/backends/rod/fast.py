@@ -1,0 +1,263 @@
+"""Many passive sweeps in one launch: no scene, job or trace per sweep, a few numbers each.
+
+The object's surface is uploaded once and scaled, turned and moved inside the kernel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from brainbench.stimuli.backends._engines import MILLI
+from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
+from brainbench.stimuli.backends.rod._pack import Chains, Shapes, Tracks, capacity_for, quaternions, still_knots
+from brainbench.stimuli.backends.rod._shapes import MESH
+from brainbench.stimuli.chain import build_chain
+from brainbench.stimuli.objects import euler_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.stimuli.objects import Solid
+    from brainbench.stimuli.sweep_grid import SweepGrid
+    from brainbench.stimuli.sweeps import SweepScenes
+
+OK_STATUS = 0
+
+
+@dataclass(frozen=True, eq=False)
+class SweepResult:
+    """What a launch gave, still on the device."""
+
+    wrench: Any
+    """Warp array [sweep, reading, whisker, 6] (N, N m; world axes)."""
+    contact: Any
+    """Warp array [sweep, reading, whisker] arc of the contact (m), negative without."""
+    status: NDArray[np.int32]
+    """[sweep, whisker] as :data:`brainbench.stimuli.backends.rod._solver.OK` and its neighbours."""
+    steps: NDArray[np.int32]
+    """[sweep, whisker] steps computed."""
+    touching: NDArray[np.int32]
+    """[sweep, whisker] steps with contact."""
+    unsolved: NDArray[np.int32]
+    """[sweep, whisker] steps whose contact forces did not converge, or for whose contacts there was no room."""
+    steps_in_full: int
+    """Steps that every whisker takes from start to end."""
+
+
+class SweepLauncher:
+    """The whiskers of a grid of sweeps on a device, ready for any number of sweeps.
+
+    Raises:
+        UsageError: the head of the grid moves, or the device is unknown.
+    """
+
+    def __init__(self, scenes: SweepScenes, fidelity: Fidelity, device: str = "cpu") -> None:
+        from brainbench.stimuli.backends.rod._solver import solver
+
+        grid = scenes.grid
+        if grid.mover != "object":
+            raise UsageError("Only sweeps whose object moves go through the fast path; received mover='head'.")
+        wp = warp()
+        self.device = pick_device(device)
+        self.scenes, self.grid, self.fidelity = scenes, grid, fidelity
+        self._solids: dict[str, Solid] = {}
+        self._head = grid.head.matrix
+        self._origin = np.asarray(grid.head.position)
+        mounts = list(scenes.array)
+        chains = [build_chain(m.whisker, fidelity.link_count(m.whisker.arc_length)) for m in mounts]
+        self.capacity = capacity_for(max(chain.links for chain in chains))
+        self.real = wp.float32 if fidelity.precision == "single" else wp.float64
+        self.kernels = solver(self.real, self.capacity)
+        self._chains = to_struct(self.kernels.Chains, Chains(self.capacity, chains).arrays(), self.device)
+        self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in chains])
+        self.readings = grid.frames.readings * MILLI
+        self._bases = [_base_knot(mount, grid) for mount in mounts]
+        spans = np.diff(self.readings, prepend=0.0)
+        self.steps_each = np.array([int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in self.steps])
+
+    def launch(self, objects: Sequence[tuple[str, Sequence[Any]]]) -> SweepResult:
+        """Simulate sweeps, object by object.
+
+        Args:
+            objects: (name, its sweeps) in the order of the result's first axis.
+        """
+        wp, kernels, device = warp(), self.kernels, self.device
+        tracks = Tracks()
+        bases = [tracks.add(knot, 0.0, 1.0) for knot in self._bases]
+        shapes = Shapes(device)
+        for name, _ in objects:
+            if name not in self._solids:
+                self._solids = {name: self.scenes.solid(name)} | dict(list(self._solids.items())[:64])
+        for name, sweeps in objects:
+            self._add(shapes, tracks, self._solids[name], sweeps)
+        count, whiskers = len(shapes.first) - 1, len(self._bases)
+        # Neighbouring threads take the same whisker past the same object.
+        whisker, row = (grid.ravel().astype(np.int32) for grid in np.meshgrid(np.arange(whiskers), np.arange(count), indexing="ij"))
+        lanes = {
+            "whisker": whisker,
+            "scene": row,
+            "base": np.array(bases, dtype=np.int32)[whisker],
+            "step": self.steps[whisker],
+            "row": row,
+            "column": whisker,
+            "load_first": np.zeros(len(row) + 1, dtype=np.int32),
+            "load_link": np.zeros(0, dtype=np.int32),
+            "load_share": np.zeros(0),
+            "load_force": np.zeros((0, 3)),
+            "load_stop": np.zeros(0),
+        }
+        out = kernels.Results()
+        frames, real = len(self.readings), self.real
+        out.wrench = wp.zeros((count, frames, whiskers, 6), dtype=real, device=device)
+        out.contact = wp.full((count, frames, whiskers), -1.0, dtype=real, device=device)
+        out.points = wp.zeros((1, 1, 1), dtype=kernels.vec3, device=device)
+        out.depth, out.failed = (wp.zeros(len(row), dtype=real, device=device) for _ in range(2))
+        names = ("status", "steps", "touching", "crowded", "unsolved")
+        for name in names:
+            setattr(out, name, wp.zeros(len(row), dtype=wp.int32, device=device))
+        options = kernels.Options()
+        options.axes = kernels.mat33(*self._head.ravel().tolist())
+        inputs = [
+            self._chains,
+            to_struct(kernels.Tracks, tracks.arrays(), device),
+            to_struct(kernels.Bodies, shapes.arrays(), device),
+            to_struct(kernels.Lanes, lanes, device),
+            options,
+            wp.array(self.readings, dtype=real, device=device),
+            out,
+        ]
+        wp.launch(kernels.run, dim=len(row), inputs=inputs, device=device, block_dim=BLOCK)
+        found = {name: getattr(out, name).numpy().reshape(whiskers, count).T for name in names}
+        return SweepResult(
+            wrench=out.wrench,
+            contact=out.contact,
+            status=found["status"],
+            steps=found["steps"],
+            touching=found["touching"],
+            unsolved=found["unsolved"] + found["crowded"],
+            steps_in_full=int(self.steps_each.sum()) * count,
+        )
+
+    @property
+    def limit(self) -> int:
+        """Most sweeps of one object that are launched together on this device."""
+        return 4096 if self.device.is_cuda else 4
+
+    def batch(self, result: SweepResult) -> Any:
+        """Return a result as frames in the form of data generation."""
+        from brainbench.stimuli.generation.engine import SweepBatch
+
+        frames = self.grid.frames
+        wrench, contact = result.wrench.numpy(), result.contact.numpy() >= 0
+        if frames.average > 1 or frames.lowpass is not None:
+            moved = np.moveaxis(wrench, 1, 0)
+            wrench = np.moveaxis(frames.reduce(moved.astype(float)), 0, 1).astype(np.float32)
+            contact = np.moveaxis(frames.split(np.moveaxis(contact, 1, 0)).any(axis=1), 0, 1)
+        doubtful = result.unsolved > 0.02 * np.maximum(result.steps, 1)
+        unstable = (result.status != 0) | doubtful
+        names = [mount.name for mount in self.scenes.array]
+        reasons = [""] * len(unstable)
+        for row in np.flatnonzero(unstable.any(axis=1)):
+            first = int(np.argmax(unstable[row]))
+            what = "a joint bent too far or a value was lost" if result.status[row, first] else "contacts not solved"
+            more = f" (and {unstable[row].sum() - 1} more whiskers)" if unstable[row].sum() > 1 else ""
+            reasons[row] = f"{names[first]}: {what}{more}"
+        wrench[np.broadcast_to(unstable[:, None, :, None], wrench.shape)] = np.nan
+        return SweepBatch(
+            wrench=wrench.astype(np.float32, copy=False),
+            contact=contact.mean(axis=1).astype(np.float32),
+            unstable=unstable,
+            reasons=tuple(reasons),
+            steps=int(result.steps.sum()),
+            steps_in_full=result.steps_in_full,
+        )
+
+    def _add(self, shapes: Shapes, tracks: Tracks, solid: Solid, sweeps: Sequence[Any]) -> None:
+        """Append the scenes of one object's sweeps, expressed in the frame of the array."""
+        grid, head = self.grid, self._head
+        surface = solid.surface
+        diagonal = solid.diagonal
+        mesh, face = shapes.add_mesh(surface.vertices * MILLI, surface.faces)
+        radius = float(np.linalg.norm(surface.vertices, axis=1).max()) * MILLI
+        lows: dict[float, NDArray] = {}
+        for sweep in sweeps:
+            turn = euler_matrix((0.0, 0.0, sweep.rotation))
+            if sweep.rotation not in lows:
+                lows[sweep.rotation] = (surface.vertices @ turn.T).min(axis=0)
+            scale = sweep.size / diagonal
+            low = lows[sweep.rotation] * scale
+            y = grid.start - low[1] if grid.placing == "clear" else grid.start + low[1]
+            place = head.T @ (np.array([sweep.distance - low[0], y, sweep.height]) - self._origin)
+            knot = still_knots(place, quaternions((head.T @ turn)[None])[0])
+            knot[0, 3:6] = head.T @ np.array([0.0, -sweep.speed, 0.0])
+            shapes.rows.append(
+                {
+                    "kind": MESH,
+                    "size": np.ones(3),
+                    "place": np.zeros(3),
+                    "turn": np.array([1.0, 0.0, 0.0, 0.0]),
+                    "scale": scale,
+                    "mesh": mesh,
+                    "face": face,
+                    "radius": radius * scale,
+                    "speed": sweep.speed,
+                    "friction": -1.0,
+                    "track": tracks.add(knot, 0.0, 1.0),
+                }
+            )
+            shapes.first.append(len(shapes.rows))
+
+
+BLOCK = 64
+"""Threads of one block on a GPU."""
+
+
+def _base_knot(mount: Any, grid: SweepGrid) -> NDArray[np.float64]:
+    from brainbench.stimuli.backends.protocol import base_rotation
+
+    angles = np.array([mount.angles])
+    return still_knots(np.asarray(mount.position), quaternions(base_rotation(angles))[0])
+
+
+def simulate_sweeps(
+    scenes: SweepScenes, indices: Sequence[int], *, fidelity: Fidelity, device: str = "cpu", workers: int | None = None
+) -> Any:
+    """Simulate sweeps as :func:`brainbench.stimuli.generation.engine.simulate_sweeps` asks; see there.
+
+    On the CPU one thread takes one object at a time; ``workers`` of them run side by side.
+    """
+    from brainbench.stimuli.generation.engine import SweepBatch, join_batches
+
+    launcher = SweepLauncher(scenes, fidelity, device)
+    groups = list(_by_object(scenes, indices, launcher.limit))
+
+    def run(group: tuple[str, list[Any]]) -> SweepBatch:
+        return launcher.batch(launcher.launch([group]))
+
+    if launcher.device.is_cuda:
+        return launcher.batch(launcher.launch(groups))
+    with ThreadPoolExecutor(max_workers=workers or 1) as pool:
+        return join_batches(list(pool.map(run, groups)))
+
+
+def _by_object(scenes: SweepScenes, indices: Sequence[int], limit: int) -> Iterator[tuple[str, list[Any]]]:
+    """(object name, sweeps) of neighbouring indices, at most ``limit`` sweeps together."""
+    last, sweeps = "", []
+    for index in indices:
+        which, within = divmod(index, scenes.grid.count)
+        name = scenes.objects[which]
+        if sweeps and (name != last or len(sweeps) >= limit):
+            yield last, sweeps
+            sweeps = []
+        last = name
+        sweeps.append(scenes.grid.sweeps(name)[within])
+    if sweeps:
+        yield last, sweeps
