@@ -121,11 +121,8 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     sensors, hinges, failed, reason = _integrate(built, job, chain.links, times)
     good = after < failed
     before, after = np.where(good, before, 0), np.where(good, after, 0)
-    local = sensors[:, :6] * np.repeat([1 / MILLI, 1 / MICRO], 3)
-    # MuJoCo's sensor reads the action of the base on the whisker, in the frame of the base.
-    world = -np.einsum("nij,nkj->nki", built.rotation, local.reshape(-1, 2, 3)).reshape(-1, 6)
     share = np.where(good, where - before, 0.0)[:, None]
-    wrench = (1 - share) * world[before] + share * world[after]
+    wrench = (1 - share) * _wrench(built, sensors, before) + share * _wrench(built, sensors, after)
     nearest = np.where(share[:, 0] < 0.5, before, after)
     shape = _shape(built, chain, hinges[nearest], nearest)
     contact, arc = _contacts(sensors[nearest, 6:], shape, chain)
@@ -144,6 +141,13 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
         seconds=time.thread_time() - started,
         link_positions=np.where(good[:, None, None], shape / MILLI, np.nan) if record_shape else None,
     )
+
+
+def _wrench(built: WhiskerModel, sensors: NDArray, steps: NDArray) -> NDArray[np.float64]:
+    """Force and moment [n, 6] (N, N·m, world) of the whisker on its base before ``steps`` [n]."""
+    local = sensors[steps, :6] * np.repeat([1 / MILLI, 1 / MICRO], 3)
+    # MuJoCo's sensor reads the action of the base on the whisker, in the frame of the base.
+    return -np.einsum("nij,nkj->nki", built.rotation[steps], local.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
 def _integrate(
@@ -189,9 +193,10 @@ def _integrate(
         angles = states[0, :, at][:, q:]
         hinges[first] = state[at][q:]
         hinges[first + 1 : first + count] = angles[:-1]
-        bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window]) < LARGEST_BEND).all(axis=1)
         warned = [str(mujoco.mjtWarning(int(kind)).name) for kind in np.flatnonzero(data.warning.number)]
-        if bad.any() or warned:
+        # Also true of NaN; looking at every step by itself takes as long as a step of a short chain.
+        if warned or not (np.isfinite(read).all() and np.abs(hinges[window]).max() < LARGEST_BEND):
+            bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window]) < LARGEST_BEND).all(axis=1)
             failed = first + (int(np.argmax(bad)) if bad.any() else 0)
             return sensors, hinges, failed, _reason(hinges[failed], warned, times[failed])
         state = states[0, -1].copy()
@@ -263,9 +268,15 @@ def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Ch
     MuJoCo reports the distance from the core of a link, so the link's margin is added back.
     """
     slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
-    touching = np.flatnonzero((slots[..., 0] > 0).any(axis=1))
+    if not slots.shape[1]:
+        return 0.0
+    # At most: as if every contact were on the link of the largest margin.
+    most = np.where(slots[..., 0] > 0, built.margins.max() - slots[..., 4], -np.inf).max(axis=1)
+    touching = np.argsort(-most, kind="stable")[: np.count_nonzero(most > -np.inf)]
     deepest = 0.0
     for steps in np.array_split(touching, len(touching) // CHUNK + 1):
+        if not len(steps) or most[steps[0]] <= deepest:
+            break
         found = slots[steps]
         arcs = _nearest_arcs(found[..., 5:8], _shape(built, chain, hinges[steps], steps), chain)
         link = np.clip(np.searchsorted(chain.nodes, arcs, side="right") - 1, 0, chain.links - 1)
