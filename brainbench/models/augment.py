@@ -54,15 +54,39 @@ class Augmentation:
     def __str__(self) -> str:
         return self.kind + (f" + {self.masking:.0%} masking" if self.masking else "")
 
-    def __call__(self, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def __call__(self, x: torch.Tensor, generator: torch.Generator, *, part: tuple[int, int] = (0, 1)) -> torch.Tensor:
         """Return an augmented copy of sweeps [B, T, S·C, 5, 7].
 
         Args:
             x: Sweeps in SI; unchanged.
             generator: Generator on the CPU; equal states give equal results on every device.
+            part: (rank, number) when ``x`` holds every number-th sweep of a larger batch, from rank on; each sweep is
+                then treated as it would be in the whole batch.
         """
-        y = KINDS[self.kind](x, generator)
-        return mask_steps(y, self.masking, generator) if self.masking else y
+        draw = Draw(generator, *part)
+        y = KINDS[self.kind](x, draw)
+        return mask_steps(y, self.masking, draw) if self.masking else y
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Random numbers for the sweeps of one batch, or of this process's part of it."""
+
+    generator: torch.Generator
+    rank: int = 0
+    parts: int = 1
+
+    def uniform(self, count: int, *shape: int) -> torch.Tensor:
+        """Return numbers in [0, 1) [count, *shape]."""
+        return torch.rand(count * self.parts, *shape, generator=self.generator)[self.rank :: self.parts]
+
+    def normal(self, count: int, *shape: int) -> torch.Tensor:
+        """Return standard normal numbers [count, *shape]."""
+        return torch.randn(count * self.parts, *shape, generator=self.generator)[self.rank :: self.parts]
+
+    def coins(self, x: torch.Tensor, probability: float = 0.5) -> torch.Tensor:
+        """Return one truth value per sweep of ``x``, shaped to broadcast against it."""
+        return (self.uniform(len(x)) < probability).to(x.device).view(-1, *(1,) * (x.ndim - 1))
 
 
 def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
@@ -92,11 +116,11 @@ def reverse_time(x: torch.Tensor) -> torch.Tensor:
     return samples.flip(1).reshape(x.shape)
 
 
-def mask_steps(x: torch.Tensor, share: float, generator: torch.Generator) -> torch.Tensor:
+def mask_steps(x: torch.Tensor, share: float, draw: Draw) -> torch.Tensor:
     """Set a share of the time steps of each sample to zero (rounded to whole steps, at least one step stays)."""
     batch, steps = x.shape[:2]
     count = min(round(share * steps), steps - 1)
-    order = torch.rand(batch, steps, generator=generator).argsort(1)
+    order = draw.uniform(batch, steps).argsort(1)
     kept = (order >= count).to(device=x.device, dtype=x.dtype)
     return x * kept.view(batch, steps, *(1,) * (x.ndim - 2))
 
@@ -118,22 +142,17 @@ def _places(direction: str) -> list[int]:
     return places
 
 
-def _coins(x: torch.Tensor, generator: torch.Generator, probability: float = 0.5) -> torch.Tensor:
-    drawn = torch.rand(len(x), generator=generator) < probability
-    return drawn.to(x.device).view(-1, *(1,) * (x.ndim - 1))
-
-
-def _physical(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+def _physical(x: torch.Tensor, draw: Draw) -> torch.Tensor:
     # Both flips together are the half turn, so three fair coins draw the eight motions evenly.
     for direction in _MIRRORED:
-        x = torch.where(_coins(x, generator), flip(x, direction), x)
-    return torch.where(_coins(x, generator), reverse_time(x), x)
+        x = torch.where(draw.coins(x), flip(x, direction), x)
+    return torch.where(draw.coins(x), reverse_time(x), x)
 
 
-def _thesis(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    draw = torch.rand(3, generator=generator) < 0.5
-    turns = int(torch.randint(4, (1,), generator=generator))
-    dims = [axis for axis, drawn in zip((3, 4, 1), draw, strict=True) if drawn]
+def _thesis(x: torch.Tensor, draw: Draw) -> torch.Tensor:
+    chosen = torch.rand(3, generator=draw.generator) < 0.5
+    turns = int(torch.randint(4, (1,), generator=draw.generator))
+    dims = [axis for axis, drawn in zip((3, 4, 1), chosen, strict=True) if drawn]
     x = x.flip(dims) if dims else x
     turned = torch.rot90(x, turns, (3, 4))
     if turns % 2:
@@ -143,34 +162,34 @@ def _thesis(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     return turned
 
 
-def _image(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+def _image(x: torch.Tensor, draw: Draw) -> torch.Tensor:
     # Pictures have one unit per pixel: work in the units the networks see.
     scale = Normaliser.physical(x.shape[2] // len(CHANNELS)).scale.to(device=x.device, dtype=x.dtype)
     y = x / scale
 
     def drawn(*shape: int) -> torch.Tensor:
-        return torch.rand(len(x), *shape, generator=generator).to(device=x.device, dtype=x.dtype)
+        return draw.uniform(len(x), *shape).to(device=x.device, dtype=x.dtype)
 
     # Colour jitter: every channel its own brightness (offset) and contrast (gain).
     spread = y.flatten(1).std(1).view(-1, 1, 1, 1, 1)
     offset, gain = drawn(1, x.shape[2], 1, 1), drawn(1, x.shape[2], 1, 1)
-    y = torch.where(_coins(x, generator, 0.8), y * (0.6 + 0.8 * gain) + 0.4 * spread * (2 * offset - 1), y)
-    y = torch.where(_coins(x, generator, 0.2), y.mean(2, keepdim=True).expand_as(y), y)
+    y = torch.where(draw.coins(x, 0.8), y * (0.6 + 0.8 * gain) + 0.4 * spread * (2 * offset - 1), y)
+    y = torch.where(draw.coins(x, 0.2), y.mean(2, keepdim=True).expand_as(y), y)
     kernel = torch.tensor([1.0, 2.0, 1.0], dtype=x.dtype, device=x.device)
     kernel = (kernel[:, None] * kernel / 16.0).expand(x.shape[2], 1, 3, 3)
     blurred = functional.conv2d(y.flatten(0, 1), kernel, padding=1, groups=x.shape[2]).unflatten(0, x.shape[:2])
-    y = torch.where(_coins(x, generator), blurred, y)
-    noise = torch.randn(x.shape, generator=generator).to(device=x.device, dtype=x.dtype)
-    y = torch.where(_coins(x, generator), y + 0.1 * spread * noise, y)
+    y = torch.where(draw.coins(x), blurred, y)
+    noise = draw.normal(*x.shape).to(device=x.device, dtype=x.dtype)
+    y = torch.where(draw.coins(x), y + 0.1 * spread * noise, y)
     return y * scale
 
 
-def _none(x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    del generator
+def _none(x: torch.Tensor, draw: Draw) -> torch.Tensor:
+    del draw
     return x
 
 
-KINDS: Mapping[str, Callable[[torch.Tensor, torch.Generator], torch.Tensor]] = {
+KINDS: Mapping[str, Callable[[torch.Tensor, Draw], torch.Tensor]] = {
     "none": _none,
     "physical": _physical,
     "thesis": _thesis,

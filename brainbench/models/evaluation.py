@@ -96,7 +96,6 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
 
     encode: Any = getattr(model, "encode", None)
     decoder: Any = getattr(model, "decoder", None)
-    named = encode is not None and decoder is not None
     digest, seen, first, five = hashlib.sha256(), 0, 0, 0
     predictions, labelled = set(), set()
     moments: list[torch.Tensor] = []
@@ -104,7 +103,7 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
         for x, labels in batches:
             digest.update(x.contiguous().cpu().numpy().tobytes() + labels.cpu().long().numpy().tobytes())
             x, labels = x.to(device), labels.to(device).long()
-            if named:
+            if encode is not None and decoder is not None:
                 features = encode(x)
                 answers = decoder(features if isinstance(decoder, AllStepsDecoder) else features[:, -1]).float()
             else:

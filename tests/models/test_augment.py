@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.errors import UsageError
-from brainbench.models.augment import KINDS, LAST_COLUMNS, Augmentation, flip, mask_steps, reverse_time
+from brainbench.models.augment import KINDS, LAST_COLUMNS, Augmentation, Draw, flip, mask_steps, reverse_time
 
 OCCUPIED = torch.tensor([[column <= last for column in range(7)] for last in LAST_COLUMNS])
 
@@ -113,12 +113,12 @@ def test_the_image_form_changes_values_differently_for_every_sample():
 
 def test_masking_silences_whole_steps_of_each_sample():
     x = torch.ones(8, 20, 6, 5, 7)
-    y = mask_steps(x, 0.75, _generator())
+    y = mask_steps(x, 0.75, Draw(_generator()))
     kept = y.flatten(2).mean(2)
     assert set(kept.unique().tolist()) == {0.0, 1.0}
     assert (kept.sum(1) == 5).all()
     assert len({tuple(row.tolist()) for row in kept}) > 1
-    assert mask_steps(x[:, :2], 0.9, _generator()).any()
+    assert mask_steps(x[:, :2], 0.9, Draw(_generator())).any()
 
 
 def test_equal_generators_give_equal_results():
@@ -136,3 +136,12 @@ def test_wrong_choices_are_refused():
         flip(torch.zeros(1, 1, 5, 5, 7), "vertical")
     with pytest.raises(UsageError, match="Unknown direction of a flip 'sideways'"):
         flip(torch.zeros(1, 1, 6, 5, 7), "sideways")
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_a_part_of_a_batch_is_treated_as_in_the_whole(kind):
+    x, augmentation = _sweeps(8), Augmentation(kind, masking=0.3)
+    whole = augmentation(x, _generator(7))
+    for rank in range(2):
+        part = augmentation(x[rank::2], _generator(7), part=(rank, 2))
+        torch.testing.assert_close(part, whole[rank::2])

@@ -1,0 +1,76 @@
+"""What is written beside a trained model: its configuration and its model card."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from brainbench.files import provenance, to_plain
+from brainbench.models.evaluation import Evaluation
+from brainbench.models.registry import describe_model
+from brainbench.models.training.config import TrainingConfig
+
+
+def checkpoint_info(
+    config: TrainingConfig,
+    classes: tuple[str, ...],
+    *,
+    epochs_done: int,
+    best_epoch: int | None,
+    evaluation: Evaluation | None,
+) -> dict[str, Any]:
+    """Return what a checkpoint's configuration says beside the architecture, in plain values."""
+    return {
+        "objective": config.objective,
+        "augmentation": config.augmentation + (f" + {config.masking:.0%} masking" if config.masking else ""),
+        "seed": config.seed,
+        "classes": list(classes),
+        "epochs": epochs_done,
+        "published_epochs": 100,
+        "best_epoch": best_epoch,
+        "training": dataclasses.asdict(config),
+        "evaluation": to_plain(evaluation),
+        "twin": config.model,
+        "licence": "MIT",
+        "provenance": provenance(),
+    }
+
+
+def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
+    """Return the text of the model card (Mitchell et al. 2019), in Markdown."""
+    known = describe_model(config.model)
+    found = info["evaluation"]
+    lines = [
+        f"# {config.model}.{config.objective}",
+        "",
+        f"{known.description}, trained with brainbench: {config.objective}.",
+        "",
+        "| | |",
+        "|---|---|",
+        f"| architecture | {config.model} ({known.citation}) |",
+        f"| parameters | {known.parameters:,} with 117 classes; {len(info['classes'])} classes here |",
+        "| input | sweeps [B, T, 30, 5, 7] in N and N·m; normalised inside |",
+        f"| epochs | {info['epochs']} (published: {info['published_epochs']}); best: {info['best_epoch']} |",
+        f"| optimiser | {config.optimizer}, {config.schedule}, learning rate {config.learning_rate:g}, batch "
+        f"{config.batch_size} |",
+        f"| augmentation | {info['augmentation']} |",
+        f"| seed | {config.seed} |",
+    ]
+    if found is not None:
+        low, high = found["interval"]["low"], found["interval"]["high"]
+        read = "linear probe on the frozen network" if config.objective != "supervised" else "its own decoder"
+        lines += [
+            f"| top-1 | {found['top1']:.3f} [{low:.3f}, {high:.3f}] on {found['count']} sweeps ({read}) |",
+            f"| top-5 | {found['top5']:.3f} |",
+            f"| test data | {found['data']} |",
+            f"| collapsed | {'yes: ' + found['reason'] if found['collapsed'] else 'no'} |",
+        ]
+    lines += [
+        f"| untrained twin | {info['twin']} |",
+        f"| licence | {info['licence']} |",
+        "",
+        "Trained on simulated touch alone; what it says about brains is what `brainbench score` measures.",
+        "",
+    ]
+    return "\n".join(lines)

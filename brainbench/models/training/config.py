@@ -1,0 +1,152 @@
+"""What is trained and how. Importing this module imports no framework."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.models.checkpoints import DTYPES
+from brainbench.models.recipes import BATCH_SIZE, EPOCHS, Setting, recipe_for
+
+PRECISIONS = ("float32", "bf16")
+COMPILE = ("off", "default", "graphs")
+AUGMENTATIONS = ("none", "physical", "thesis", "image")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One training run. :meth:`published` fills in the published recipe.
+
+    Raises:
+        UsageError: a value is outside its range; the message names what is allowed.
+    """
+
+    model: str
+    """Registry name without a tag."""
+    objective: str = "supervised"
+    optimizer: str = "sgd"
+    schedule: str = "step"
+    learning_rate: float = 1e-2
+    warmup_epochs: int = 0
+    epochs: int = EPOCHS
+    batch_size: int = BATCH_SIZE
+    """Sweeps per optimiser step, over all processes."""
+    decoder: str = "linear"
+    augmentation: str = "physical"
+    """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.augment`)."""
+    masking: float = 0.0
+    """Share of masked time steps."""
+    precision: str = "bf16"
+    """``float32``, or ``bf16``: mixed precision with float32 weights."""
+    compile: str = "off"
+    """``off``, ``default`` (torch.compile) or ``graphs`` (torch.compile with CUDA graphs)."""
+    clip: float = 1.0
+    """Largest norm of the gradient; 0 leaves it alone."""
+    probe_epochs: int = 100
+    """Epochs of the linear probe after a self-supervised objective; 0 for none."""
+    seed: int = 0
+    """Of weights, order, augmentation and dropout."""
+    checkpoint_seconds: float = 60.0
+    """Time between saved states within an epoch; the end of every epoch saves too."""
+    weights_dtype: str = "float32"
+    """Precision of the published weights: ``float32``, ``float16`` or ``bfloat16``."""
+
+    def __post_init__(self) -> None:
+        from brainbench.models.registry import OBJECTIVES
+
+        for kind, value, allowed in (
+            ("objective", self.objective, OBJECTIVES),
+            ("precision", self.precision, PRECISIONS),
+            ("way to compile", self.compile, COMPILE),
+            ("precision of weights", self.weights_dtype, DTYPES),
+            ("augmentation", self.augmentation, AUGMENTATIONS),
+        ):
+            if value not in allowed:
+                raise unknown_name(kind, value, allowed)
+        for name, smallest in (("epochs", 1), ("batch_size", 2), ("probe_epochs", 0), ("warmup_epochs", 0)):
+            if getattr(self, name) < smallest:
+                raise UsageError(f"{name} must be at least {smallest}; received {getattr(self, name)!r}.")
+        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0) or not self.clip >= 0:
+            raise UsageError(
+                "The learning rate must be positive and the clipping norm 0 or more; received "
+                f"{self.learning_rate!r} and {self.clip!r}."
+            )
+
+    @classmethod
+    def published(cls, model: str, objective: str = "supervised", **changes: Any) -> TrainingConfig:
+        """Return the published recipe of an architecture and an objective, with changes.
+
+        Raises:
+            UsageError: there is no such objective or field, or a value is outside its range.
+        """
+        objective, _, variant = objective.partition("-")
+        recipe = recipe_for(model, objective)
+        setting = recipe.setting
+        if variant == "warmup" and objective == "simsiam":
+            setting = Setting(setting.optimizer, setting.schedule, setting.learning_rate, 10)
+        elif variant:
+            raise unknown_name("objective", f"{objective}-{variant}", ("supervised", "simclr", "simsiam", "ae"))
+        values = {
+            "model": model,
+            "objective": objective,
+            "batch_size": recipe.batch_size,
+            "epochs": recipe.epochs,
+            "decoder": recipe.decoder if objective == "supervised" else "linear",
+            **dataclasses.asdict(setting),
+        }
+        return cls.from_mapping({**values, **{name: value for name, value in changes.items() if value is not None}})
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> TrainingConfig:
+        """Build a configuration from names and values.
+
+        Raises:
+            UsageError: a name does not exist, or a value is of another kind or outside its range.
+        """
+        known = {field.name: field for field in fields(cls)}
+        for name, value in values.items():
+            if name not in known:
+                raise unknown_name("training option", name, known)
+            kinds = {"str": (str,), "int": (int,), "float": (int, float)}[str(known[name].type)]
+            if not isinstance(value, kinds) or isinstance(value, bool):
+                raise UsageError(f"The training option {name!r} is a {known[name].type}; received {value!r}.")
+        if "model" not in values:
+            raise UsageError("A training configuration needs the option 'model'.")
+        return cls(**values)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What must be equal for a run to be resumed: all but how often and how exactly results are stored."""
+        free = ("checkpoint_seconds", "weights_dtype")
+        return {name: value for name, value in dataclasses.asdict(self).items() if name not in free}
+
+
+def read_options(path: str | Path) -> dict[str, Any]:
+    """Read training options from a TOML or JSON file.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it cannot be parsed or holds no mapping.
+    """
+    import tomllib
+
+    from brainbench.files import read_json
+
+    path = Path(path)
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
+    if path.suffix.lower() == ".json":
+        values = read_json(path)
+    else:
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise DataError(f"{str(path)!r} is not valid TOML ({error}).") from error
+    if not isinstance(values, dict):
+        raise DataError(f"{str(path)!r} holds a {type(values).__name__}, not names and values.")
+    return values

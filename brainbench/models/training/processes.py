@@ -1,0 +1,103 @@
+"""One process or several: what torchrun says, and how they stay in step."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from brainbench.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process among those of the run."""
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """(rank, number): which sweeps of a batch are this process's."""
+        return self.rank, self.count
+
+    @property
+    def first(self) -> bool:
+        """Whether this process writes files and shows progress."""
+        return self.rank == 0
+
+    def wrap(self, module: nn.Module) -> nn.Module:
+        """Return the module with gradients (and on CUDA batch norms) averaged over processes."""
+        if self.count == 1:
+            return module
+        ids = [self.device.index] if self.device.type == "cuda" else None
+        return nn.parallel.DistributedDataParallel(module, device_ids=ids)
+
+    def prepare(self, module: nn.Module) -> nn.Module:
+        """Return the module on its device, with batch norms that pool over processes.
+
+        Raises:
+            UsageError: batch norms over several processes without CUDA, where PyTorch has none.
+        """
+        if self.count > 1 and any(isinstance(m, nn.modules.batchnorm._BatchNorm) for m in module.modules()):
+            if self.device.type != "cuda":
+                raise UsageError(
+                    "Several processes on the CPU would each normalise over their own part of a batch; train a "
+                    "network with batch norms in one process, or on CUDA."
+                )
+            module = nn.SyncBatchNorm.convert_sync_batchnorm(module)
+        return module.to(self.device)
+
+    def mean(self, value: float) -> float:
+        """Return the mean of a number over processes."""
+        if self.count == 1:
+            return value
+        total = torch.tensor([value], dtype=torch.float64, device=self.device)
+        torch.distributed.all_reduce(total)
+        return float(total) / self.count
+
+    def any(self, flag: bool) -> bool:
+        """Whether the flag is up in any process."""
+        return self.mean(float(flag)) > 0
+
+    def wait(self) -> None:
+        """Wait until all processes have come here."""
+        if self.count > 1:
+            torch.distributed.barrier()
+
+
+@contextmanager
+def processes(device: str | None = None) -> Iterator[Processes]:
+    """Join the processes that torchrun started, or be the only one.
+
+    Args:
+        device: ``cpu``, ``cuda`` or ``cuda:N``; None takes CUDA when there is one.
+
+    Raises:
+        UsageError: the device does not exist.
+    """
+    chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    count, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
+    try:
+        where = torch.device(chosen)
+    except RuntimeError as error:
+        raise UsageError(f"{chosen!r} is not a device; name cpu, cuda or cuda:N.") from error
+    if where.type == "cuda":
+        if not torch.cuda.is_available():
+            raise UsageError(f"The device {chosen!r} was asked for and PyTorch sees no CUDA; name cpu instead.")
+        if where.index is None:
+            where = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+        torch.cuda.set_device(where)
+    if count == 1:
+        yield Processes(0, 1, where)
+        return
+    torch.distributed.init_process_group("nccl" if where.type == "cuda" else "gloo")
+    try:
+        yield Processes(rank, count, where)
+    finally:
+        torch.distributed.destroy_process_group()

@@ -1,0 +1,21 @@
+"""A tiny labelled data set: three classes that differ in which whiskers are loaded."""
+
+import torch
+
+from brainbench.models.training.batches import ArrayData
+
+CLASSES = ("front", "middle", "back")
+
+
+def sweeps(count, seed, steps=8):
+    generator = torch.Generator().manual_seed(seed)
+    labels = torch.arange(count) % 3
+    x = 0.2 * torch.randn(count, steps, 30, 5, 7, generator=generator)
+    for index, label in enumerate(labels):
+        x[index, :, :, label : label + 2] += 2.0
+    return x * torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None], labels
+
+
+def tiny(**counts):
+    counts = {"train": 24, "validation": 9, "test": 9} | counts
+    return ArrayData(CLASSES, **{split: sweeps(n, i) for i, (split, n) in enumerate(counts.items()) if n})
