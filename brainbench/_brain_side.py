@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from brainbench.metrics import SubjectRDM
+    from brainbench.metrics import Metric
 
-RDM_METHOD = "correlation"
 DEMO_STIMULI = "rodgers"
 """Recipe that the demo animals feel."""
 
@@ -47,12 +46,13 @@ class BrainSide:
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}}
 
     def animals(
-        self, kept: tuple[str, ...], *, time: str = "mean", seed: int = 0, draws: int = 0
-    ) -> tuple[SubjectRDM, ...]:
-        """Every animal's RDM, its split halves and bootstrap draws over the labels ``kept``, in that order."""
+        self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
+    ) -> tuple[Any, ...]:
+        """Every animal prepared by a metric (RSA by default) over the labels ``kept``, in that order."""
         from brainbench.datasets import blocks
-        from brainbench.metrics import TrialBlock, subject_rdm
+        from brainbench.metrics import TrialBlock, get_metric
 
+        metric = metric or get_metric("rsa")
         index = np.full(len(self.vocabulary), -1)
         index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
         animals = []
@@ -64,9 +64,7 @@ class BrainSide:
                 trials.append(
                     TrialBlock(features, index[labels][rows], [key for key, row in zip(keys, rows, strict=True) if row])
                 )
-            animals.append(
-                subject_rdm(subject, trials, len(kept), stimuli=kept, method=RDM_METHOD, seed=seed, draws=draws)
-            )
+            animals.append(metric.animal(subject, trials, len(kept), stimuli=kept, seed=seed, draws=draws))
         return tuple(animals)
 
 

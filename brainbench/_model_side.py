@@ -1,4 +1,4 @@
-"""The model's side of a score: find the model, run it on the stimuli, reduce its layers to RDMs."""
+"""The model's side of a score: find the model, run it on the stimuli, reduce its layers to features."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench._brain_side import RDM_METHOD
 from brainbench.errors import UsageError, unknown_name
 from brainbench.types import CHANNELS, ModelCard, Progress
 
@@ -40,19 +39,19 @@ class ModelSide:
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Provenance of stimuli and weights."""
 
-    def rdms(self, rows: list[int]) -> dict[str, NDArray[np.float64]]:
-        """Every layer's RDM [P] over the stimuli ``rows``."""
-        return {layer: _rdm(values[rows], self.time) for layer, values in self.activations.items()}
+    def features(self, rows: list[int]) -> dict[str, NDArray[np.floating]]:
+        """Every layer's features [K, F] of the stimuli ``rows``."""
+        return {layer: _features_of(values[rows], self.time) for layer, values in self.activations.items()}
 
-    def baseline_rdms(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """RDMs of the raw input and of random features of it; empty without an input."""
+    def baseline_features(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.floating]]]:
+        """The raw input and random features of it; empty without an input."""
         if self.model_input is None:
             return {}
         raw = self.model_input[rows].astype(np.float64)
         weights = np.random.default_rng(seed).standard_normal((raw.shape[-1], RANDOM_FEATURES)) / np.sqrt(raw.shape[-1])
         return {
-            "raw input": {"input": _rdm(raw, self.time)},
-            "random features": {"random": _rdm(np.maximum(raw @ weights, 0.0), self.time)},
+            "raw input": {"input": _features_of(raw, self.time)},
+            "random features": {"random": _features_of(np.maximum(raw @ weights, 0.0), self.time)},
         }
 
 
@@ -193,9 +192,6 @@ def _with_weights(module: torch.nn.Module, card: ModelCard) -> Candidate:
     return Candidate(replace(card, parameters=count, weights=digest), module)
 
 
-def _rdm(values: NDArray[np.floating], time: str) -> NDArray[np.float64]:
-    from brainbench.metrics import rdm
-
-    # NaN activations must stay NaN here: on this side nothing is "not recorded".
-    flat = values.reshape(len(values), -1) if time == "concatenate" else values.mean(axis=1, dtype=np.float64)
-    return rdm(flat, method=RDM_METHOD)
+def _features_of(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
+    """[K, T, F] → [K, F'] by the time rule; NaN activations stay NaN, since here nothing is "not recorded"."""
+    return values.reshape(len(values), -1) if time == "concatenate" else values.mean(axis=1, dtype=np.float64)

@@ -22,11 +22,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from brainbench.datasets import Selection, Window
+    from brainbench.metrics import Metric
     from brainbench.stimuli import Fidelity
 
 TimeRule = Literal["mean", "concatenate"]
-
-COMPARISON = "pearson"
 
 
 def score(
@@ -67,6 +66,7 @@ def score_record(
     recordings: str | os.PathLike[str] | xr.Dataset = "demo",
     stimuli: Any = None,
     estimator: str = "default",
+    metric: str | Metric = "rsa",
     conditions: str | None = None,
     match: str | os.PathLike[str] | Mapping[str, str | None] | None = None,
     select: Selection | str | None = None,
@@ -86,6 +86,8 @@ def score_record(
 
     Args:
         model, recordings, stimuli, estimator: as in :func:`score`.
+        metric: a name (:func:`brainbench.metrics.list_metrics`), ``"FILE.py:NAME"``, or a
+            :class:`brainbench.metrics.Metric`.
         conditions: ``TABLE:COLUMN[,COLUMN]``, the interval table and columns that label the trials.
         match: recording label → stimulus label (None drops the recording label), as a mapping or a
             JSON, TOML or CSV file; without it both sides must have the same labels.
@@ -114,6 +116,8 @@ def score_record(
     if time not in ("mean", "concatenate"):
         raise UsageError(f"Unknown time rule {time!r}; allowed: 'mean', 'concatenate'.")
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
+    chosen = metrics.find_metric(metric) if isinstance(metric, str) else metric
+    metrics.check_metric(chosen)
     candidate = find_model(model, seed=seed)
     brain = brain_side(recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress)
     network = candidate.respond(
@@ -128,18 +132,16 @@ def score_record(
     pairs = join_labels(brain.vocabulary, network.labels, match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
-    animals = brain.animals(kept, time=time, seed=seed, draws=metrics.DRAWS)
+    animals = brain.animals(kept, metric=chosen, time=time, seed=seed, draws=metrics.DRAWS)
 
-    def against_brain(name: str, rdms: Mapping[str, Any]) -> Score:
-        return metrics.score_rdms(
-            rdms, animals, name=name, stimuli=kept, estimator=estimator, compare=COMPARISON, seed=seed
-        )
+    def against_brain(name: str, features: Mapping[str, Any]) -> Score:
+        return chosen.score(features, animals, name=name, stimuli=kept, estimator=estimator, seed=seed)
 
-    scores = [against_brain(network.card.name, network.rdms(rows))]
+    scores = [against_brain(network.card.name, network.features(rows))]
     between = None
     if baselines:
-        scores += [against_brain(name, rdms) for name, rdms in network.baseline_rdms(rows, seed).items()]
-        between = metrics.score_animals(animals, stimuli=kept, estimator=estimator)
+        scores += [against_brain(name, features) for name, features in network.baseline_features(rows, seed).items()]
+        between = chosen.score_animals(animals, stimuli=kept, estimator=estimator)
 
     origin = provenance(
         **network.origin,
@@ -153,6 +155,7 @@ def score_record(
             "normalize": normalize,
             "layers": layers,
             "estimator": estimator,
+            "metric": chosen.name,
             "seed": seed,
         },
         seconds=round(clock.perf_counter() - started, 2),

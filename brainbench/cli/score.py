@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from brainbench.types import ResultRecord, Score
 
 
+_RELIABILITY = {
+    True: "split halves, Spearman-Brown, mean over animals",
+    False: "share of the variance between stimuli that is not trial noise, mean over animals",
+}
+
+
 def _complete_model(incomplete: str) -> list[str]:
     from brainbench.models.registry import list_models
 
@@ -54,6 +60,9 @@ def score(
     ] = "mean",
     bin: Annotated[float | None, typer.Option(help="Bin width of the spike counts in seconds.")] = None,
     estimator: Annotated[str, typer.Option(help="default, thesis or thesis-input (as published).")] = "default",
+    metric: Annotated[
+        str, typer.Option(help="rsa, rsa-crossnobis, cka, ridge, procrustes, or FILE.py:CLASS of your own.")
+    ] = "rsa",
     normalize: Annotated[
         bool, typer.Option(help="Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI.")
     ] = True,
@@ -83,6 +92,7 @@ def score(
             time=time,  # pyright: ignore[reportArgumentType]  # checked there, with the allowed values
             bin=bin,
             estimator=estimator,
+            metric=metric,
             normalize=normalize,
             seed=seed,
             command=_command(),
@@ -112,15 +122,16 @@ def _text(record: ResultRecord) -> str:
     lines = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(score.subjects)} animals  ·  {source}"]
     if record.synthetic:
         lines.append("Synthetic recordings: ranks on them say nothing about brains.")
+    rsa = score.metric.startswith("RSA")
     facts = [
         [
             "score",
             f"{_number(score.value)} {_interval(score)}",
-            "noise-corrected RSA, 1 = explains all that is reliable",
+            "noise-corrected RSA, 1 = explains all that is reliable" if rsa else score.metric,
         ],
         ["status", score.status, "; ".join(score.reasons)],
         ["raw r", _number(score.r), _ceiling(score)],
-        ["reliability", _number(score.reliability), "split halves, Spearman-Brown, mean over animals"],
+        ["reliability", _number(score.reliability), _RELIABILITY[rsa]],
         ["permutation p", _number(score.p), f"{score.p_method}; smallest possible {_number(score.p_smallest)}"],
         ["layer", str(score.layer), score.layer_rule],
         ["best layer", f"{_number(score.best_layer_value)}", f"{score.best_layer}: optimistic maximum, not a result"],

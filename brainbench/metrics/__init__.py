@@ -3,7 +3,7 @@
 The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`split_half` reliability and
 :func:`noise_corrected`; :func:`noise_ceiling`; :func:`permutation_test`; :func:`subject_rdm`,
 :func:`score_rdms` and :func:`score_animals`, which join them. Beyond one score: :func:`bootstrap_score`,
-:func:`compare_models`, :func:`layer_tests`, :func:`turing_test`.
+:func:`compare_models`, :func:`layer_tests`, :func:`turing_test`. Beyond RSA: :func:`get_metric`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from brainbench.metrics.equivalence import EquivalenceTest, equivalence_test, tu
 from brainbench.metrics.inference import PermutationTest, permutation_test
 from brainbench.metrics.multiple import LayerTest, ModelComparison, compare_models, layer_tests
 from brainbench.metrics.noise import ESTIMATORS, RELIABILITY_GATE, Corrected, noise_corrected, spearman_brown
+from brainbench.metrics.patterns import PatternMetric
 from brainbench.metrics.precision import noise_precision
+from brainbench.metrics.protocol import Metric, check_metric, find_metric, get_metric, list_metrics, register_metric
 from brainbench.metrics.rdm import RDM_METHODS, rdm, rdm_problem
 from brainbench.metrics.reliability import SUBJECT_METHODS, SplitHalf, TrialBlock, split_half
 from brainbench.metrics.score import score_rdms
@@ -33,8 +35,10 @@ __all__ = [
     "Corrected",
     "EquivalenceTest",
     "LayerTest",
+    "Metric",
     "ModelComparison",
     "NoiseCeiling",
+    "PatternMetric",
     "PermutationTest",
     "SplitHalf",
     "SubjectRDM",
@@ -42,16 +46,21 @@ __all__ = [
     "bootstrap_ceiling",
     "bootstrap_comparisons",
     "bootstrap_score",
+    "check_metric",
     "compare",
     "compare_models",
     "equivalence_test",
+    "find_metric",
+    "get_metric",
     "layer_tests",
+    "list_metrics",
     "noise_ceiling",
     "noise_corrected",
     "noise_precision",
     "permutation_test",
     "rdm",
     "rdm_problem",
+    "register_metric",
     "score_animals",
     "score_rdms",
     "spearman_brown",

@@ -139,7 +139,7 @@ def split_half(
     names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
     if len(names) != n_stimuli:
         raise UsageError(f"There are {n_stimuli} stimuli but {len(names)} names.")
-    sessions, problem, notes = _usable(blocks, n_stimuli, names, least=4 if method == "crossnobis" else 2)
+    sessions, problem, notes = usable_sessions(blocks, n_stimuli, names, least=4 if method == "crossnobis" else 2)
     if method in ("mahalanobis", "crossnobis") and problem is None:
         sessions, problem, notes = _without_noise(sessions, n_stimuli, noise, notes)
     pairs = n_stimuli * (n_stimuli - 1) // 2
@@ -197,7 +197,7 @@ def _draws(
     return rdms, np.divide(total, present.sum(axis=1), out=np.full(number, np.nan), where=present.any(axis=1))
 
 
-def _usable(
+def usable_sessions(
     blocks: Sequence[TrialBlock], count: int, names: list[str], *, least: int
 ) -> tuple[list[Session], str | None, tuple[str, ...]]:
     """Check the sessions, leave out what cannot be split and say what."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.errors import UsageError
+from brainbench.files import to_plain
 from brainbench.metrics._animals import (
     Animals,
     ceiling_of,
@@ -162,7 +163,7 @@ def _statistics(
             "draws": held,
             "undefined_draws": boot.undefined,
             "standard_error": boot.standard_error,
-            "interval": boot.interval("percentile"),
+            "interval": to_plain(boot.interval("percentile")),
         }
         found["monte_carlo_error"]["bootstrap_interval"] = boot.monte_carlo_error("percentile")
     return found

@@ -135,7 +135,7 @@ def test_the_score_carries_its_bootstrap_and_its_monte_carlo_error():
     found = score.provenance["statistics"]
     assert found["bootstrap"]["draws"] == 200
     assert found["bootstrap"]["levels"] == "animals, sessions and trials"
-    assert found["bootstrap"]["interval"].low < score.value < found["bootstrap"]["interval"].high
+    assert found["bootstrap"]["interval"]["low"] < score.value < found["bootstrap"]["interval"]["high"]
     assert found["monte_carlo_error"]["p"] == 0
     repeated = [
         score_rdms(
