@@ -286,9 +286,9 @@ def test_other_comparisons_use_their_own_split_halves(method):
 
 def test_a_score_survives_json():
     latent = make_latent(14)
-    animals = [subject_rdm(f"m{i}", [make_block(latent, seed=i)], 6, splits=60, draws=50) for i in range(2)]
+    animals = [subject_rdm(f"m{i}", [make_block(latent, seed=i)], 6, splits=60, draws=100) for i in range(2)]
     score = _score(_make_layers(latent), animals)
-    assert score.provenance["statistics"]["bootstrap"]["draws"] == 50
+    assert score.provenance["statistics"]["bootstrap"]["draws"] == 100
     assert Score.from_json(score.to_json()) == score
 
 
