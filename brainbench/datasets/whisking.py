@@ -7,6 +7,8 @@ B batch, T time step, S sub-step, C channel, W whisker, H×W whisker grid, N swe
 from __future__ import annotations
 
 import os
+import sys
+import threading
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -33,6 +35,7 @@ SPLITS = ("train", "validation", "test", "all")
 """What ``split`` may be; ``all`` is the three together."""
 
 _AHEAD = 2
+_BUFFERS = 2 * (_AHEAD + 2)
 _BLOCK = 64
 
 
@@ -122,6 +125,7 @@ class WhiskingDataset:
         entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]
         self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
         self._choose()
+        self._buffers = _Buffers()
         self._maps: OrderedDict[int, NDArray[np.float32]] = OrderedDict()
         self.epoch = 0
         """Number of the epoch that the next batch belongs to, from 0."""
@@ -224,7 +228,10 @@ class WhiskingDataset:
         sweeps = np.asarray(sweeps)
         device = torch.device(self.device)
         shape = (len(sweeps), *self._shards[0].shape)
-        raw = torch.empty(shape, dtype=torch.float32, pin_memory=device.type == "cuda")
+        if device.type == "cuda":
+            raw = torch.empty(shape, dtype=torch.float32, pin_memory=True)
+        else:
+            raw = torch.from_numpy(self._buffers.take(shape))
         self.read(sweeps, out=raw.numpy())
         label = torch.from_numpy(self.labels[sweeps]).to(device)
         moved = raw.to(device, non_blocking=True)
@@ -348,11 +355,37 @@ class WhiskingDataset:
 
     def _to_grid(self, raw: torch.Tensor) -> torch.Tensor:
         """Return [B, T, S·C, H, W] of [B, frame, W, C]: sub-step major, cells without a whisker zero."""
+        import torch
+
         source, empty = self._columns
         count, frames = raw.shape[:2]
-        grid = raw.reshape(count * frames, -1).index_select(1, source)
+        rows = raw.view(count * frames, -1)
+        if raw.device.type == "cpu":
+            grid = torch.from_numpy(self._buffers.take((len(rows), len(source))))
+            torch.index_select(rows, 1, source, out=grid)
+        else:
+            grid = rows.index_select(1, source)
         grid.view(-1, GRID_SHAPE[0] * GRID_SHAPE[1]).index_fill_(1, empty, 0.0)
         return grid.view(count, frames // self.substeps, self.substeps * len(CHANNELS), *GRID_SHAPE)
+
+
+class _Buffers:
+    """Memory for batches, used again once nobody holds it: fresh memory is slower than copying into it."""
+
+    def __init__(self) -> None:
+        self._held: list[NDArray[np.float32]] = []
+        self._lock = threading.Lock()
+
+    def take(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """Return an array of ``shape`` with any content that no tensor or view refers to."""
+        with self._lock:
+            for index in range(len(self._held)):
+                # The list's own reference and the argument's; every tensor on the memory holds another.
+                if self._held[index].shape == shape and sys.getrefcount(self._held[index]) == 2:
+                    return self._held[index]
+            made = np.empty(shape, np.float32)
+            self._held = [*self._held[-_BUFFERS:], made]
+            return made
 
 
 def _most_open() -> int:

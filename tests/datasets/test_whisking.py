@@ -102,6 +102,29 @@ def test_a_state_of_other_batches_is_refused(folder):
         WhiskingDataset(folder, batch_size=6, seed=1).load_state_dict(state)
 
 
+def test_batches_that_are_kept_are_never_written_over(folder):
+    data = WhiskingDataset(folder, split="train", batch_size=2)
+    kept, views, copies = [], [], []
+    for epoch in range(3):
+        for index, (x, _) in enumerate(data):
+            if index % 2 == epoch % 2:
+                kept.append(x)
+                views.append(x[1:, 0])
+                copies.append(x.clone())
+        # Only views are left of the first epoch's batches.
+        if epoch == 0:
+            kept.clear()
+    assert all(torch.equal(view, copy[1:, 0]) for view, copy in zip(views, copies, strict=True))
+    assert all(torch.equal(x, copy) for x, copy in zip(kept, copies[-len(kept) :], strict=True))
+
+
+def test_memory_is_used_again_once_nobody_holds_it(folder):
+    data = WhiskingDataset(folder, split="train", batch_size=2)
+    addresses = {x.data_ptr() for _ in range(3) for x, _ in data}
+    assert len(addresses) <= 8
+    assert len(data._buffers._held) <= 9
+
+
 def test_processes_read_different_sweeps_and_equally_many(folder):
     parts = [WhiskingDataset(folder, split="train", batch_size=4, part=(rank, 5)) for rank in range(5)]
     orders = [part.order(3) for part in parts]

@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brainbench.errors import DataError
-from brainbench.stimuli.generation.shard import build_solids, make_shard, simulate_shard, write_shard
+from brainbench.stimuli.generation.shard import Prepared, make_shard, prepare_shard, simulate_shard, write_shard
 
 if TYPE_CHECKING:
     from brainbench.stimuli.generation.plan import ShardTask
-    from brainbench.stimuli.objects import Solid
 
 Done = Callable[[int], None]
 """Called with the number of sweeps of a shard that is written."""
@@ -77,8 +76,8 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
     with _pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(WRITERS) as writers:
         writing: deque[Future[int]] = deque()
         try:
-            for task, solids in _built_ahead(tasks, builders):
-                content = simulate_shard(task, solids, workers)
+            for task, prepared in _built_ahead(tasks, builders):
+                content = simulate_shard(task, prepared, workers)
                 if len(writing) == WRITERS:
                     done(writing.popleft().result())
                 writing.append(writers.submit(write_shard, content, folder))
@@ -90,12 +89,10 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
             raise
 
 
-def _built_ahead(
-    tasks: Sequence[ShardTask], builders: ProcessPoolExecutor
-) -> Iterator[tuple[ShardTask, tuple[Solid | str, ...]]]:
-    coming: deque[tuple[ShardTask, Future[tuple[Solid | str, ...]]]] = deque()
+def _built_ahead(tasks: Sequence[ShardTask], builders: ProcessPoolExecutor) -> Iterator[tuple[ShardTask, Prepared]]:
+    coming: deque[tuple[ShardTask, Future[Prepared]]] = deque()
     for task in tasks:
-        coming.append((task, builders.submit(build_solids, task)))
+        coming.append((task, builders.submit(prepare_shard, task)))
         if len(coming) > AHEAD:
             first, future = coming.popleft()
             yield first, future.result()

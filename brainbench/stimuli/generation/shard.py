@@ -6,7 +6,7 @@ The bytes of a shard depend on what was asked for alone: no time, no machine and
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,6 @@ from brainbench.types import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from brainbench.stimuli.generation.engine import SweepBatch
     from brainbench.stimuli.generation.plan import ShardTask
 
 OK, UNSTABLE, UNUSABLE = 0, 1, 2
@@ -46,66 +45,76 @@ class ShardContent:
     attributes: Mapping[str, Any]
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What stands ready before a shard is simulated; made by another process while the GPU works."""
+
+    solids: tuple[Solid | None, ...]
+    """The objects of the shard; None for one that cannot be used."""
+    reasons: tuple[str, ...]
+    """Why an object cannot be used; empty for the others."""
+    tables: Mapping[str, NDArray[Any]]
+    """The arrays that do not depend on the simulation."""
+
+
 def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
-    """Build, simulate and write one shard with ``workers`` threads; return the number of its sweeps."""
-    return write_shard(simulate_shard(task, build_solids(task), workers), folder)
+    """Prepare, simulate and write one shard with ``workers`` threads; return the number of its sweeps."""
+    return write_shard(simulate_shard(task, prepare_shard(task), workers), folder)
 
 
-def build_solids(task: ShardTask) -> tuple[Solid | str, ...]:
-    """Build the objects of a shard; in place of an object that cannot be used stands why."""
-    found: list[Solid | str] = []
+def prepare_shard(task: ShardTask) -> Prepared:
+    """Build the objects of a shard and list its sweeps."""
+    solids: list[Solid | None] = []
+    reasons = []
     for item in task.objects:
         try:
-            found.append(item.load())
+            solids.append(item.load())
+            reasons.append("")
         except DataError as error:
-            found.append(str(error) or type(error).__name__)
-    return tuple(found)
+            solids.append(None)
+            reasons.append(str(error) or type(error).__name__)
+    hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
+    return Prepared(tuple(solids), tuple(reasons), {**_tables(task, hashes), **_conditions(task)})
 
 
-def simulate_shard(task: ShardTask, solids: tuple[Solid | str, ...], workers: int | None = None) -> ShardContent:
-    """Simulate the sweeps of a shard past its solids."""
-    usable = [index for index, solid in enumerate(solids) if isinstance(solid, Solid)]
+def simulate_shard(task: ShardTask, prepared: Prepared, workers: int | None = None) -> ShardContent:
+    """Simulate the sweeps of a shard past its objects."""
     count, frames = task.grid.count, task.grid.frames
-    chosen = np.flatnonzero(np.isin(task.owner, usable))
     whiskers = len(task.config["whiskers"]["names"])
-    wrench = np.full((len(task), frames.count, whiskers, 6), np.nan, dtype=np.float32)
+    place = {owner: rank for rank, owner in enumerate(i for i, solid in enumerate(prepared.solids) if solid)}
+    chosen = np.flatnonzero(np.isin(task.owner, list(place)))
+    shape = (len(task), frames.count, whiskers, 6)
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
-    reasons = [str(solids[owner]) if owner not in usable else "" for owner in task.owner.tolist()]
+    reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
     steps = steps_in_full = 0
+    wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
-        place = {owner: index for index, owner in enumerate(usable)}
-        named = {task.objects[owner].name: solid for owner in usable if isinstance(solid := solids[owner], Solid)}
-        scenes = SweepScenes(task.grid, named, whiskers=task.whiskers)
-        indices = [place[task.owner[i]] * count + int(task.within[i]) for i in chosen.tolist()]
-        settings = task.settings
+        named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
         batch = simulate_sweeps(
-            scenes,
-            indices,
-            fidelity=settings.fidelity,
-            backend=settings.backend,
-            device=settings.device,
+            SweepScenes(task.grid, named, whiskers=task.whiskers),
+            [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()],
+            fidelity=task.settings.fidelity,
+            backend=task.settings.backend,
+            device=task.settings.device,
             workers=workers,
         )
-        # The usual shard has no unusable object: its forces, hundreds of megabytes, need no copy.
-        wrench = _take(batch, wrench, chosen)
+        if batch.wrench.shape != (len(chosen), *shape[1:]):
+            raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")
         contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)
         for index, reason in zip(chosen.tolist(), batch.reasons, strict=True):
             reasons[index] = reason
         steps, steps_in_full = batch.steps, batch.steps_in_full
+        wrench = batch.wrench
+    if len(chosen) < len(task):
+        known, wrench = wrench, np.full(shape, np.nan, dtype=np.float32)
+        wrench[chosen] = known
     arrays = {
-        **_tables(task, solids),
-        **_conditions(task),
+        **prepared.tables,
         "contact": contact,
         "status": status,
         "reason": _texts(reasons),
-        "wrench": wrench,
-    }
-    work = {
-        "steps": steps,
-        "steps_in_full": steps_in_full,
-        "unstable": int((status == UNSTABLE).any(axis=1).sum()),
-        "unusable": int((status == UNUSABLE).any(axis=1).sum()),
+        "wrench": np.ascontiguousarray(wrench, dtype="<f4"),
     }
     attributes = {
         "format": SWEEPS_FORMAT,
@@ -114,7 +123,10 @@ def simulate_shard(task: ShardTask, solids: tuple[Solid | str, ...], workers: in
         "axes": frames.axes,
         "config": to_json(task.config, indent=None),
         "config_hash": task.config_hash,
-        **work,
+        "steps": steps,
+        "steps_in_full": steps_in_full,
+        "unstable": int((status == UNSTABLE).any(axis=1).sum()),
+        "unusable": int((status == UNUSABLE).any(axis=1).sum()),
     }
     return ShardContent(task, arrays, attributes)
 
@@ -140,19 +152,9 @@ def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
     return len(content.task)
 
 
-def _take(batch: SweepBatch, empty: NDArray[np.float32], chosen: NDArray[np.intp]) -> NDArray[np.float32]:
-    if batch.wrench.shape[1:] != empty.shape[1:]:
-        raise UsageError(f"The engine gave wrenches {batch.wrench.shape[1:]} per sweep; expected {empty.shape[1:]}.")
-    if len(chosen) == len(empty):
-        return np.ascontiguousarray(batch.wrench, dtype="<f4")
-    empty[chosen] = batch.wrench
-    return empty
-
-
-def _tables(task: ShardTask, solids: tuple[Solid | str, ...]) -> dict[str, NDArray[Any]]:
+def _tables(task: ShardTask, hashes: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Return the names behind the numbers: times, whiskers, channels, classes and objects."""
     mounts = list(default_array(task.grid.species).select(task.whiskers))
-    hashes = [_hash_solid(solid) if isinstance(solid, Solid) else "" for solid in solids]
     number = {label: index for index, label in enumerate(task.classes)}
     return {
         "time": task.grid.frames.times,

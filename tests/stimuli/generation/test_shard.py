@@ -13,8 +13,8 @@ from brainbench.stimuli.generation.shard import (
     OK,
     UNSTABLE,
     UNUSABLE,
-    build_solids,
     make_shard,
+    prepare_shard,
     simulate_shard,
     write_shard,
 )
@@ -71,7 +71,7 @@ def test_the_same_shard_has_the_same_bytes_and_its_hash_tells_of_its_content(tmp
     for folder in ("a", "b"):
         make_shard(task, str(tmp_path / folder), workers=1 + (folder == "b"))
     assert (tmp_path / "a" / task.name).read_bytes() == (tmp_path / "b" / task.name).read_bytes()
-    content = simulate_shard(task, build_solids(task))
+    content = simulate_shard(task, prepare_shard(task))
     with h5py.File(tmp_path / "a" / task.name) as file:
         stored = {name: file[name][:] for name in content.arrays}
         assert hash_arrays(stored) == hash_arrays(content.arrays) == file.attrs["content_hash"]
@@ -115,7 +115,7 @@ def test_sweeps_of_an_object_that_cannot_be_built_are_marked_and_the_others_are_
 @pytest.mark.parametrize("kept", [0, 100, 5000])
 def test_a_shard_that_was_cut_off_is_not_whole(tmp_path, kept):
     task = small_plan().shards[0]
-    write_shard(simulate_shard(task, build_solids(task)), tmp_path)
+    write_shard(simulate_shard(task, prepare_shard(task)), tmp_path)
     path = tmp_path / task.name
     assert is_whole(path, task)
     path.write_bytes(path.read_bytes()[:kept])
