@@ -79,6 +79,7 @@ def score_record(
     time: TimeRule = "mean",
     seed: int = 0,
     baselines: bool = True,
+    explain: bool = False,
     command: str | None = None,
     progress: Progress | None = None,
 ) -> ResultRecord:
@@ -101,6 +102,8 @@ def score_record(
             ``"concatenate"`` keeps every step as features.
         seed: seed of untrained weights, of split halves and of random features.
         baselines: also score the raw input, random features and animal against animal.
+        explain: also walk from the published estimator to the default one (``estimator_walk`` in the
+            statistics of the provenance); RSA only.
         command: the command line that makes this record, kept in its provenance.
         progress: called with (done, total, what).
 
@@ -118,6 +121,8 @@ def score_record(
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     chosen = metrics.find_metric(metric) if isinstance(metric, str) else metric
     metrics.check_metric(chosen)
+    if explain and chosen.name != "rsa":
+        raise UsageError(f"The published estimator is one of RSA; the metric {chosen.name!r} has none to explain.")
     candidate = find_model(model, seed=seed)
     brain = brain_side(recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress)
     network = candidate.respond(
@@ -137,10 +142,13 @@ def score_record(
     def against_brain(name: str, features: Mapping[str, Any]) -> Score:
         return chosen.score(features, animals, name=name, stimuli=kept, estimator=estimator, seed=seed)
 
-    scores = [against_brain(network.card.name, network.features(rows))]
+    features = network.features(rows)
+    scores = [against_brain(network.card.name, features)]
+    if explain:
+        scores = [_with_walk(scores[0], {layer: metrics.rdm(values) for layer, values in features.items()}, animals)]
     between = None
     if baselines:
-        scores += [against_brain(name, features) for name, features in network.baseline_features(rows, seed).items()]
+        scores += [against_brain(name, found) for name, found in network.baseline_features(rows, seed).items()]
         between = chosen.score_animals(animals, stimuli=kept, estimator=estimator)
 
     origin = provenance(
@@ -174,3 +182,13 @@ def _with_origin(item: Score, origin: Mapping[str, Any]) -> Score:
     """Add where a score comes from to what its statistics say."""
     statistics = item.provenance.get("statistics")
     return dataclasses.replace(item, provenance={**origin, **({"statistics": statistics} if statistics else {})})
+
+
+def _with_walk(item: Score, rdms: Mapping[str, Any], animals: tuple[Any, ...]) -> Score:
+    """Add the walk from the published estimator to the default one to a score's statistics."""
+    from brainbench.files import to_plain
+    from brainbench.metrics.explain import explain_score
+
+    walk = [to_plain(step) for step in explain_score(rdms, animals)]
+    statistics = {**item.provenance.get("statistics", {}), "estimator_walk": walk}
+    return dataclasses.replace(item, provenance={**item.provenance, "statistics": statistics})

@@ -67,6 +67,14 @@ def score(
         bool, typer.Option(help="Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI.")
     ] = True,
     seed: Annotated[int, typer.Option(help="Seed of untrained weights and of split halves.")] = 0,
+    explain_estimator: Annotated[
+        bool,
+        typer.Option(
+            "--explain-estimator",
+            help="Also walk from the published estimator to the default one, fault by fault; MODEL may then be an .npz "
+            "of stored splits (arrays r_xy, r_yy and r_xx).",
+        ),
+    ] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the record and the report.")] = Path(
         "brainbench-results"
     ),
@@ -77,6 +85,9 @@ def score(
     from leaderboards.report import write_report
     from leaderboards.store import write_record
 
+    if explain_estimator and Path(model).suffix == ".npz":
+        _explain_splits(Path(model), as_json=as_json)
+        return
     with progress_bar() as progress:
         record = score_record(
             model,
@@ -95,6 +106,7 @@ def score(
             metric=metric,
             normalize=normalize,
             seed=seed,
+            explain=explain_estimator,
             command=_command(),
             progress=progress,
         )
@@ -102,6 +114,37 @@ def score(
     report = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
     emit(data, f"{_text(record)}\n\nrecord  {path}\nreport  {report}", as_json=as_json)
+
+
+def _explain_splits(path: Path, *, as_json: bool) -> None:
+    """Print the walk through stored split halves."""
+    import numpy as np
+
+    from brainbench.errors import DataError, DataFileNotFoundError
+    from brainbench.files import to_plain
+    from brainbench.metrics.explain import explain_splits
+
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no file {path}.")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} is no .npz file of plain arrays ({error}).") from error
+    if missing := {"r_xy", "r_yy"} - arrays.keys():
+        raise DataError(f"{path} lacks the array {sorted(missing)[0]!r}; it has {sorted(arrays)}.")
+    steps = [to_plain(step) for step in explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))]
+    emit({"estimator_walk": steps}, _walk(steps), as_json=as_json)
+
+
+def _walk(steps: list[dict[str, Any]]) -> str:
+    """Lay out the walk from the published estimator to the default one."""
+    rows = [
+        ["–" if step["value"] is None else f"{step['value']:.3f}", step["change"], step["status"], step["detail"]]
+        for step in steps
+    ]
+    title = "From the published estimator to the default, one fault at a time"
+    return f"{title}\n{table('', ['value', 'step', 'status', ''], rows, right=(0,))}"
 
 
 def _command() -> str:
@@ -142,6 +185,8 @@ def _text(record: ResultRecord) -> str:
         [name, f"{_number(item.value)} {_interval(item)}", item.status] for name, item in others if item is not None
     ]
     text = "\n".join(lines) + "\n\n" + table("", ["", "", ""], facts)
+    if walk := score.provenance.get("statistics", {}).get("estimator_walk"):
+        text += f"\n\n{_walk(walk)}"
     if rows:
         text += "\n\n" + table("Baselines, same estimator", ["", "score", "status"], rows)
     return text

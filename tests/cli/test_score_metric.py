@@ -25,3 +25,28 @@ def test_the_text_names_the_metric_and_an_unknown_one_is_refused(run, files):  #
     wrong = run(*arguments, "--metric", "rigde", "--out", files["out"])
     assert wrong.status == 2
     assert "did you mean 'ridge'" in wrong.err
+
+
+def test_the_walk_from_the_published_estimator_is_printed_and_recorded(run, files):  # noqa: F811
+    arguments = ("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture")
+    found = run(*arguments, "--explain-estimator", "--out", files["out"])
+    assert found.status == 0, found.err
+    assert "From the published estimator to the default" in found.out
+    data = json.loads(run(*arguments, "--explain-estimator", "--json", "--out", files["out"]).out)
+    walk = data["record"]["score"]["provenance"]["statistics"]["estimator_walk"]
+    assert walk[0]["change"].startswith("as published")
+    refused = run(*arguments, "--explain-estimator", "--metric", "ridge", "--out", files["out"])
+    assert refused.status == 2
+    assert "none to explain" in refused.err
+
+
+def test_stored_splits_are_walked_through(run, tmp_path):
+    import numpy as np
+
+    path = tmp_path / "splits.npz"
+    np.savez(path, r_xy=np.full(100, 0.3), r_yy=np.linspace(-0.2, 0.8, 100))
+    found = run("score", str(path), "--explain-estimator")
+    assert found.status == 0, found.err
+    assert "as published for the raw input" in found.out
+    np.savez(path, r_xy=np.full(100, 0.3))
+    assert "lacks the array 'r_yy'" in run("score", str(path), "--explain-estimator").err

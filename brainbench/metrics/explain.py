@@ -1,0 +1,221 @@
+"""The walk from the published estimator to the default one, one switch per fault, one line per step.
+
+Faults of the published estimator (each a field of :class:`Switches`; True is as published):
+
+``best_target``      the maximum over targets (every animal and their pool) is the score
+``best_layer``       the maximum over layers, on the data that are scored
+``drop_splits``      splits whose halves correlate below .5 are left out (models), which keeps the lucky ones
+``median``           ratios are summarised by their median (raw input), by their mean (models): bars of one
+                     figure came from two estimators
+``ratio_per_split``  every split is corrected by its own reliability before averaging; splits with negative
+                     reliability have no real value and vanish
+``negative_pairs``   two negative reliabilities have a positive product and pass
+``no_gate``          animals are averaged however unreliable they are
+
+Faults that happen before the estimator (other stimuli filled with zeros, stimuli numbered by first
+appearance) are in ``brainbench.datasets.synthetic`` and their damage is in docs/statistics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.errors import UsageError
+from brainbench.metrics._animals import gather
+from brainbench.metrics._pairs import Floats, rdm_stack
+from brainbench.metrics.compare import compare as compare_rdms
+from brainbench.metrics.layers import held_out
+from brainbench.metrics.noise import RELIABILITY_GATE, THESIS_FILTER, spearman_brown
+from brainbench.metrics.subject import SubjectRDM, is_flat
+from brainbench.types import Status
+
+
+@dataclass(frozen=True)
+class Switches:
+    """Which published faults are on."""
+
+    best_target: bool = True
+    best_layer: bool = True
+    drop_splits: bool = True
+    median: bool = False
+    negative_pairs: bool = True
+    ratio_per_split: bool = True
+    no_gate: bool = True
+
+
+PUBLISHED = Switches()
+"""The bars of models."""
+PUBLISHED_INPUT = Switches(drop_splits=False, median=True)
+"""The bar of the raw input."""
+CORRECTED = Switches(*(False for _ in fields(Switches)))
+_AVERAGED = "split halves averaged before the correction instead of after"
+_GATED = "gate on reliability: the default"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of the walk."""
+
+    change: str
+    """What was switched, in words."""
+    value: float
+    status: Status
+    detail: str
+    """How many splits and animals entered, or why there is no value."""
+    switches: Switches
+
+
+def corrected_value(
+    r_xy: ArrayLike, r_yy: ArrayLike, switches: Switches, *, r_xx: ArrayLike | None = None
+) -> tuple[float, int]:
+    """Return one comparison corrected for noise under the switches, and the splits that entered.
+
+    Args:
+        r_xy: Raw comparison [S] or a number.
+        r_yy: Raw split-half comparisons [S] of the brain.
+        switches: Of these, ``drop_splits``, ``median``, ``negative_pairs`` and ``ratio_per_split`` matter here.
+        r_xx: The same for the other side; 1 (a model) by default.
+    """
+    halves = np.asarray(r_yy, dtype=np.float64).ravel()
+    others = np.ones(len(halves)) if r_xx is None else np.broadcast_to(np.asarray(r_xx, dtype=np.float64), halves.shape)
+    raw = np.broadcast_to(np.asarray(r_xy, dtype=np.float64), halves.shape)
+    keep = np.isfinite(halves) & np.isfinite(others) & np.isfinite(raw)
+    if switches.drop_splits:
+        keep &= halves >= THESIS_FILTER
+    if not keep.any():
+        return math.nan, 0
+    if not switches.ratio_per_split:
+        sides = [float(spearman_brown(side[keep].mean())) for side in (halves, others)]
+        value = float(raw[keep].mean()) / math.sqrt(math.prod(sides)) if min(sides) > 0 else math.nan
+        return value, int(keep.sum())
+    first, second = spearman_brown(halves[keep]), spearman_brown(others[keep])
+    real = first * second > 0
+    if not switches.negative_pairs:
+        real &= first > 0
+    if not real.any():
+        return math.nan, 0
+    ratios = raw[keep][real] / np.sqrt(first[real] * second[real])
+    return float(np.median(ratios) if switches.median else ratios.mean()), int(real.sum())
+
+
+def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None = None) -> tuple[Step, ...]:
+    """Walk through stored split halves of one model and one target, from the published bars to the default.
+
+    Args:
+        r_xy: Raw comparison [S] or a number.
+        r_yy: Raw split-half comparisons [S] of the brain.
+        r_xx: The same for the other side; 1 by default.
+
+    Raises:
+        UsageError: no splits.
+    """
+    halves = np.asarray(r_yy, dtype=np.float64).ravel()
+    if not np.isfinite(halves).any():
+        raise UsageError("There are no split halves to explain; give r_yy with one correlation per split.")
+    reliability = float(spearman_brown(halves[np.isfinite(halves)].mean()))
+    negative = int((halves < 0).sum())
+    walk = (
+        ("as published for the raw input: median of the splits' ratios", PUBLISHED_INPUT),
+        ("mean instead of median of the ratios", Switches(drop_splits=False)),
+        (f"splits with a raw correlation below {THESIS_FILTER} left out: as published for models", PUBLISHED),
+        (
+            "all splits again, two negative reliabilities no longer pass",
+            Switches(drop_splits=False, negative_pairs=False),
+        ),
+        ("split halves averaged before the correction instead of after", replace(CORRECTED, no_gate=True)),
+    )
+    steps = []
+    for change, switches in walk:
+        value, used = corrected_value(r_xy, halves, switches, r_xx=r_xx)
+        detail = f"{used:,} of {len(halves):,} splits"
+        if switches.ratio_per_split and not switches.drop_splits:
+            detail += f"; {negative} with negative reliability have no real ratio and vanish"
+        steps.append(Step(change, value, "ok" if math.isfinite(value) else "undefined", detail, switches))
+    value = steps[-1].value
+    if not reliability > 0:
+        last = Step(
+            "gate on reliability: the default", math.nan, "undefined", f"reliability {reliability:.2f}", CORRECTED
+        )
+    else:
+        good = reliability >= RELIABILITY_GATE
+        detail = f"reliability {reliability:.2f} is {'at least' if good else 'below'} {RELIABILITY_GATE}"
+        detail += "" if good else ": no correction of these data is trustworthy"
+        last = Step(_GATED, value, "ok" if good else "unreliable", detail, CORRECTED)
+    return (*steps, last)
+
+
+def explain_score(
+    layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[SubjectRDM], *, compare: str = "pearson"
+) -> tuple[Step, ...]:
+    """Walk a model's score from the published estimator to the default one, on the same RDMs.
+
+    The published pool of all animals' units is represented by their mean RDM and halves.
+
+    Raises:
+        UsageError: no layers or animals, no animal with a usable RDM, or RDMs that do not fit.
+    """
+    rdms = rdm_stack(list(layer_rdms.values()), "layer_rdms")
+    rdms = rdms[~is_flat(rdms)]
+    animals = gather(subjects, estimator="thesis-input", comparison=compare, pairs=rdms.shape[-1])
+    # Without the published estimators' own demands: whoever has an RDM takes part.
+    usable = [subject for subject in animals.subjects if subject.problem is None and not is_flat(subject.rdm)]
+    if not len(rdms) or not usable:
+        raise UsageError("There is nothing to explain: no layer or no animal has a usable RDM.")
+    walk = (
+        ("as published: maximum over layers and over targets", PUBLISHED),
+        ("mean over animals instead of the best target", replace(PUBLISHED, best_target=False)),
+        ("no split is left out", replace(PUBLISHED, best_target=False, drop_splits=False)),
+        (
+            "two negative reliabilities no longer pass",
+            replace(PUBLISHED, best_target=False, drop_splits=False, negative_pairs=False),
+        ),
+        (
+            "split halves averaged before the correction instead of after",
+            replace(CORRECTED, best_layer=True, no_gate=True),
+        ),
+        (f"animals with a reliability below {RELIABILITY_GATE} left out", replace(CORRECTED, best_layer=True)),
+        ("layer chosen on the other animals: the default", CORRECTED),
+    )
+    return tuple(_step(change, switches, rdms, usable, compare) for change, switches in walk)
+
+
+def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectRDM], comparison: str) -> Step:
+    targets = [(subject.subject, subject.rdm, subject.split_half_by(comparison)) for subject in subjects]
+    if not switches.no_gate:
+        targets = [
+            target
+            for target in targets
+            if float(spearman_brown(target[2][np.isfinite(target[2])].mean())) >= RELIABILITY_GATE
+        ]
+    if switches.best_target and len(subjects) > 1:
+        splits = min(len(subject.halves) for subject in subjects)
+        halves = np.mean([subject.halves[:splits] for subject in subjects], axis=0)
+        agreement = compare_rdms(halves[:, 0], halves[:, 1], method=comparison)
+        targets.append(("the pool", np.mean([subject.rdm for subject in subjects], axis=0), agreement))
+    if not targets:
+        return Step(change, math.nan, "undefined", "no animal is reliable", switches)
+    r = compare_rdms(rdms[:, None], np.stack([target[1] for target in targets])[None], method=comparison)
+    # A correction is a factor of the raw comparison: one per target.
+    found = [corrected_value(1.0, target[2], switches) for target in targets]
+    factors = np.array([item[0] for item in found])
+    known = np.isfinite(factors)
+    if not known.any():
+        return Step(change, math.nan, "undefined", "no split half has a positive reliability", switches)
+    names = [target[0] for target, keep in zip(targets, known, strict=True) if keep]
+    used = sum(item[1] for item in found)
+    values = (r * factors)[:, known]
+    detail = f"{len(names)} of {len(targets)} targets, {used:,} splits"
+    if switches.best_target:
+        place = int(np.argmax(values.max(axis=0)))
+        return Step(change, float(values.max()), "ok", f"{detail}; the best is {names[place]}", switches)
+    if switches.best_layer or len(rdms) == 1:
+        return Step(change, float(values.mean(axis=1).max()), "ok", detail, switches)
+    if len(names) == 1:
+        return Step(change, math.nan, "undefined", "one animal: the default chooses on halves of its trials", switches)
+    value = float((held_out(r[:, known]) * factors[known]).mean())
+    return Step(change, value, "ok", detail, switches)
