@@ -165,8 +165,9 @@ def main() -> None:
     print(body)
     if not options.no_write:
         note = (
-            "Rates count the stored forces (float32), by elapsed time and by processor time of all threads; others used the "
-            "machine too. Reading is from the page cache. Writing is bound by hashing (per thread) and by the disk."
+            "Rates count the stored forces (float32), by elapsed time and by processor time of all threads; others "
+            "used the machine too. Reading is from the page cache. Writing is bound by hashing (per thread) and by the "
+            "disk."
         )
         write_section("Data sets of sweeps", "python benchmarks/whisking_dataset.py", f"{note}\n\n{body}")
 

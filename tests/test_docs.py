@@ -33,7 +33,9 @@ def test_the_scene_file_of_the_stimuli_page_is_valid(tmp_path: Path):
     assert [scene.label for scene in recipe.scenes] == ["near", "far"]
 
 
-@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "docs/recordings.md", "docs/stimuli.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "CONTRIBUTING.md", "docs/recordings.md", "docs/stimuli.md", "docs/datasets.md"]
+)
 def test_links_between_pages_lead_somewhere(page: str):
     text = (ROOT / page).read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#:]+)\)", text):
