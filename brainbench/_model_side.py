@@ -119,7 +119,9 @@ def find_model(model: Any, *, seed: int = 0) -> Candidate:
             "A model is a registry name, FILE.py:FUNCTION, a file of activations, a mapping of activations or a "
             f"torch.nn.Module; received {type(model).__name__}."
         )
-    if ":" in model or model.endswith(".py"):
+    from brainbench.models.checkpoints import PREFIXES
+
+    if (":" in model and not model.startswith(PREFIXES)) or model.endswith(".py"):
         from brainbench.models.user import load_user_model
 
         return _with_weights(load_user_model(model, seed=seed), ModelCard(model, family="user module", seed=seed))
@@ -127,7 +129,27 @@ def find_model(model: Any, *, seed: int = 0) -> Candidate:
 
     known = describe_model(model)
     card = ModelCard(model, family=known.family, objective="untrained", multiply_adds=known.multiply_adds, seed=seed)
-    return _with_weights(load_model(model, seed=seed), card)
+    return _with_weights(load_model(model, seed=seed), card if known.trained is None else _trained(card, known.trained))
+
+
+def _trained(card: ModelCard, config: Mapping[str, Any]) -> ModelCard:
+    """Fill in the card what a checkpoint's configuration says of its training."""
+    from brainbench.types import Interval
+
+    found = config.get("evaluation") or {}
+    interval = found.get("interval")
+    return replace(
+        card,
+        objective=config.get("objective"),
+        augmentation=config.get("augmentation"),
+        top1=found.get("top1"),
+        top5=found.get("top5"),
+        accuracy_interval=Interval(**interval) if interval else None,
+        accuracy_data=found.get("data"),
+        collapsed=found.get("collapsed"),
+        twin=config.get("twin"),
+        seed=config.get("seed"),
+    )
 
 
 def _features(path: Path) -> Candidate:

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from brainbench import __version__
-from brainbench.cli import doctor, leaderboard, models, power, recordings, score, stimuli, tradeoff
+from brainbench.cli import doctor, export, leaderboard, models, power, recordings, score, stimuli, tradeoff, train
 from brainbench.errors import BrainbenchError
 
 app = typer.Typer(
@@ -27,6 +27,8 @@ app = typer.Typer(
 )
 app.command("score")(score.score)
 app.command("power")(power.power)
+app.command("train")(train.train)
+app.command("export")(export.export)
 app.command("doctor")(doctor.doctor)
 app.add_typer(models.app, name="models")
 app.add_typer(recordings.app, name="recordings")

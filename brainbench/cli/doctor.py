@@ -31,6 +31,10 @@ OPTIONAL = {
     "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),
     "warp-lang": ("gpu", "nothing yet: the batched whisker solver of a later version"),
     "mujoco-warp": ("gpu", "nothing yet: robot hands on CUDA in a later version"),
+    "tensorboard": ("train", "training curves in TensorBoard, beside the run's log"),
+    "onnxscript": ("export", "brainbench export --format onnx"),
+    "onnxruntime": ("export", "the check of exported ONNX files"),
+    "huggingface_hub": ("hub", "models by hf-hub:OWNER/NAME"),
     "matplotlib": ("report", "pictures and plots of stimuli (brainbench stimuli render | plot)"),
     "imageio-ffmpeg": ("report", "films of stimuli as MP4 (GIF needs matplotlib alone)"),
 }

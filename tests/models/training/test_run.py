@@ -216,6 +216,8 @@ def test_two_processes_train_as_one(tmp_path):
         torch.testing.assert_close(second[name], value, atol=2e-5, rtol=1e-3, msg=name)
 
 
+# PyTorch's compiler uses a part of PyTorch that PyTorch has deprecated.
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
 @pytest.mark.slow
 def test_a_compiled_run_learns_too(tmp_path):
     result = train(_config(epochs=4, compile="default", model="zhuang-small"), tiny(), out=tmp_path, device="cpu")

@@ -1,0 +1,204 @@
+"""Write a network's streaming step to a file for other runtimes, with its contract, and check the file itself.
+
+The file takes ``obs`` [B, C, H, W] in SI and ``h_in`` [B, S] and gives ``features`` [B, F] and ``h_out`` [B, S]; the
+normaliser is inside. Beside it stands a JSON contract: channels, units, frame, rate, latency and the reset rule.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.errors import DataError, missing_dependency, unknown_name
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
+
+SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
+"""Formats and their suffixes: ONNX, and an exported PyTorch program."""
+INPUTS, OUTPUTS = ("obs", "h_in"), ("features", "h_out")
+TOLERANCE = 1e-4
+"""Largest difference between the file and the network, relative to the largest feature."""
+_STEPS = 8
+
+
+@dataclass(frozen=True)
+class Export:
+    """A written file and what was found about it."""
+
+    path: Path
+    contract: Path
+    """The JSON contract."""
+    format: str
+    state_size: int
+    """S."""
+    features: int
+    """F."""
+    difference: float
+    """Largest difference between the file's features and the network's on a random stream, relative to the largest."""
+
+
+def export_model(
+    model: nn.Module, path: str | Path, *, format: str = "onnx", name: str = "", opset: int = 18
+) -> Export:
+    """Export a network's streaming step and check the exported file against the network.
+
+    Args:
+        model: A network of :class:`~brainbench.models.ead.EAD`'s kind; exported in evaluation mode, on the CPU.
+        path: File to write; the suffix of the format is added when there is none.
+        format: ``onnx`` or ``torch``.
+        name: What the contract calls the network.
+        opset: ONNX operator set.
+
+    Raises:
+        UsageError: there is no such format, or the network cannot be streamed.
+        MissingDependencyError: the packages of the extra ``export`` are missing, for ``onnx``.
+        DataError: the file does not compute what the network does; it is then removed.
+    """
+    import copy
+
+    from brainbench.files import atomic_path, content_hash, provenance, write_json
+    from brainbench.models.streaming import StreamingStep
+
+    if format not in SUFFIXES:
+        raise unknown_name("export format", format, SUFFIXES)
+    _require(format)
+    target = Path(path)
+    target = target if target.suffix else target.with_suffix(SUFFIXES[format])
+    step = StreamingStep(copy.deepcopy(model).cpu().float().eval()).eval()
+    with atomic_path(target) as temporary:
+        (_write_onnx if format == "onnx" else _write_torch)(step, temporary, opset)
+        difference = _difference(step, READERS[format](temporary))
+        if not difference <= TOLERANCE:
+            raise DataError(
+                f"The exported file differs from the network by {difference:.2g} of the largest feature (allowed "
+                f"{TOLERANCE:g}), so it was not kept."
+            )
+    spec: Any = model.spec
+    state = {key: value.detach().cpu() for key, value in model.state_dict().items()}
+    contract = {
+        "model": name or type(model).__name__,
+        "format": format,
+        "file": target.name,
+        "inputs": {"obs": ["batch", *spec.input_shape], "h_in": ["batch", step.state_size]},
+        "outputs": {"features": ["batch", step.model.features], "h_out": ["batch", step.state_size]},
+        "dtype": "float32",
+        "normaliser": "inside the file; obs is in SI",
+        "reset": "h_in of zeros is the state before the first step; rows are independent, so zero the row of an "
+        "environment to reset it",
+        "full": None if spec.max_steps is None else f"after {spec.max_steps} steps without a reset features are NaN",
+        **{key: value for key, value in asdict(spec).items() if key != "outputs"},
+        "difference": difference,
+        "weights": content_hash(*(part for key in sorted(state) for part in (key, state[key].numpy()))),
+        "provenance": provenance(),
+    }
+    file = write_json(target.with_name(f"{target.name}.json"), contract)
+    return Export(target, file, format, step.state_size, step.model.features, difference)
+
+
+def _require(format: str) -> None:
+    if format != "onnx":
+        return
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        try:
+            __import__(package)
+        except ImportError as error:
+            raise missing_dependency(package, extra="export", purpose="Exporting to ONNX") from error
+
+
+def _example(step: Any, batch: int) -> tuple[torch.Tensor, torch.Tensor]:
+    import torch
+
+    return torch.zeros(batch, *step.model.spec.input_shape), step.init_state(batch)
+
+
+def _write_onnx(step: Any, path: Path, opset: int) -> None:
+    import torch
+
+    batch = torch.export.Dim("batch", min=1, max=4096)
+    with warnings.catch_warnings(), torch.no_grad():
+        # The exporter warns of its own parts' deprecations, which nobody here can act on.
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            step,
+            _example(step, 2),
+            dynamo=True,
+            opset_version=opset,
+            input_names=list(INPUTS),
+            output_names=list(OUTPUTS),
+            dynamic_shapes=({0: batch}, {0: batch}),
+            verbose=False,
+        )
+    if program is None:
+        raise DataError("PyTorch gave no ONNX program for this network.")
+    program.save(str(path), external_data=False)
+
+
+def _write_torch(step: Any, path: Path, opset: int) -> None:
+    import torch
+
+    del opset
+    batch = torch.export.Dim("batch", min=1, max=4096)
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        program = torch.export.export(step, _example(step, 2), dynamic_shapes=({0: batch}, {0: batch}))
+        torch.export.save(program, path)
+
+
+def read_onnx(path: str | Path) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Return the step of an exported ONNX file as a function of NumPy arrays (obs, h_in) → (features, h_out)."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+    def run(obs: Any, h_in: Any) -> tuple[Any, Any]:
+        features, h_out = session.run(list(OUTPUTS), dict(zip(INPUTS, (obs, h_in), strict=True)))
+        return features, h_out
+
+    return run
+
+
+def read_torch(path: str | Path) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Return the step of an exported PyTorch program as a function of NumPy arrays (obs, h_in) → (features, h_out)."""
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        module = torch.export.load(path).module()
+
+    def run(obs: Any, h_in: Any) -> tuple[Any, Any]:
+        with torch.no_grad():
+            features, h_out = module(torch.from_numpy(obs), torch.from_numpy(h_in))
+        return features.numpy(), h_out.numpy()
+
+    return run
+
+
+READERS = {"onnx": read_onnx, "torch": read_torch}
+"""Readers of exported files, by format."""
+
+
+def _difference(step: Any, run: Callable[[Any, Any], tuple[Any, Any]]) -> float:
+    """Compare the file with the network's own streaming on random touch, at two batch sizes."""
+    import torch
+
+    model, worst = step.model, 0.0
+    generator = torch.Generator().manual_seed(0)
+    steps = min(_STEPS, model.spec.max_steps or _STEPS)
+    scale = model.normaliser.scale
+    for batch in (1, 3):
+        h, state = step.init_state(batch).numpy(), model.init_state(batch)
+        for _ in range(steps):
+            x = torch.randn(batch, *model.spec.input_shape, generator=generator) * scale
+            with torch.no_grad():
+                expected, state = model.encode_step(x, state)
+            features, h = run(x.numpy(), h)
+            error = (torch.from_numpy(features) - expected).abs().max() / expected.abs().max().clamp_min(1e-12)
+            worst = max(worst, float(error)) if bool(torch.isfinite(error)) else float("inf")
+    return worst

@@ -1,0 +1,55 @@
+import json
+
+import pytest
+
+from brainbench.stimuli.generation.run import generate
+from tests.stimuli.generation.fakes import small_plan
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sweeps")
+    generate(small_plan(("brick:5", "cone:5"), whiskers="C2,C3,D1", shard_size=10), path, workers=1)
+    return str(path)
+
+
+def _options(folder, out):
+    return ("--data", folder, "--out", str(out), "--epochs", "2", "--batch-size", "8", "--device", "cpu")
+
+
+def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_path):
+    trained = run("train", "s4-small", *_options(folder, tmp_path / "run"), "--augmentation", "none")
+    assert trained.status == 0, trained.err
+    assert "finished" in trained.out
+    assert f"brainbench score local-dir:{tmp_path / 'run' / 'best'}" in trained.out
+    shown = json.loads(run("models", "show", f"local-dir:{tmp_path / 'run' / 'best'}", "--json").out)
+    assert shown["trained"]["classes"] == ["brick", "cone"]
+    file = tmp_path / "s4.pt2"
+    exported = run(
+        "export", f"local-dir:{tmp_path / 'run' / 'best'}", "--format", "torch", "--out", str(file), "--json"
+    )
+    assert exported.status == 0, exported.err
+    assert json.loads(exported.out)["difference"] < 1e-4
+    assert json.loads((tmp_path / "s4.pt2.json").read_text())["outputs"]["features"] == ["batch", 96]
+
+
+def test_a_stopped_run_goes_on_and_options_come_from_a_file(run, folder, tmp_path):
+    file = tmp_path / "options.toml"
+    file.write_text('augmentation = "none"\nmasking = 0.5\n')
+    options = (*_options(folder, tmp_path / "run"), "--config", str(file))
+    stopped = json.loads(run("train", "s4-small", *options, "--stop-after", "0", "--json").out)
+    assert next(iter(stopped["runs"].values()))["status"] == "stopped"
+    assert stopped["config"]["masking"] == 0.5
+    for _ in range(8):
+        done = json.loads(run("train", "s4-small", *options, "--json").out)
+    assert next(iter(done["runs"].values()))["status"] == "finished"
+
+
+def test_wrong_requests_are_answered_in_one_line(run, folder, tmp_path):
+    outcome = run("train", "s4-small", "--data", folder, "--objective", "simclear")
+    assert outcome.status == 2
+    assert "did you mean 'simclr'" in outcome.err
+    outcome = run("train", "s4-small", "--data", str(tmp_path / "none"))
+    assert outcome.status == 2
+    outcome = run("train", "s4-small", "--data", folder, "--sweep", "2:4")
+    assert "--sweep takes 'all', or NUMBER/COUNT" in outcome.err

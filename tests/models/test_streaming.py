@@ -1,0 +1,56 @@
+import pytest
+import torch
+from torch import nn
+
+from brainbench.errors import UsageError
+from brainbench.models.registry import load_model
+from brainbench.models.streaming import StreamingStep
+
+NAMES = ["zhuang-intersection-ln-small", "zhuang-lstm-small+gpt", "zhuang-feedforward-small", "resnet18-small",
+         "resnet18-small+mamba", "s4-small", "s4-small+gpt", "zhuang-small+mamba"]  # fmt: skip
+
+
+def _sweep(batch, steps):
+    return torch.randn(batch, steps, 30, 5, 7) * torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", NAMES)
+def test_a_flat_state_streams_the_sweeps_features(name):
+    model, x = load_model(name), _sweep(2, 6)
+    step, expected = StreamingStep(model), model.encode(x)
+    h = step.init_state(2)
+    for t in range(6):
+        features, h = step(x[:, t], h)
+        torch.testing.assert_close(features, expected[:, t], atol=1e-4, rtol=1e-4)
+    assert h.shape == (2, step.state_size)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["zhuang-ugrnn-small+gpt", "s4-small+mamba"])
+def test_zeroing_a_row_resets_it_alone(name):
+    model, x = load_model(name), _sweep(2, 4)
+    step = StreamingStep(model)
+    h = step.init_state(2)
+    for t in range(3):
+        _, h = step(x[:, t], h)
+    h[0] = 0.0
+    features, _ = step(x[:, 3], h)
+    torch.testing.assert_close(features[:1], model.encode(x[:1, 3:])[:, 0], atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(features[1:], model.encode(x[1:])[:, 3], atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_a_full_context_gives_nan_until_it_is_reset():
+    model = load_model("zhuang-small+gpt")
+    step, x = StreamingStep(model), _sweep(1, 1)[:, 0]
+    h = step.init_state(1)
+    for t in range(model.spec.max_steps + 1):
+        features, h = step(x, h)
+        assert torch.isfinite(features).all() == (t < model.spec.max_steps)
+    assert torch.isfinite(step(x, step.init_state(1))[0]).all()
+
+
+def test_other_networks_are_refused():
+    with pytest.raises(UsageError, match=r"need an encoder-attender-decoder network .* received Linear"):
+        StreamingStep(nn.Linear(2, 2))
