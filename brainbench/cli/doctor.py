@@ -31,6 +31,8 @@ OPTIONAL = {
     "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),
     "warp-lang": ("gpu", "nothing yet: the batched whisker solver of a later version"),
     "mujoco-warp": ("gpu", "nothing yet: robot hands on CUDA in a later version"),
+    "distributed": ("cluster", "data sets made by a Dask cluster (brainbench stimuli sweep --scheduler)"),
+    "scikit-learn": ("learn", "support vector machines (brainbench stimuli separability)"),
     "tensorboard": ("train", "training curves in TensorBoard, beside the run's log"),
     "onnxscript": ("export", "brainbench export --format onnx"),
     "onnxruntime": ("export", "the check of exported ONNX files"),

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from brainbench.errors import MissingDependencyError, UsageError
+from brainbench.errors import DataError, MissingDependencyError, UsageError
 from brainbench.stimuli.generation import cluster
 from brainbench.stimuli.generation.run import generate
 from tests.stimuli.generation.fakes import files_of, killed_plan, small_plan
@@ -40,6 +40,17 @@ def test_a_cluster_only_makes_what_is_missing(threads, tmp_path):
     seen = []
     generate(plan, tmp_path, scheduler=threads.scheduler_address, progress=lambda *told: seen.append(told))
     assert seen == [(4, 4, "simulating sweeps")]
+
+
+def test_workers_that_write_to_a_disk_of_their_own_are_noticed(threads, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "make_shard", _write_elsewhere)
+    with pytest.raises(DataError, match=r"wrote \w+-00000.h5, but not here: .* must be a folder that .* all workers"):
+        generate(small_plan(("brick:2",), split="object", limit=1), tmp_path, scheduler=threads.scheduler_address)
+
+
+def _write_elsewhere(task, folder, workers):
+    """Do as a worker does whose folder of this name is another one."""
+    return len(task)
 
 
 @pytest.mark.slow

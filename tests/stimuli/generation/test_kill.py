@@ -1,5 +1,6 @@
 """A run that is killed at any instant and started again leaves the bytes of a run that was not."""
 
+import dataclasses
 import os
 import random
 import signal
@@ -10,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from brainbench.errors import DataError
 from brainbench.stimuli.generation.run import generate
-from tests.stimuli.generation.fakes import files_of, killed_plan
+from tests.stimuli.generation.fakes import files_of, killed_plan, small_plan
 
 ROOT = Path(__file__).parents[3]
 CODE = """
@@ -87,3 +89,19 @@ def test_no_process_of_the_pool_outlives_its_parent(tmp_path):
     while any(Path(f"/proc/{child}").exists() for child in children):
         assert time.monotonic() < deadline
         time.sleep(0.1)
+
+
+def _end_this_process():
+    os._exit(3)
+
+
+@pytest.mark.slow
+def test_a_process_of_the_pool_that_dies_is_said_and_the_shards_before_are_kept(tmp_path):
+    plan = small_plan(("brick:6",), shard_size=4)
+    fatal = dict(plan.objects)
+    last = plan.shards[-1].objects[0].name
+    fatal[last] = dataclasses.replace(fatal[last], load=_end_this_process)
+    with pytest.raises(DataError, match="ended unexpectedly, perhaps for want of memory; the finished shards are kept"):
+        generate(dataclasses.replace(plan, objects=fatal), tmp_path, workers=2)
+    generate(plan, tmp_path, workers=1)
+    assert (tmp_path / "manifest.json").is_file()
