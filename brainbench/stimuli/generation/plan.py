@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     from brainbench.stimuli.sweep_grid import SweepGrid
 
 SHARD_SIZES = {"mujoco": 64, "bullet": 16}
-"""Sweeps per shard: what a kill costs at most is minutes; other backends take :data:`LARGE_SHARD`."""
-LARGE_SHARD = 2048
+"""Sweeps per shard of slow backends, so that a kill costs minutes at most."""
+USUAL_SHARD = 512
+GPU_SHARD = 2048
+"""Sweeps per shard on a GPU, which takes thousands at a time."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Settings:
     sample: float | None = None
     """Only this fraction of all sweeps, drawn at random; all when None."""
     shard_size: int | None = None
-    """Sweeps per shard; by backend when None."""
+    """Sweeps per shard; by backend and device when None."""
 
     def __post_init__(self) -> None:
         if self.split not in ("object", "sweep"):
@@ -67,7 +69,8 @@ class Settings:
     @property
     def sweeps_per_shard(self) -> int:
         """Sweeps of every shard but the last of each split."""
-        return self.shard_size or SHARD_SIZES.get(self.backend, LARGE_SHARD)
+        usual = USUAL_SHARD if self.device == "cpu" else GPU_SHARD
+        return self.shard_size or SHARD_SIZES.get(self.backend, usual)
 
 
 @dataclass(frozen=True, eq=False)

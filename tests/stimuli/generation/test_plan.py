@@ -92,6 +92,14 @@ def test_what_determines_the_bytes_is_in_the_hash():
     assert small_plan().config_hash == plans[0].config_hash
 
 
+def test_shards_are_small_where_sweeps_are_slow():
+    sizes = [Settings(FAST, backend=backend, device=device).sweeps_per_shard for backend, device in
+             (("bullet", "cpu"), ("mujoco", "cpu"), ("rod", "cpu"), ("rod", "cuda"))]  # fmt: skip
+    assert sizes == sorted(sizes)
+    assert len(set(sizes)) == 4
+    assert Settings(FAST, shard_size=7).sweeps_per_shard == 7
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
