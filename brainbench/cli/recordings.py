@@ -127,6 +127,20 @@ def export(
     emit({"files": files}, table("", ["file", ""], rows, right=(1,)), as_json=as_json)
 
 
+@app.command("fetch")
+def fetch(
+    name: Annotated[str, typer.Argument(help="A recipe ('rodgers') or the six digits of a dandiset.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to put it in.")] = Path(),
+    assets: Annotated[str | None, typer.Option(help="Glob of the files wanted, e.g. 'sub-231CR/*'.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Download a public data set with the dandi client; without a network or that client, nothing is tried."""
+    from brainbench.datasets import fetch as fetch_files
+
+    folder = fetch_files(name, out, assets=assets)
+    emit({"folder": folder}, str(folder), as_json=as_json)
+
+
 def _verdict(animal: SubjectRDM) -> str:
     from brainbench.metrics import RELIABILITY_GATE
 

@@ -8,6 +8,7 @@ from brainbench.datasets.blocks import SessionBlock, blocks
 from brainbench.datasets.checks import Checkup, check
 from brainbench.datasets.conditions import Conditions
 from brainbench.datasets.exports import export
+from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import Inspection, inspect
 from brainbench.datasets.pooling import pooled
@@ -32,6 +33,7 @@ __all__ = [
     "blocks",
     "check",
     "export",
+    "fetch",
     "get_recipe",
     "inspect",
     "list_recipes",

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from brainbench.datasets._extract import merged_spans, recorded_span
 from brainbench.datasets._findings import Finding, Severity, share, some
 from brainbench.datasets.conditions import Conditions
+from brainbench.datasets.recipes import Recipe
 from brainbench.datasets.sessions import OBSERVED, Session, Table, as_labels
-from brainbench.datasets.window import CONTACTS
+from brainbench.datasets.window import CONTACTS, WHOLE, Window
 from brainbench.errors import BrainbenchError, DataError
 
 _LONGEST_TRIAL = 600.0
@@ -152,17 +153,29 @@ def _contacts(session: Session, trials: Table, where: str) -> Iterator[Finding]:
 
 
 def check_coverage(
-    session: Session, spikes: list[NDArray[np.float64]], conditions: Conditions | None, where: str
+    session: Session,
+    spikes: list[NDArray[np.float64]],
+    recipe: Recipe | None,
+    conditions: Conditions | None,
+    where: str,
 ) -> Iterator[Finding]:
-    """Yield the findings about trials without recording, and breaks inside it."""
+    """Yield the findings about trials without recording, and breaks inside it.
+
+    Of a trial the recipe's window counts, without a recipe all of it.
+    """
     table = session.tables.get(conditions.table if conditions else "trials")
     span = recorded_span(spikes)
     if table is None or span is None or "start_time" not in table or not len(table):
         return
+    window = recipe.window if recipe else WHOLE if "stop_time" in table else Window("start", length=1e-3)
     try:
-        start = table.times("start_time")
-        stop = table.times("stop_time") if "stop_time" in table else start
-    except DataError:
+        edges = window.edges(session, table, [])
+    except BrainbenchError:
+        return  # What is wrong with the columns has been told already.
+    start, stop = edges[np.isfinite(edges).all(axis=1)].T
+    if not len(start):
+        message = f"none of {len(table)} trials has the events of the window {window}"
+        yield Finding("error", "coverage", where, message)
         return
     low, high = span
     units = session.units
@@ -172,11 +185,11 @@ def check_coverage(
         outside = ~((start >= low) & (stop <= high))
         message = "no obs_intervals: the recorded span is taken from the first to the last spike of all units"
         yield Finding("note", "coverage", where, message, "A unit lost early cannot be told from a silent one.")
-    values = {"first_spike": low, "last_spike": high, "trials": len(table), "outside": int(outside.sum())}
+    values = {"first_spike": low, "last_spike": high, "trials": len(start), "outside": int(outside.sum())}
     if outside.any():
         message = (
-            f"{share(int(outside.sum()), len(table))} trials lie outside the recorded span (spikes: {low:.1f} to "
-            f"{high:.1f} s, trials: {np.nanmin(start):.1f} to {np.nanmax(stop):.1f} s)"
+            f"{share(int(outside.sum()), len(start))} trials lie outside the recorded span (spikes: {low:.1f} to "
+            f"{high:.1f} s, trials: {start.min():.1f} to {stop.max():.1f} s)"
         )
         severity: Severity = "error" if outside.all() else "warning" if outside.mean() > 0.1 else "note"
         question = " Do spikes and trials share a clock?" if severity != "note" else ""

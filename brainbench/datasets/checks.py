@@ -126,7 +126,7 @@ def check_session(
     for note in notes:
         yield Finding("warning", "spikes", where, note, "Whoever wrote the file may have joined trials or probes.")
     yield from check_spikes(session, spikes, where)
-    yield from check_coverage(session, spikes, conditions, where)
+    yield from check_coverage(session, spikes, recipe, conditions, where)
     yield from check_clock(session, spikes, recipe, where)
 
 

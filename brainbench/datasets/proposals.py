@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets.recipes import detect_recipe
+from brainbench.datasets.conditions import natural_vocabulary
+from brainbench.datasets.recipes import Recipe, detect_recipe
 from brainbench.datasets.sessions import Session, Table, as_labels, natural_order
 from brainbench.errors import DataError
 
@@ -47,7 +48,7 @@ class Proposal:
 
 
 def propose(sessions: Iterable[Session]) -> list[Proposal]:
-    """Rank the columns that could label trials: 2–60 values with at least two trials each.
+    """Rank the columns that could label trials: 2–60 values (more if named like a stimulus), twice each or more.
 
     Stimulus-like names come before others and before behavioural ones; then text before integers
     before the rest, the table ``trials`` before others, and balanced columns before unbalanced.
@@ -57,16 +58,23 @@ def propose(sessions: Iterable[Session]) -> list[Proposal]:
         recipe = detect_recipe(session)
         for name, table in session.tables.items():
             for column in summarise_columns(table):
-                if not (2 <= column.distinct <= _MOST_VALUES and column.fewest >= 2) or _is_time(column):
+                # A column named like a stimulus may have thousands of values; others would be mere numbers.
+                most = np.inf if _STIMULUS.search(column.name) else _MOST_VALUES
+                if not (2 <= column.distinct <= most and column.fewest >= 2) or _is_time(column):
                     continue
                 ranked.append((_rank(name, column, len(table)), _proposal(session, name, column.name)))
         if recipe is not None:
-            labels = recipe.conditions.values(session.table(recipe.conditions.table)).tolist()
-            declared = recipe.vocabulary(recipe.conditions) or ()
-            counts = Counter("-".join(row) for row in labels)
-            fewest = min(counts[label] for label in declared)
-            ranked.append(((-1.0,), Proposal(str(recipe.conditions), declared, fewest)))
+            table = session.table(recipe.conditions.table)
+            if all(name in table for name in recipe.conditions.columns):
+                ranked.append(((-1.0,), _of_recipe(recipe, table)))
     return [proposal for _, proposal in sorted(ranked, key=lambda item: item[0])]
+
+
+def _of_recipe(recipe: Recipe, table: Table) -> Proposal:
+    values = [tuple(row) for row in recipe.conditions.values(table).tolist() if all(row)]
+    declared = recipe.vocabulary(recipe.conditions) or natural_vocabulary(values)
+    counts = Counter("-".join(row) for row in values)
+    return Proposal(str(recipe.conditions), declared, min((counts[label] for label in declared), default=0))
 
 
 def _rank(table: str, column: ColumnSummary, rows: int) -> tuple[float, ...]:

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from brainbench.datasets import rodgers
+from brainbench.datasets import area2_bump, hires, rodgers, yu
 from brainbench.datasets._recipe import Recipe
 from brainbench.datasets.selection import DEFAULT, EVERYTHING, Selection
 from brainbench.datasets.sessions import Session
 from brainbench.errors import UsageError, unknown_name
 
 _RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe for recipe in (rodgers.RECIPE, rodgers.DISCRIMINATION, rodgers.DETECTION)
+    recipe.name: recipe
+    for recipe in (
+        rodgers.RECIPE,
+        rodgers.DISCRIMINATION,
+        rodgers.DETECTION,
+        yu.RECIPE,
+        hires.RECIPE,
+        area2_bump.RECIPE,
+    )
 }
 _SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
 

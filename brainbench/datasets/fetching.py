@@ -1,0 +1,64 @@
+"""Download public recordings through the ``dandi`` client; nothing else here uses a network."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+from brainbench.datasets.recipes import get_recipe, list_recipes
+from brainbench.errors import DataError, MissingDependencyError, UsageError, unknown_name
+
+
+def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None = None) -> Path:
+    """Download a data set of the DANDI archive (https://dandiarchive.org).
+
+    What is there already is kept if unchanged, so an interrupted download goes on.
+
+    Args:
+        name: a recipe's name, or the six digits of a dandiset.
+        folder: where to put it.
+        assets: glob of the files wanted, such as ``"sub-231CR/*"``; by default those that the recipe
+            can use, else all.
+
+    Returns:
+        The folder of the data set, ``folder/NUMBER``.
+
+    Raises:
+        UsageError: the name is neither.
+        MissingDependencyError: the client is not installed.
+        DataError: the client failed; its own messages stand above.
+    """
+    number, pattern = _dandiset(name)
+    client = shutil.which("dandi")
+    if client is None:
+        raise MissingDependencyError(
+            f"Downloading from the DANDI archive needs its client, which is not installed: pip install dandi. Or get "
+            f"DANDI:{number} elsewhere: every other command works on files, without a network."
+        )
+    pattern = assets or pattern
+    source = f"dandi://dandi/{number}/{pattern}" if pattern else f"DANDI:{number}"
+    target = Path(folder)
+    # Keeping the tree keeps two animals' files of the same name apart.
+    command = [client, "download", "--output-dir", str(target), "--existing", "refresh", "--preserve-tree"]
+    command += ["--path-type", "glob"] if pattern else []
+    target.mkdir(parents=True, exist_ok=True)
+    status = subprocess.run([*command, source], check=False).returncode
+    if status:
+        raise DataError(f"The dandi client ended with status {status} while fetching {source}; its messages say why.")
+    return target / number
+
+
+def _dandiset(name: str) -> tuple[str, str]:
+    if match := re.fullmatch(r"(?:DANDI:)?(\d{6})", name, re.IGNORECASE):
+        known = [get_recipe(item) for item in list_recipes()]
+        return match[1], next((item.assets for item in known if item.dandiset == match[1]), "")
+    public = [item for item in list_recipes() if get_recipe(item).dandiset]
+    if name not in list_recipes():
+        raise unknown_name("data set", name, public, hint="Or give the six digits of a dandiset, such as 000231.")
+    recipe = get_recipe(name)
+    if not recipe.dandiset:
+        raise UsageError(f"The recipe {name!r} names no data set of the DANDI archive; public are {', '.join(public)}.")
+    return recipe.dandiset, recipe.assets
