@@ -88,19 +88,26 @@ def test_a_held_whisker_balances_its_peg_or_is_flagged(tip_radius, young_modulus
         assert _imbalance(trace) < 0.02
 
 
-@pytest.mark.parametrize("time_step", [1e-5, 1e-4, 1e-3])
-@pytest.mark.parametrize("speed", [0.1, 1.0])
-def test_a_box_that_sweeps_past_at_a_metre_per_second_lets_the_whisker_come_to_rest(speed, time_step):
+@pytest.mark.parametrize("time_step", [1e-5, 1e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("speed", [0.1, 1.0, 5.0, 20.0])
+@pytest.mark.parametrize("at", [0.009, 0.013])
+def test_a_box_that_sweeps_past_lets_the_whisker_come_to_rest_or_is_too_fast_for_the_step(at, speed, time_step):
     box = Box((0.0, 0.0, 0.0), (2e-3, 1e-3, 5e-3))
     travel = 0.02 / speed
-    sweep = _moving(box, (0.013, -0.01, 0.0), (0.013, 0.01, 0.0), 2 * travel, friction=0.48)
+    sweep = _moving(box, (at, -0.01, 0.0), (at, 0.01, 0.0), 2 * travel, friction=0.48)
     times = np.linspace(travel / 20, 2 * travel + 0.1, 200)
     trace = _run(Job(C2, StillFollicle(), (sweep,), times), Fidelity(links=10, time_step=time_step))
     assert _sound(trace)
+    if time_step > 1.1 * 2e-3 / speed:
+        # It moves on by more than its thickness of 2 mm in most steps.
+        assert trace.status == "unstable"
     if trace.status == "ok":
-        assert trace.contact.any()
+        # At 20 m/s it is past between two readings.
+        assert trace.contact.any() or trace.penetration > 0
+        # Blows of some tenths of a newton at 5 m/s; 1.5 N break keratin of this thickness.
+        assert np.linalg.norm(trace.wrench[:, :3], axis=1).max() < 1.0
         assert not trace.contact[-1]
-        assert np.linalg.norm(trace.wrench[-1, 3:]) < 1e-3 * np.linalg.norm(trace.wrench[:, 3:], axis=1).max()
+        assert np.linalg.norm(trace.wrench[-1, 3:]) <= 1e-3 * np.linalg.norm(trace.wrench[:, 3:], axis=1).max()
 
 
 @pytest.mark.parametrize("radius", [1e-4, 1e-3, 5e-3])

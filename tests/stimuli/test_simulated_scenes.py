@@ -127,7 +127,7 @@ def test_c0_to_c3_touch_each_of_the_six_rodgers_stimuli_after_the_start():
 @pytest.mark.slow
 def test_all_thirty_whiskers_stay_sound_on_the_six_stimuli_and_a_finer_simulation_says_the_same():
     dissimilarities = []
-    for fidelity in (Fidelity.preset("balanced"), Fidelity(links=16, time_step=5e-5, steps_per_period=50)):
+    for fidelity in (Fidelity.preset("balanced"), Fidelity(links=16, time_step=5e-5, steps_per_period=30)):
         dataset = simulate(get_recipe("rodgers").scenes, fidelity=fidelity, cache=False)
         assert (dataset["status"] == "ok").all()
         counts = dataset["contact"].any("time").sum("whisker").values

@@ -8,13 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.errors import UsageError
+from brainbench.stimuli.backends._reach import distances
 from brainbench.stimuli.chain import build_chain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.backends._reach import Reach
     from brainbench.stimuli.backends.protocol import Job
     from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.stimuli.obstacle import Obstacle
+    from brainbench.stimuli.whisker import Whisker
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +34,69 @@ LEAST_TAPER = 1e-6
 """Difference of the radii of a link's ends (mm) below which it is a capsule."""
 LARGEST_BEND = 1.5
 """Angle between two links (rad) that no intact whisker reaches; beyond it a simulation counts as unstable."""
+
+
+def strongest_force(whisker: Whisker) -> float:
+    """Force (N) that would stretch the base of the whisker to twice its length: far beyond what keratin bears.
+
+    A chain cannot stretch, so a contact that can only be relieved along it has any force; it counts as unstable.
+    """
+    return whisker.young_modulus * np.pi * whisker.base_radius**2
+
+
+def too_strong(force: float, whisker: Whisker) -> str:
+    """Say in words that a base force (N) cannot be right."""
+    return (
+        f"the base force reached {force:.3g} N, and {strongest_force(whisker):.3g} N stretch the whisker to twice its "
+        "length: an overlap could not be resolved; choose a smaller time step or slower motion"
+    )
+
+
+def step_travel(
+    whisker: Whisker, position: NDArray, euler: NDArray, obstacle: Obstacle, times: NDArray
+) -> NDArray[np.float64]:
+    """Farthest [n] (m) that a point of the unbent whisker can move against an obstacle in each step.
+
+    Args:
+        whisker: carried by its base at ``position`` [n + 1, 3] (m) with angles ``euler`` [n + 1, 3] (rad).
+        obstacle: may move too.
+        times: [n + 1] (s).
+    """
+    turn = np.abs(np.diff(euler, axis=0)).sum(axis=1) * whisker.arc_length
+    own = np.linalg.norm(np.diff(position, axis=0), axis=1) + turn
+    if obstacle.motion is None:
+        return own
+    places, quaternions = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
+    size = max(float(np.linalg.norm(part.bounds(), axis=1).max()) for part in obstacle.parts)
+    chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
+    return own + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
+
+
+def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, times: NDArray) -> tuple[int, str]:
+    """Find the first step in which whisker and obstacle can pass through one another without ever overlapping.
+
+    Contact is looked for at the end of each step only. Returns the step (the number of steps when there is none)
+    and what is wrong in words. Arguments as for :func:`step_travel`.
+    """
+    first, reason = len(times) - 1, ""
+    for obstacle in reach.obstacles:
+        corners = np.stack([part.bounds() for part in obstacle.parts])
+        bounds = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+        thickness = float((bounds[1] - bounds[0]).min()) + 2 * job.whisker.base_radius
+        travel = step_travel(job.whisker, position, euler, obstacle, times)
+        passing = travel > thickness
+        if not passing.any():
+            continue
+        near = distances(obstacle, bounds, position, times)[:-1] <= job.whisker.arc_length + travel
+        found = np.flatnonzero(passing & near)
+        if len(found) and found[0] < first:
+            first = int(found[0])
+            reason = (
+                f"an object moves by {travel[first] * MILLI:.3g} mm against the whisker in one step at "
+                f"{times[first]:.6g} s and is only {thickness * MILLI:.3g} mm thick, so it may pass without being "
+                "touched; choose a smaller time step"
+            )
+    return first, reason
 
 
 def require_parts(jobs: Sequence[Job], backend: str) -> None:

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from brainbench.errors import MissingDependencyError
-from brainbench.stimuli.backends._engines import CONE_SIDES, LEAST_TAPER, MICRO, MILLI
+from brainbench.stimuli.backends._engines import CONE_SIDES, LEAST_TAPER, MICRO, MILLI, step_travel
 from brainbench.stimuli.backends._mujoco_drive import ARMATURE, Drive, drive_free, drive_scalars
 from brainbench.stimuli.backends.protocol import base_rotation
 from brainbench.stimuli.obstacle import Box, ConvexPart, Sphere, rotation_matrix
@@ -241,18 +241,8 @@ def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
 
 def _travel(job: Job, reach: Reach, times: NDArray, position: NDArray, euler: NDArray) -> float:
     """Farthest (mm) that a point of the unbent whisker can move against an obstacle in one step."""
-    turn = np.abs(np.diff(euler, axis=0)).sum(axis=1) * job.whisker.arc_length * MILLI
-    own = np.linalg.norm(np.diff(position, axis=0), axis=1) + turn
-    most = 0.0
-    for obstacle in reach.obstacles:
-        other = np.zeros_like(own)
-        if obstacle.motion is not None:
-            places, quaternions = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
-            size = max(float(np.linalg.norm(part.bounds(), axis=1).max()) for part in obstacle.parts)
-            chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
-            other = (np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size) * MILLI
-        most = max(most, float((own + other).max(initial=0.0)))
-    return most
+    moves = (step_travel(job.whisker, position / MILLI, euler, obstacle, times) for obstacle in reach.obstacles)
+    return max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
 
 
 def _add_obstacles(

@@ -90,6 +90,12 @@ def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:
     return replace(obstacle, surface=None)
 
 
+def distances(obstacle: Obstacle, bounds: NDArray, points: NDArray, times: NDArray) -> NDArray[np.float64]:
+    """Distances [n] (m) of points [n, 3] (world) at ``times`` [n] from a box [2, 3] that the obstacle carries."""
+    away = _box_distance(bounds, _in_obstacle_frame(obstacle, points, times))
+    return np.broadcast_to(away, len(times))
+
+
 def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
     if obstacle.motion is None:
         return points[:1] if np.ptp(points, axis=0).max() == 0 else points

@@ -32,7 +32,16 @@ import numpy as np
 from brainbench.errors import UsageError
 from brainbench.stimuli.backends._bullet_contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.backends._bullet_model import FOLLICLE, BulletWorld, engine
-from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, require_parts, warn_overdamped
+from brainbench.stimuli.backends._engines import (
+    LARGEST_BEND,
+    MICRO,
+    MILLI,
+    passed_unseen,
+    require_parts,
+    strongest_force,
+    too_strong,
+    warn_overdamped,
+)
 from brainbench.stimuli.backends._mujoco_drive import drive_scalars
 from brainbench.stimuli.backends._reach import reachable
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
@@ -98,14 +107,17 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     where = np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
     before, after = np.floor(where).astype(int), np.ceil(where).astype(int)
     times = job.start + step * np.arange(after[-1] + 2)
-    position, _ = job.follicle.pose(times)
-    reach = reachable(job.whisker, np.asarray(position, dtype=float), job.obstacles, times)
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    reach = reachable(job.whisker, position, job.obstacles, times)
+    missed, why = passed_unseen(job, reach, position, euler, times)
     nearest = np.where(where - before < 0.5, before, after)
     with BulletWorld(chain, reach.obstacles, reach.nearest, np.asarray(job.gravity, dtype=float)) as world:
         run = _Run(job, chain, reach, world, times, frozenset(nearest.tolist()) if record_shape else frozenset())
         computed = run.steps if run.moves or reach.obstacles else 0
         run.integrate(computed)
     failed = run.failed if computed else run.steps
+    if missed < failed:
+        failed, run.reason = missed, why
     good = after < failed
     before, after, nearest = (np.where(good, index, 0) for index in (before, after, nearest))
     share = np.where(good, where - before, 0.0)[:, None]
@@ -235,7 +247,8 @@ class _Run:
                 f"joint {int(bend.argmax()) // 2} bent by {bend.max():.2f} rad, more than a chain of links can "
                 "represent,"
             )
-        return ""
+        strength = float(np.abs(self.wrench[n, :3]).max())
+        return too_strong(strength, self.chain.whisker) if strength > strongest_force(self.chain.whisker) else ""
 
     def _loads(self, n: int, q: list[float]) -> NDArray[np.float64]:
         """Joint forces [6 + 2N] of the loads of the job at step n."""

@@ -18,7 +18,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.errors import UsageError
-from brainbench.stimuli.backends._engines import LARGEST_BEND, MICRO, MILLI, require_parts, warn_overdamped
+from brainbench.stimuli.backends._engines import (
+    LARGEST_BEND,
+    MICRO,
+    MILLI,
+    passed_unseen,
+    require_parts,
+    strongest_force,
+    too_strong,
+    warn_overdamped,
+)
 from brainbench.stimuli.backends._mujoco_drive import ARMATURE
 from brainbench.stimuli.backends._mujoco_model import SLOT_WIDTH, WhiskerModel, build_model, engine
 from brainbench.stimuli.backends._reach import reachable
@@ -105,8 +114,8 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
     before = np.floor(where).astype(int)
     after = np.ceil(where).astype(int)
     times = job.start + step * np.arange(after[-1] + 2)
-    position, _ = job.follicle.pose(times)
-    reach = reachable(job.whisker, np.asarray(position, dtype=float), job.obstacles, times)
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    reach = reachable(job.whisker, position, job.obstacles, times)
     built = build_model(job, chain, reach, step, times)
     still = not built.drives and not job.loads and not np.any(job.gravity)
     if still and not reach.obstacles:
@@ -119,6 +128,9 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
             link_positions=np.repeat(rest, len(where), axis=0) if record_shape else None,
         )
     sensors, hinges, failed, reason = _integrate(built, job, chain.links, times)
+    missed, why = passed_unseen(job, reach, position, euler, times)
+    if missed < failed:
+        failed, reason = missed, why
     good = after < failed
     before, after = np.where(good, before, 0), np.where(good, after, 0)
     share = np.where(good, where - before, 0.0)[:, None]
@@ -134,7 +146,7 @@ def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
         wrench=np.where(good[:, None], wrench, np.nan),
         contact=contact & good,
         contact_arc=np.where(good, arc, np.nan),
-        penetration=_penetration(sensors[:failed, 6:], hinges[:failed], built, chain),
+        penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
         status="unstable" if reason else "ok",
         reason=reason,
         steps=min(failed, len(sensors)),
@@ -160,7 +172,7 @@ def _integrate(
     mujoco, rollout = engine(), import_module("mujoco.rollout")
     model = built.model
     data = mujoco.MjData(model)
-    steps = len(times) - 1
+    steps, strongest = len(times) - 1, strongest_force(job.whisker) * MILLI
     sensors = np.zeros((steps, model.nsensordata))
     hinges = np.zeros((steps, 2 * links))
     spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
@@ -195,10 +207,12 @@ def _integrate(
         hinges[first + 1 : first + count] = angles[:-1]
         warned = [str(mujoco.mjtWarning(int(kind)).name) for kind in np.flatnonzero(data.warning.number)]
         # Also true of NaN; looking at every step by itself takes as long as a step of a short chain.
-        if warned or not (np.isfinite(read).all() and np.abs(hinges[window]).max() < LARGEST_BEND):
+        sound = np.isfinite(read).all() and np.abs(hinges[window]).max() < LARGEST_BEND
+        if warned or not sound or np.abs(read[0, :, :3]).max() > strongest:
             bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window]) < LARGEST_BEND).all(axis=1)
+            bad |= np.abs(read[0, :, :3]).max(axis=1) > strongest
             failed = first + (int(np.argmax(bad)) if bad.any() else 0)
-            return sensors, hinges, failed, _reason(hinges[failed], warned, times[failed])
+            return sensors, hinges, failed, _reason(job, hinges[failed], sensors[failed, :3], warned, times[failed])
         state = states[0, -1].copy()
     return sensors, hinges, steps, ""
 
@@ -267,9 +281,9 @@ def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Ch
 
     MuJoCo reports the distance from the core of a link, so the link's margin is added back.
     """
-    slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
-    if not slots.shape[1]:
+    if not slots.size:
         return 0.0
+    slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
     # At most: as if every contact were on the link of the largest margin.
     most = np.where(slots[..., 0] > 0, built.margins.max() - slots[..., 4], -np.inf).max(axis=1)
     touching = np.argsort(-most, kind="stable")[: np.count_nonzero(most > -np.inf)]
@@ -285,7 +299,7 @@ def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Ch
     return deepest / MILLI
 
 
-def _reason(hinges: NDArray, warned: list[str], moment: float) -> str:
+def _reason(job: Job, hinges: NDArray, force: NDArray, warned: list[str], moment: float) -> str:
     where = f"at {moment:.6g} s"
     if not np.isfinite(hinges).all():
         return f"the state stopped being finite {where}; choose a smaller time step"
@@ -293,4 +307,7 @@ def _reason(hinges: NDArray, warned: list[str], moment: float) -> str:
     if bend >= LARGEST_BEND:
         joint = int(np.abs(hinges).argmax()) // 2
         return f"joint {joint} bent by {bend:.2f} rad {where}, more than a chain of links can represent"
+    strength = float(np.abs(force).max()) / MILLI
+    if strength > strongest_force(job.whisker):
+        return f"{where} {too_strong(strength, job.whisker)}"
     return f"MuJoCo warned of {', '.join(warned) or 'a non-finite sensor'} {where}"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from brainbench.errors import MissingDependencyError, UsageError
 from brainbench.stimuli import get_recipe, validation
-from brainbench.stimuli.backends import _bullet_model, get_backend, list_backends
+from brainbench.stimuli.backends import _bullet_model, get_backend
 from brainbench.stimuli.backends._bullet_contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.backends._bullet_model import FOLLICLE, MOST_LINKS, BulletWorld
 from brainbench.stimuli.backends.protocol import Job, Load, StillFollicle, base_rotation
@@ -56,11 +56,6 @@ def _post(x, y, radius=1e-3, **options):
 def _scale(wrench):
     """Largest force and largest moment, as a divisor of [n, 6] differences."""
     return np.repeat([np.abs(wrench[:, :3]).max(), np.abs(wrench[:, 3:]).max()], 3)
-
-
-def test_the_backend_is_listed_and_found_by_name():
-    assert "bullet" in list_backends()
-    assert get_backend("bullet").name == "bullet"
 
 
 def test_without_pybullet_the_error_names_the_extra_or_the_python(monkeypatch):
@@ -117,49 +112,11 @@ def test_the_rodgers_stimuli_feel_alike_on_both_engines_at_fine_steps(label):
 
 
 @needs_bullet
-def test_a_point_load_bends_the_cantilever_by_the_closed_form():
-    at = 0.65 * C2.arc_length
-    weak = 1e-3 * at / validation.references.point_load_deflection(C2, 1.0, at)
-    result = validation.point_load(C2, weak, at, backend="bullet")
-    assert result.wrench[1] == pytest.approx(weak, rel=1e-8)
-    assert result.moment_error < 1e-5
-    assert result.deflection == pytest.approx(result.reference_deflection, rel=0.01)
-
-
-@needs_bullet
 def test_a_ringdown_shows_the_first_frequency_and_the_damping_ratio():
     light = replace(C2, damping_ratio=0.15)
     result = validation.ringdown(light, backend="bullet", fidelity=Fidelity(links=10, time_step=4e-5))
     assert result.frequency_error == pytest.approx(0, abs=0.01)
     assert result.damping_ratio == pytest.approx(0.15, rel=0.02)
-
-
-@needs_bullet
-@pytest.mark.parametrize(
-    "follicle",
-    [
-        Swing(angles=(0.4, 0.2, 0.3)),
-        Swing(angles=(0.3, -0.2, 0.4), rest=(0.7, 0.3, 1.1)),
-        Swing(angles=(0.4, 0.2, 0.3), shift=(1e-3, 2e-3, -1e-3), rest=(2.0, -0.4, -2.0)),
-    ],
-)
-def test_a_stiff_whisker_in_free_air_shows_its_centripetal_and_euler_wrench(follicle):
-    stiff = replace(C2, young_modulus=5e13, damping_ratio=6.0)
-    times = np.arange(1.0, 21.0) * 2e-3
-    trace = _run(Job(stiff, follicle, (), times), fidelity=Fidelity(links=6, time_step=2e-5))[0]
-    s = np.linspace(0, stiff.arc_length, 2001)
-    density = stiff.linear_density(s)[None, :, None]
-
-    def points(at):
-        position, euler = follicle.pose(at)
-        return position[:, None, :] + base_rotation(euler)[:, None, :, 0] * s[:, None]
-
-    acceleration = (points(times + 1e-5) - 2 * points(times) + points(times - 1e-5)) / 1e-10
-    arm = points(times) - follicle.pose(times)[0][:, None, :]
-    force = -np.trapezoid(density * acceleration, s, axis=1)
-    moment = -np.trapezoid(np.cross(arm, density * acceleration), s, axis=1)
-    for found, expected in ((trace.wrench[:, :3], force), (trace.wrench[:, 3:], moment)):
-        assert np.linalg.norm(found - expected) < 3e-3 * np.linalg.norm(expected)
 
 
 @needs_bullet
@@ -205,28 +162,6 @@ def test_with_friction_a_resting_whisker_keeps_the_drag_and_the_step_does_not_ma
 @pytest.mark.parametrize(
     "part",
     [
-        Capsule((0.009, -5e-4, -0.01), (0.009, -5e-4, 0.01), 1e-3),
-        Cylinder((0.009, -5e-4, -0.01), (0.009, -5e-4, 0.01), 1e-3),
-        Sphere((0.009, -5e-4, 0.0), 1e-3),
-        Box((0.009, -5e-4, 0.0), (1e-3, 1e-3, 1e-2)),
-        ConvexPart(np.array([[x, y, z] for x in (0.008, 0.010) for y in (-1.5e-3, 5e-4) for z in (-0.01, 0.01)])),
-    ],
-)
-def test_an_object_on_one_side_pushes_the_base_to_the_other_whatever_its_shape(part):
-    follicle = Swing(angles=(-0.3, 0, 0), rest=(math.pi / 2 + 0.3, 0.0, -math.pi / 2))
-    trace = _run(Job(CRITICAL, follicle, (Obstacle((part,), friction=0.0),), np.arange(1.0, 26.0) * 2e-3))[0]
-    assert trace.status == "ok"
-    assert trace.contact[-1]
-    assert not trace.contact[0]
-    assert trace.wrench[-1, 1] > 0
-    assert trace.wrench[-1, 5] > 0
-    assert 0.007 < trace.contact_arc[-1] < 0.0115
-
-
-@needs_bullet
-@pytest.mark.parametrize(
-    "part",
-    [
         Capsule((0.0, 0.0, -0.002), (0.0, 0.0, 0.002), 1e-3),
         Cylinder((0.0, 0.0, 0.002), (0.0, 0.0, -0.002), 1e-3),
         Cylinder((-0.002, 0.0, 0.0), (0.002, 0.0, 0.0), 1e-3),
@@ -247,81 +182,6 @@ def test_distances_to_every_shape_are_those_of_geometry(part, gap):
     assert distance == pytest.approx(gap, abs=1e-6)
     np.testing.assert_allclose(normal, [0, 1, 0], atol=1e-5)
     assert point[1] == pytest.approx(-0.05, abs=1e-6)
-
-
-@needs_bullet
-def test_friction_drags_the_base_along_with_a_moving_object_and_is_bounded_by_coulombs_law():
-    def belt(times):
-        position = np.zeros((len(times), 3))
-        ramp = np.clip(times / 0.05, 0, 1)
-        position[:, 1] = -1.2e-3 + 6e-4 * ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
-        position[:, 2] = 0.05 * np.maximum(times - 0.06, 0)
-        return position, np.tile([1.0, 0, 0, 0], (len(times), 1))
-
-    obstacle = Obstacle((Box((0.01, 0, 0), (1e-3, 1e-3, 2e-2)),), belt, friction=0.3)
-    trace = _run(Job(CRITICAL, StillFollicle(), (obstacle,), np.array([0.059, 0.16, 0.2])))[0]
-    normal, drag = trace.wrench[:, 1], trace.wrench[:, 2]
-    assert abs(drag[0]) < 1e-3 * normal[0]
-    assert drag[1] > 0.1 * normal[1]
-    assert drag[2] == pytest.approx(0.3 * normal[2], rel=0.02)
-
-
-@needs_bullet
-def test_a_turning_arm_that_carries_a_ball_does_what_the_ball_on_its_circle_does():
-    arm, centre = 6e-3, np.array([0.010, -7.5e-3, 0.0])
-
-    def angle(times):
-        u = np.clip(times / 0.04, 0, 1)
-        return np.pi / 2 - 1.2 + 1.2 * u**3 * (10 - 15 * u + 6 * u**2)
-
-    def turning(times):
-        half = angle(times) / 2
-        zero = np.zeros_like(half)
-        return np.tile(centre, (len(times), 1)), np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
-
-    def circling(times):
-        around = np.stack([np.cos(angle(times)), np.sin(angle(times)), np.zeros(len(times))], axis=1)
-        return centre + arm * around, np.tile([1.0, 0, 0, 0], (len(times), 1))
-
-    times = np.arange(1.0, 36.0) * 2e-3
-    a, b = _run(
-        Job(C2, StillFollicle(), (Obstacle((Sphere((arm, 0, 0), 2e-3),), turning, friction=0.0),), times),
-        Job(C2, StillFollicle(), (Obstacle((Sphere((0, 0, 0), 2e-3),), circling, friction=0.0),), times),
-    )
-    assert a.contact[-1]
-    np.testing.assert_allclose(a.wrench, b.wrench, atol=1e-5 * np.abs(b.wrench).max())
-
-
-@needs_bullet
-def test_a_scene_turned_about_z_and_moved_gives_turned_wrenches():
-    turn, shift = 1.1, np.array([0.003, -0.002, 0.0])
-    rotation = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
-    here = Swing(angles=(0.3, 0.1, 0.2))
-
-    class There:
-        def pose(self, times):
-            position, euler = here.pose(times)
-            return position + shift, euler + np.array([turn, 0, 0])
-
-    post = np.array([0.010, 2e-3, 0.0])
-    moved = rotation @ post + shift
-    times = np.arange(1.0, 26.0) * 2e-3
-    a, b = _run(
-        Job(C2, here, (_post(*post[:2], friction=0.0),), times),
-        Job(C2, There(), (_post(*moved[:2], friction=0.0),), times),
-    )
-    assert a.contact.any()
-    vectors = (a.wrench.reshape(-1, 2, 3) @ rotation.T).reshape(-1, 6)
-    assert np.abs((b.wrench - vectors) / _scale(vectors)).max() < 1e-6
-
-
-@needs_bullet
-def test_gravity_pulls_the_base_with_the_weight_of_the_whisker_when_asked():
-    job = Job(CRITICAL, StillFollicle(), (), np.array([0.1]), gravity=(0.0, 0.0, -9.81))
-    trace = _run(job)[0]
-    assert trace.wrench[0, 2] == pytest.approx(-9.81 * C2.mass, rel=1e-6)
-    s = np.linspace(0, C2.arc_length, 4001)
-    assert trace.wrench[0, 4] == pytest.approx(9.81 * np.trapezoid(C2.linear_density(s) * s, s), rel=1e-3)
 
 
 @needs_bullet
@@ -386,37 +246,6 @@ def _steps_of_bullet(bullet, client, body, chain, step, count, load):
 
 
 @needs_bullet
-def test_a_whisker_that_cannot_be_touched_or_moved_is_not_simulated():
-    times = np.arange(1.0, 6.0) * 1e-2
-    trace = _run(Job(C2, StillFollicle(), (_post(0.05, 0.0),), times), record_shape=True)[0]
-    assert (trace.steps, trace.status) == (0, "ok")
-    np.testing.assert_array_equal(trace.wrench, 0)
-    assert trace.link_positions is not None
-    np.testing.assert_allclose(trace.link_positions[-1, -1], [C2.arc_length, 0, 0], atol=1e-12)
-
-
-@needs_bullet
-def test_the_recorded_shape_at_rest_is_the_rest_curve():
-    curved = replace(C2, curvature=20.0)
-    still = StillFollicle(position=(0.001, 0.002, 0.003), euler=(0.4, 0.2, 0.9))
-    trace = _run(Job(curved, still, (), np.array([0.01])), record_shape=True)[0]
-    chain = build_chain(curved, COARSE.links)
-    assert trace.link_positions is not None
-    expected = np.column_stack([chain.points, np.zeros(len(chain.points))]) @ base_rotation(still.euler).T
-    np.testing.assert_allclose(trace.link_positions[0], expected + still.position, atol=1e-9)
-
-
-@needs_bullet
-def test_a_load_beyond_all_reason_is_reported_as_unstable_and_never_as_a_number():
-    job = Job(C2, StillFollicle(), (), np.array([2e-4, 0.05]), loads=(Load(C2.arc_length, (0.0, 1.0, 0.0)),))
-    trace = _run(job)[0]
-    assert trace.status == "unstable"
-    assert "rad" in trace.reason or "finite" in trace.reason
-    assert np.isnan(trace.wrench[-1]).all()
-    assert not trace.contact[-1]
-
-
-@needs_bullet
 def test_more_links_than_pybullet_moves_are_refused():
     job = Job(C2, StillFollicle(), (), np.array([0.01]), gravity=(0.0, 0.0, -9.81))
     assert _run(job, fidelity=Fidelity(links=MOST_LINKS, time_step=1e-3))[0].status == "ok"
@@ -424,14 +253,6 @@ def test_more_links_than_pybullet_moves_are_refused():
         _run(job, fidelity=Fidelity(links=MOST_LINKS + 1, time_step=1e-3))
     with pytest.raises(UsageError, match="workers must be at least 1"):
         _run(job, workers=0)
-
-
-@needs_bullet
-def test_progress_counts_the_jobs():
-    calls = []
-    jobs = [Job(C2, StillFollicle(), (), np.array([0.01]))] * 3
-    _run(*jobs, progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
 @given(seed=st.integers(0, 10**6), contacts=st.integers(1, 4))
