@@ -115,7 +115,7 @@ def write_set(folder: Path, sweeps: int) -> list[list[str]]:
     # What other processes do while the GPU works is measured by itself.
     each = [seconds(lambda task=task: prepare_shard(task), 1) for task in plan.shards]
     ready = [(task, prepare_shard(task)) for task in plan.shards]
-    ahead, local._built_ahead = local._built_ahead, lambda tasks, pool: iter(ready)
+    ahead, local._built_ahead = local._built_ahead, lambda tasks, pool, ahead: iter(ready)
     pool, local._pool = local._pool, ThreadPoolExecutor  # type: ignore[assignment]
     try:
         took = seconds(lambda: generate(plan, folder), 1)

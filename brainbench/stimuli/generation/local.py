@@ -26,7 +26,7 @@ Done = Callable[[int], None]
 WRITERS = 4
 """Threads that write shards behind a GPU: one hashes about 1 GB/s."""
 AHEAD = 4
-"""Shards whose objects are built ahead of the simulation."""
+"""Shards at least that are prepared ahead of the simulation; as many as there are processes to do it, if more."""
 
 
 def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done: Done) -> None:
@@ -71,12 +71,12 @@ def _run_pool(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done
 def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
     """Make shards one after the other in this process while others build objects and threads hash and write.
 
-    At most :data:`AHEAD` shards' objects and :data:`WRITERS` + 1 shards' forces are in memory.
+    The objects of as many shards as there are workers and the forces of :data:`WRITERS` + 1 shards are in memory.
     """
     with _pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(WRITERS) as writers:
         writing: deque[Future[int]] = deque()
         try:
-            for task, prepared in _built_ahead(tasks, builders):
+            for task, prepared in _built_ahead(tasks, builders, max(AHEAD, workers)):
                 content = simulate_shard(task, prepared, workers)
                 if len(writing) == WRITERS:
                     done(writing.popleft().result())
@@ -93,7 +93,7 @@ def _built_ahead(tasks: Sequence[ShardTask], builders: ProcessPoolExecutor) -> I
     coming: deque[tuple[ShardTask, Future[Prepared]]] = deque()
     for task in tasks:
         coming.append((task, builders.submit(prepare_shard, task)))
-        if len(coming) > AHEAD:
+        if len(coming) > ahead:
             first, future = coming.popleft()
             yield first, future.result()
     while coming:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.morphology import WhiskerArray
     from brainbench.stimuli.sweep_grid import SweepGrid
 
-SHARD_SIZES = {"mujoco": 64, "bullet": 16}
+SHARD_SIZES = {"mujoco": 32, "bullet": 8}
 """Sweeps per shard of slow backends, so that a kill costs minutes at most."""
 USUAL_SHARD = 512
 GPU_SHARD = 2048
