@@ -89,7 +89,9 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
             raise
 
 
-def _built_ahead(tasks: Sequence[ShardTask], builders: ProcessPoolExecutor) -> Iterator[tuple[ShardTask, Prepared]]:
+def _built_ahead(
+    tasks: Sequence[ShardTask], builders: ProcessPoolExecutor, ahead: int
+) -> Iterator[tuple[ShardTask, Prepared]]:
     coming: deque[tuple[ShardTask, Future[Prepared]]] = deque()
     for task in tasks:
         coming.append((task, builders.submit(prepare_shard, task)))
