@@ -73,8 +73,8 @@ def check_clock(
     }
     if lag:
         message = (
-            f"spikes follow touch ({event}) by about {lag:+.2f} s instead of 5 to 30 ms (response {elsewhere:.0f} SD "
-            f"there, {at_touch:.1f} SD at the touch)"
+            f"spikes follow touch ({event}) by about {_seconds(lag)} s instead of 5 to 30 ms (response "
+            f"{elsewhere:.0f} SD there, {at_touch:.1f} SD at the touch)"
         )
         yield Finding("error", "clock", where, message, _advice(session, lag), values)
     elif at_touch >= PRESENT:
@@ -165,4 +165,11 @@ def _advice(session: Session, lag: float) -> str:
                 f"That is the starting_time of {series.name} ({series.start:g} s): it was "
                 f"{'added' if lag > 0 else 'subtracted'} though spikes are on the session's clock already."
             )
-    return f"Subtract {lag:+.3f} s from all spike times, or find out which clock they are on, before scoring."
+    return (
+        f"Subtract about {_seconds(lag)} s from all spike times, or find out which clock they are on, before scoring."
+    )
+
+
+def _seconds(lag: float) -> str:
+    """Write a lag (s) as exactly as it is known, which is the width of the response."""
+    return f"{lag:+.1f}" if abs(lag) >= 1 else f"{lag:+.2f}"
