@@ -37,8 +37,8 @@ def test_members_of_a_collection_have_2000_to_20000_triangles_and_travel_between
 
 
 def test_surfaces_alone_are_the_same_shapes_for_engines_that_collide_meshes():
-    (usual,) = resolve_objects(["mug-3"]).values()
-    (surface,) = resolve_objects(["mug-3"], surfaces=True).values()
+    (usual,) = resolve_objects(["pyramid-3"]).values()
+    (surface,) = resolve_objects(["pyramid-3"], surfaces=True).values()
     solid, other = surface.load(), usual.load()
     assert solid.parts == ()
     assert solid.surface is not None

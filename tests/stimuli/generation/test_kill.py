@@ -54,7 +54,7 @@ def unbroken(tmp_path_factory):
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(unbroken, tmp_path):
     folder = tmp_path / "set"
-    assert _kill_after(_start(folder, 1), 0.3)
+    assert _kill_after(_start(folder, 1), 0.2)
     assert not (folder / "manifest.json").exists()
     generate(killed_plan(), folder, workers=1)
     assert files_of(folder) == files_of(unbroken)
@@ -68,7 +68,7 @@ def test_a_run_killed_at_many_instants_ends_with_the_same_bytes(unbroken, tmp_pa
     cut = 0
     for _ in range(12):
         # Often within a moment of starting and of a shard's end; between two kills at least a little is done.
-        if not _kill_after(_start(folder, workers), draw.uniform(*(0.0, 0.7) if workers == 1 else (1.5, 5.0))):
+        if not _kill_after(_start(folder, workers), draw.uniform(*(0.0, 0.6) if workers == 1 else (1.5, 4.5))):
             break
         cut += 1
     assert cut >= 3
