@@ -141,7 +141,10 @@ def _check_config(plan: GenerationPlan, folder: Path) -> None:
         write_json(path, config)
         return
     found = read_json(path)
-    if found != config:
+    if found != config and not any(folder.glob("*.h5")):
+        # Begun, but nothing was made: a failed first try must not stand in the way.
+        write_json(path, config)
+    elif found != config:
         other = sorted(key for key in {*found, *config} if found.get(key) != config.get(key))
         raise UsageError(
             f"{str(folder)!r} holds a data set begun with other {', '.join(other)}; give the same options as then, or "

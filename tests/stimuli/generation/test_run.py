@@ -99,6 +99,13 @@ def test_another_data_set_in_the_folder_is_refused_and_named(unbroken, tmp_path)
         generate(small_plan(), tmp_path)
 
 
+def test_a_first_try_that_made_nothing_does_not_stand_in_the_way(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({"seed": 7}))
+    plan = small_plan(("brick:1",), limit=1)
+    generate(plan, tmp_path, workers=1)
+    assert json.loads((tmp_path / "config.json").read_text()) == json.loads(json.dumps(plan.config))
+
+
 def test_a_disk_that_is_too_small_is_said_before_anything_is_simulated(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(1e9, 1e9 - 60e6, 60e6))
