@@ -30,11 +30,14 @@ def draw_collisions(axes: Any, points: Sequence[Mapping[str, Any]]) -> None:
     for marker, backend in zip("os^Dv", sorted({point["backend"] for point in points}), strict=False):
         for number, geometry in enumerate(geometries):
             some = [point for point in points if (point["backend"], point["collision"]) == (backend, geometry)]
-            costs, errors = [p["cost"] for p in some], [p["error"] for p in some]
-            axes.scatter(costs, errors, s=22, marker=marker, color=f"C{number}", label=f"{geometry}, {backend}")
+            axes.scatter([p["cost"] for p in some], [p["error"] for p in some], s=22, marker=marker, color=f"C{number}")
+        axes.scatter([], [], s=22, marker=marker, color="0.5", label=backend)
+    for number, geometry in enumerate(geometries):
+        axes.scatter([], [], s=22, marker="s", color=f"C{number}", label=geometry)
     _label(axes, "whisking into a hollow, by collision geometry", "relative error of the base moment")
 
 
 def _label(axes: Any, title: str, error: str) -> None:
     axes.set(xscale="log", yscale="log", title=title, xlabel="processor seconds per whisker-second", ylabel=error)
-    axes.legend(frameon=False, fontsize="small")
+    axes.margins(x=0.12)
+    axes.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.14), ncol=4)

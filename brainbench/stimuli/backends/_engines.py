@@ -67,7 +67,7 @@ def step_travel(
     if obstacle.motion is None:
         return own
     places, quaternions = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
-    size = max(float(np.linalg.norm(part.bounds(), axis=1).max()) for part in obstacle.parts)
+    size = float(np.linalg.norm(_bounds(obstacle), axis=1).max())
     chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
     return own + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
 
@@ -80,8 +80,7 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
     """
     first, reason = len(times) - 1, ""
     for obstacle in reach.obstacles:
-        corners = np.stack([part.bounds() for part in obstacle.parts])
-        bounds = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+        bounds = _bounds(obstacle)
         thickness = float((bounds[1] - bounds[0]).min()) + 2 * job.whisker.base_radius
         travel = step_travel(job.whisker, position, euler, obstacle, times)
         passing = travel > thickness
@@ -97,6 +96,13 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
                 "touched; choose a smaller time step"
             )
     return first, reason
+
+
+def _bounds(obstacle: Obstacle) -> NDArray[np.float64]:
+    """Lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
+    bodies = obstacle.parts if obstacle.surface is None else (obstacle.surface,)
+    corners = np.stack([body.bounds() for body in bodies])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
 
 def require_parts(jobs: Sequence[Job], backend: str) -> None:

@@ -90,26 +90,6 @@ def _follow(built, steps):
     return np.concatenate(out)
 
 
-def test_the_base_wrench_is_the_applied_force_less_the_growth_of_momentum():
-    force = np.array([0.0, 2e-6, 1e-6])
-    step = 2e-5
-    times = np.arange(1.0, 400.0) * step
-    job = Job(C2, StillFollicle(), (), times, loads=(Load(0.011, tuple(force)),))
-    trace = _run(job, fidelity=Fidelity(links=12, time_step=step), record_shape=True)[0]
-    chain = build_chain(C2, 12)
-    assert trace.link_positions is not None
-    along = np.diff(trace.link_positions, axis=1)
-    centres = trace.link_positions[:, :-1] + along * (chain.centres / chain.lengths)[:, None]
-    momentum = np.gradient(np.einsum("l,nlk->nk", chain.masses, centres), times, axis=0)
-    impulse = np.cumsum(force - trace.wrench[:, :3], axis=0) * step
-    # Momentum between samples: compare growth since the first interior one.
-    gained = (momentum - momentum[1])[2:-1]
-    given = (impulse - impulse[1] + (force - trace.wrench[1, :3]) * step / 2)[2:-1]
-    given -= (force - trace.wrench[2:-1, :3]) * step / 2
-    assert np.abs(gained).max() > 1e-11
-    assert np.abs(gained - given).max() < 0.02 * np.abs(gained).max()
-
-
 def test_refining_step_and_links_converges():
     times = np.arange(1.0, 101.0) * 1e-3
     job = Job(C2, Swing(angles=(0.25, 0, 0)), (_post(0.0107, 0.0025, friction=0.0),), times)

@@ -121,6 +121,24 @@ def test_a_stiff_whisker_in_free_air_shows_its_centripetal_and_euler_wrench(engi
     assert not trace.contact.any()
 
 
+def test_the_base_wrench_is_the_applied_force_less_the_growth_of_momentum(engine):
+    force, step = np.array([0.0, 2e-6, 1e-6]), 2e-5
+    times = np.arange(1.0, 400.0) * step
+    job = Job(C2, StillFollicle(), (), times, loads=(Load(0.011, tuple(force)),))
+    trace = _run(engine, job, fidelity=Fidelity(links=12, time_step=step), record_shape=True)[0]
+    chain = build_chain(C2, 12)
+    along = np.diff(trace.link_positions, axis=1)
+    centres = trace.link_positions[:, :-1] + along * (chain.centres / chain.lengths)[:, None]
+    momentum = np.gradient(np.einsum("l,nlk->nk", chain.masses, centres), times, axis=0)
+    impulse = np.cumsum(force - trace.wrench[:, :3], axis=0) * step
+    # Momentum between samples: compare growth since the first interior one.
+    gained = (momentum - momentum[1])[2:-1]
+    given = (impulse - impulse[1] + (force - trace.wrench[1, :3]) * step / 2)[2:-1]
+    given -= (force - trace.wrench[2:-1, :3]) * step / 2
+    assert np.abs(gained).max() > 1e-11
+    assert np.abs(gained - given).max() < 0.02 * np.abs(gained).max()
+
+
 def test_gravity_pulls_the_base_with_the_weight_of_the_whisker_when_asked(engine):
     trace = _run(engine, Job(CRITICAL, StillFollicle(), (), np.array([0.1]), gravity=(0.0, 0.0, -9.81)))[0]
     assert trace.wrench[0, 2] == pytest.approx(-9.81 * C2.mass, rel=1e-6)
