@@ -34,6 +34,8 @@ class Session:
     """[R], ascending."""
     hashes: Hashes
     """[R]"""
+    inflation: float = 1.0
+    """How much larger the noise of means is, in units of the noise that the trials were divided by."""
     complete: bool = field(init=False)
 
     identity: int = field(init=False)
@@ -136,7 +138,7 @@ def weighted_patterns(session: Session, weights: Floats, count: int, *, variance
                 # Repeats of one trial tell nothing of its noise: only products of different trials count.
                 squares, pairs = weight**2 @ filled[rows] ** 2, number**2 - weight**2 @ seen
                 free = ((weight @ filled[rows]) ** 2 - squares) / np.where(pairs > 0, pairs, np.nan)
-                spread[:, stimulus] = means[:, stimulus] ** 2 - free
+                spread[:, stimulus] = session.inflation * (means[:, stimulus] ** 2 - free)
     return means, spread
 
 
@@ -180,7 +182,8 @@ def _from_products(
             if method == "crossnobis":
                 # The product of a trial with itself holds its noise; those of different trials do not.
                 diagonal = np.einsum("sii->si", gram)
-                diagonal[...] = (number**2 * diagonal - (weight * np.diag(product)) @ group) / (number * (number - 1))
+                free = (number**2 * diagonal - (weight * np.diag(product)) @ group) / (number * (number - 1))
+                diagonal[...] = diagonal - session.inflation * (diagonal - free)
             grams[half] += gram
     if method in ("sqeuclidean", "crossnobis"):
         return products_from_gram(grams[0], units), products_from_gram(grams[1], units)

@@ -137,12 +137,14 @@ class _Sums:
         self.units = np.add.reduceat(weights * part.sums, starts, axis=1)
         self.squares = np.add.reduceat(weights**2 * part.squares, starts, axis=1)
         self.gram = self.patterns @ self.patterns.swapaxes(-1, -2)
+        self.inflation = session.inflation
 
     def without(self, half: _Sums) -> _Sums:
         """Return the sums of the other half, whose inner products need no second pass over its patterns."""
         other = object.__new__(_Sums)
         cross = self.patterns @ half.patterns.swapaxes(-1, -2)
         other.gram = self.gram - cross - cross.swapaxes(-1, -2) + half.gram
+        other.inflation = self.inflation
         for name in ("number", "number_squared", "units", "squares"):
             setattr(other, name, getattr(self, name) - getattr(half, name))
         return other
@@ -157,8 +159,9 @@ def _distances(sums: list[_Sums], copies: Ints, units: Floats, method: str) -> F
             own = part.gram / (number[:, :, None] * number[:, None, :])
             if method == "crossnobis":
                 pairs = part.number**2 - part.number_squared
-                diagonal = np.einsum("dii->di", part.gram) - part.squares
-                np.einsum("dii->di", own)[...] = diagonal / np.where(pairs > 0, pairs, np.nan)
+                free = (np.einsum("dii->di", part.gram) - part.squares) / np.where(pairs > 0, pairs, np.nan)
+                diagonal = np.einsum("dii->di", own)
+                diagonal[...] = diagonal - part.inflation * (diagonal - free)
             weight = copies[:, index].astype(np.float64)[:, None, None]
             gram += np.where(weight > 0, weight * own, 0.0)
             total += np.where(weight[..., 0] > 0, weight[..., 0] * part.units / number, 0.0)

@@ -277,4 +277,6 @@ def _shifted(sessions: list[Session], means: list[Floats], *, by_unit: bool) -> 
         shifts = [np.nanmean(mean, axis=0) for mean in means]
     else:
         shifts = [np.nanmean(np.concatenate([mean.ravel() for mean in means]))] * len(sessions)
-    return [Session(s.responses - shift, s.codes, s.hashes) for s, shift in zip(sessions, shifts, strict=True)]
+    return [
+        Session(s.responses - shift, s.codes, s.hashes, s.inflation) for s, shift in zip(sessions, shifts, strict=True)
+    ]

@@ -35,14 +35,13 @@ def test_crossnobis_with_unequal_trials_equals_rsatoolbox():
         from rsatoolbox.data import Dataset
         from rsatoolbox.rdm import calc_rdm_unbalanced
     block = _unbalanced()
-    precision = noise_precision(block.responses, block.labels)
     data = Dataset(block.responses, obs_descriptors={"stimulus": block.labels, "trial": np.arange(len(block.labels))})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         expected = calc_rdm_unbalanced(
-            data, method="crossnobis", descriptor="stimulus", cv_descriptor="trial", noise=precision
+            data, method="crossnobis", descriptor="stimulus", cv_descriptor="trial"
         ).dissimilarities[0]
-    found = subject_rdm("a", [block], 6, method="crossnobis", splits=5)
+    found = subject_rdm("a", [block], 6, method="crossnobis", noise="none", splits=5)
     np.testing.assert_allclose(found.rdm, expected, atol=1e-10)
 
 
@@ -57,15 +56,28 @@ def test_halves_by_products_and_by_patterns_are_the_same(method):
     np.testing.assert_allclose(second, pattern_rdms([session], [1 - member], 6, method), atol=1e-11)
 
 
-def test_crossnobis_is_zero_on_average_where_stimuli_are_alike_and_the_biased_distance_is_not():
+@pytest.mark.parametrize("noise", ["none", "diag", "shrinkage_diag", "full"])
+def test_crossnobis_is_zero_on_average_where_stimuli_are_alike(noise):
     rng = np.random.default_rng(1)
     labels = np.repeat(np.arange(6), [4, 5, 6, 7, 8, 9])
-    found, biased = [], []
+    found = []
     for _ in range(200):
-        block = TrialBlock(rng.normal(size=(len(labels), 10)), labels)
-        found.append(subject_rdm("a", [block], 6, method="crossnobis", noise="diag", splits=1).rdm.mean())
-        biased.append(subject_rdm("a", [block], 6, method="mahalanobis", noise="diag", splits=1).rdm.mean())
+        block = TrialBlock(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
+        found.append(subject_rdm("a", [block], 6, method="crossnobis", noise=noise, splits=1).rdm.mean())
     assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(200)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["none", "diag", "full"])
+def test_crossnobis_is_zero_on_average_in_two_thousand_simulations(noise):
+    rng = np.random.default_rng(2)
+    labels = np.repeat(np.arange(6), [4, 5, 6, 8, 10, 12])
+    found, biased = [], []
+    for _ in range(2000):
+        block = TrialBlock(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
+        found.append(subject_rdm("a", [block], 6, method="crossnobis", noise=noise, splits=1).rdm.mean())
+        biased.append(subject_rdm("a", [block], 6, method="sqeuclidean", splits=1).rdm.mean())
+    assert abs(np.mean(found)) < 3 * np.std(found) / np.sqrt(2000)
     assert np.mean(biased) > 0.2
 
 
