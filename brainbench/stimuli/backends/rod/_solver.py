@@ -15,16 +15,21 @@ from typing import Any
 from brainbench.stimuli.backends.rod._shapes import MESH, distances
 from brainbench.stimuli.backends.rod._tracks import tracks
 
-CONTACTS = 6
+CONTACTS = 4
 """Contacts of one whisker that are solved together; the tightest are kept when there are more."""
-SWEEPS = 150
+SWEEPS = 20
 """Most Gauss-Seidel sweeps over the contacts of one step."""
+PROXIMAL = 0.0
+"""Compliance of a contact, as a share of the whisker's own, against changes of its force from step to step. It makes
+neighbouring contacts well-conditioned and vanishes when forces are steady."""
 LARGEST_BEND = 1.5
 """Bend of one joint (rad) beyond which a chain means nothing."""
 REST = 1e-6
 """Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
 FAR = 3.0
 """How far (mm) a distance query looks; a link further away is looked at again when it may have come nearer."""
+NEAR = 0.2
+"""How much further (mm) than needed a search among triangles looks, so that it need not be made in every step."""
 CREVICE = 0.02
 """Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
 
@@ -206,6 +211,12 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         return wp.cos(x)
 
     @wp.func
+    def first_axis(z: vec3, along: vec3, angle: real) -> vec3:
+        """Axis of a joint's first hinge from that of its second, the link behind it and the second angle."""
+        x = wp.normalize(along)
+        return wp.cross(z, x) * cosine(angle) + x * sine(angle)
+
+    @wp.func
     def rotate(q: vec4, x: vec3) -> vec3:
         u = vec3(q[1], q[2], q[3])
         t = real(2.0) * wp.cross(u, x)
@@ -331,10 +342,13 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
             start_nearest = wp.min(start_nearest, wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1]))
         touch.clear = wp.min(reach, wp.sqrt(wp.min(nearest, wp.min(end_nearest, start_nearest))))
         if face >= 0:
-            if share > real(1e-3) and share < real(1.0 - 1e-3):
+            out_here = outward_of(bodies, face, v, w)
+            # On a flat or hollow edge the ends of the link are nearer, or as near.
+            flat = wp.dot(out_here, bodies.outward[face, 0]) > real(0.99999)
+            if share > real(1e-3) and share < real(1.0 - 1e-3) and not (flat and nearest > real(0.0)):
                 radius = ra + (rb - ra) * share
                 away = a + (b - a) * share - corner_point(bodies, face, v, w)
-                out = direction(away, wp.sqrt(nearest), outward_of(bodies, face, v, w), radius)
+                out = direction(away, wp.sqrt(nearest), out_here, radius)
                 touch.between = 1
                 touch.share = share
                 touch.gap = out[3] - radius
@@ -398,7 +412,6 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         # State of the joints, and what one step keeps of each link between its passes.
         q = wp.zeros(wp.static(capacity), dtype=vec2)
         qd = wp.zeros(wp.static(capacity), dtype=vec2)
-        e1 = wp.zeros(wp.static(capacity), dtype=vec3)
         e2 = wp.zeros(wp.static(capacity), dtype=vec3)
         node = wp.zeros(wp.static(capacity + 1), dtype=vec3)
         k1w = wp.zeros(wp.static(capacity), dtype=vec3)
@@ -408,10 +421,12 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         push = wp.zeros(wp.static(capacity), dtype=vec2)
         inverse = wp.zeros(wp.static(capacity), dtype=vec3)
         clear = wp.zeros(wp.static(capacity), dtype=real)
+        close = wp.zeros(wp.static(capacity), dtype=wp.int32)
         # Contacts of one step.
         c_link = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
         c_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_ahead = wp.zeros(wp.static(CONTACTS), dtype=real)
+        c_old = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_gap = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_mu = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_at = wp.zeros(wp.static(CONTACTS), dtype=vec3)
@@ -427,6 +442,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         held_count = int(0)
         comply = wp.zeros(wp.static(rows * rows), dtype=real)
 
+        look_near = real(wp.static(NEAR))
         object_speed = zero
         for s in range(shapes_from, shapes_to):
             object_speed = wp.max(object_speed, bodies.speed[s])
@@ -502,6 +518,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                 # At rest, and nothing can have come near: the wrench stays zero.
                 for i in range(links):
                     clear[i] = zero
+                    close[i] = 0
                     q[i] = vec2(zero, zero)
                     qd[i] = vec2(zero, zero)
                 before = upto
@@ -541,7 +558,6 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                     sb = sine(angle[1])
                     x = turned * ca - z * sa
                     z = turned * sa + z * ca
-                    e1[i] = y
                     e2[i] = z
                     node[i] = at
                     vw = vw + y * rate[0] + z * rate[1]
@@ -569,8 +585,9 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                     cvv = bv
                     for i in range(links):
                         rate = qd[i]
-                        cvw = cvw + e1[i] * rate[0] + e2[i] * rate[1]
-                        cvv = cvv + wp.cross(node[i], e1[i] * rate[0] + e2[i] * rate[1])
+                        spun = first_axis(e2[i], node[i + 1] - node[i], q[i][1]) * rate[0] + e2[i] * rate[1]
+                        cvw = cvw + spun
+                        cvv = cvv + wp.cross(node[i], spun)
                         taper = ch.taper[i, who]
                         if clear[i] <= margin + taper[0]:
                             closest = real(1e20)
@@ -586,9 +603,16 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 rb = taper[1] / scale
                                 touch = Touch()
                                 if bodies.kind[s] == wp.static(MESH):
-                                    touch = far_mesh(bodies, s, a, b, ra, rb, real(wp.static(FAR)) / scale)
+                                    # A link that was near is looked at among its triangles at once.
+                                    touch.clear = zero
+                                    if close[i] == 0:
+                                        touch = far_mesh(bodies, s, a, b, ra, rb, real(wp.static(FAR)) / scale)
                                     if touch.between == 0 and touch.clear * scale <= margin + taper[0]:
-                                        touch = near_mesh(bodies, s, a, b, ra, rb, margin / scale)
+                                        touch = near_mesh(bodies, s, a, b, ra, rb, (margin + look_near) / scale)
+                                        if touch.end == 0:
+                                            close[i] = 0
+                                        else:
+                                            close[i] = 1
                                 else:
                                     found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
                                     touch.clear = found[1] + wp.min(ra, rb)
@@ -660,7 +684,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                                 along = node[i + 1] - node[i]
                                                 tangent = along - normal * wp.dot(along, normal)
                                                 if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
-                                                    tangent = e1[i] - normal * wp.dot(e1[i], normal)
+                                                    tangent = e2[i] - normal * wp.dot(e2[i], normal)
                                                 tangent = wp.normalize(tangent)
                                                 axis[3 * slot] = normal
                                                 axis[3 * slot + 1] = tangent
@@ -704,8 +728,9 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 pull = ln.load_force[load]
                                 pw = pw - wp.cross(at + xa * (b4[0] * ln.load_share[load]), pull)
                                 pv = pv - pull
-                    s1 = e1[i]
+                    angle = q[i]
                     s2 = e2[i]
+                    s1 = wp.cross(s2, xa) * cosine(angle[1]) + xa * sine(angle[1])
                     m1 = wp.cross(at, s1)
                     m2 = wp.cross(at, s2)
                     u1w = sym(ia, s1) + ib * m1
@@ -721,7 +746,6 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                     i11 = d22 * whole
                     i12 = -d12 * whole
                     i22 = d11 * whole
-                    angle = q[i]
                     rate = qd[i]
                     lag = h + step_damping
                     t1 = -k * (angle[0] + lag * rate[0]) - wp.dot(s1, pw) - wp.dot(m1, pv)
@@ -737,7 +761,8 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                     k2w[i] = g2w
                     k2v[i] = g2v
                     push[i] = vec2(f1, f2)
-                    inverse[i] = vec3(i11, i12, i22)
+                    if contacts > 0:
+                        inverse[i] = vec3(i11, i12, i22)
                     # Velocity-product acceleration of the joint.
                     jw = s1 * rate[0] + s2 * rate[1]
                     jv = m1 * rate[0] + m2 * rate[1]
@@ -754,12 +779,13 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                 reaction_w = sym(ia, baw) + ib * bav + pw
                 reaction_v = baw * ib + sym(ic, bav) + pv
                 # Down again: accelerations without contact.
+                worst = zero
                 aw = baw
                 av = bav
                 vw = bw
                 vv = bv
                 for i in range(links):
-                    s1 = e1[i]
+                    s1 = first_axis(e2[i], node[i + 1] - node[i], q[i][1])
                     s2 = e2[i]
                     at = node[i]
                     m1 = wp.cross(at, s1)
@@ -775,9 +801,24 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                     f = push[i]
                     a1 = f[0] - wp.dot(k1w[i], aw) - wp.dot(k1v[i], av)
                     a2 = f[1] - wp.dot(k2w[i], aw) - wp.dot(k2v[i], av)
-                    push[i] = vec2(a1, a2)
                     aw = aw + s1 * a1 + s2 * a2
                     av = av + m1 * a1 + m2 * a2
+                    if contacts > 0:
+                        push[i] = vec2(a1, a2)
+                    else:
+                        rate = rate + vec2(a1, a2) * h
+                        angle = q[i] + rate * h
+                        qd[i] = rate
+                        q[i] = angle
+                        bend = wp.max(wp.abs(angle[0]), wp.abs(angle[1]))
+                        # A value that is no number must not slip through a comparison.
+                        if not (bend < real(wp.static(LARGEST_BEND))):
+                            if status == 0:
+                                status = wp.static(BENT)
+                                if not (bend < real(1e30)):
+                                    status = wp.static(LOST)
+                                failed = now + h
+                        worst = wp.max(worst, wp.max(bend, wp.max(wp.abs(rate[0]), wp.abs(rate[1]))))
                     for c in range(contacts):
                         if c_link[c] == i:
                             point = c_at[c]
@@ -808,6 +849,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 if apart < real(0.3) * ch.taper[c_link[c], who][3]:
                                     guess = held_force[e]
                             force[3 * c] = wp.max(zero, wp.dot(guess, axis[3 * c]))
+                            c_old[c] = force[3 * c]
                             force[3 * c + 1] = wp.dot(guess, axis[3 * c + 1])
                             force[3 * c + 2] = wp.dot(guess, axis[3 * c + 2])
                         held_count = int(0)
@@ -816,7 +858,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 comply[r * wp.static(rows) + e] = zero
                         for back in range(top + 1):
                             i = top - back
-                            s1 = e1[i]
+                            s1 = first_axis(e2[i], node[i + 1] - node[i], q[i][1])
                             s2 = e2[i]
                             m1 = wp.cross(node[i], s1)
                             m2 = wp.cross(node[i], s2)
@@ -865,6 +907,8 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                             b1 += comply[(r + 1) * wp.static(rows) + e] * force[e]
                                             b2 += comply[(r + 2) * wp.static(rows) + e] * force[e]
                                     nn = comply[r * wp.static(rows) + r]
+                                    bn = bn - real(wp.static(PROXIMAL)) * nn * c_old[c]
+                                    nn = nn * real(wp.static(1.0 + PROXIMAL))
                                     n1 = comply[r * wp.static(rows) + r + 1]
                                     n2 = comply[r * wp.static(rows) + r + 2]
                                     c11 = comply[(r + 1) * wp.static(rows) + r + 1]
@@ -900,7 +944,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                                 f1 = p0
                                                 f2 = q0
                                                 pace = one / (c11 + c22)
-                                                for _ in range(24):
+                                                for _ in range(8):
                                                     fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
                                                     s1_ = f1 - pace * (b1 + n1 * fn + c11 * f1 + c12 * f2)
                                                     s2_ = f2 - pace * (b2 + n2 * fn + c12 * f1 + c22 * f2)
@@ -950,7 +994,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                     )
                                     tv = tv + total
                                     tw = tw + wp.cross(c_at[c], total)
-                            s1 = e1[i]
+                            s1 = first_axis(e2[i], node[i + 1] - node[i], q[i][1])
                             s2 = e2[i]
                             u1 = wp.dot(s1, tw) + wp.dot(wp.cross(node[i], s1), tv)
                             u2 = wp.dot(s2, tw) + wp.dot(wp.cross(node[i], s2), tv)
@@ -968,7 +1012,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 extra = inverse[i]
                             a1 = extra[0] - wp.dot(k1w[i], aw) - wp.dot(k1v[i], av)
                             a2 = extra[1] - wp.dot(k2w[i], aw) - wp.dot(k2v[i], av)
-                            s1 = e1[i]
+                            s1 = first_axis(e2[i], node[i + 1] - node[i], q[i][1])
                             s2 = e2[i]
                             aw = aw + s1 * a1 + s2 * a2
                             av = av + wp.cross(node[i], s1) * a1 + wp.cross(node[i], s2) * a2
@@ -989,9 +1033,11 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 force_sum += force[3 * c]
                 touching += touched
                 steps = steps + 1
-                worst = zero
                 busy = touched
-                for i in range(links):
+                moved_links = int(0)
+                if contacts > 0:
+                    moved_links = links
+                for i in range(moved_links):
                     rate = qd[i] + push[i] * h
                     angle = q[i] + rate * h
                     if opt.quasistatic == 1:

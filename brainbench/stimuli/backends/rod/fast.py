@@ -5,7 +5,7 @@ The object's surface is uploaded once and scaled, turned and moved inside the ke
 
 from __future__ import annotations
 
-import math
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -69,6 +69,8 @@ class SweepLauncher:
         self.device = pick_device(device)
         self.scenes, self.grid, self.fidelity = scenes, grid, fidelity
         self._solids: dict[str, Solid] = {}
+        self.seconds: dict[str, float] = {}
+        """What the last launch spent on placing objects, uploading, and computing."""
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         mounts = list(scenes.array)
@@ -90,6 +92,7 @@ class SweepLauncher:
             objects: (name, its sweeps) in the order of the result's first axis.
         """
         wp, kernels, device = warp(), self.kernels, self.device
+        clock = [time.perf_counter()]
         tracks = Tracks()
         bases = [tracks.add(knot, 0.0, 1.0) for knot in self._bases]
         shapes = Shapes(device)
@@ -98,6 +101,7 @@ class SweepLauncher:
                 self._solids = {name: self.scenes.solid(name)} | dict(list(self._solids.items())[:64])
         for name, sweeps in objects:
             self._add(shapes, tracks, self._solids[name], sweeps)
+        clock.append(time.perf_counter())
         count, whiskers = len(shapes.first) - 1, len(self._bases)
         # Neighbouring threads take the same whisker past the same object.
         whisker, row = (grid.ravel().astype(np.int32) for grid in np.meshgrid(np.arange(whiskers), np.arange(count), indexing="ij"))
@@ -134,7 +138,12 @@ class SweepLauncher:
             wp.array(self.readings, dtype=real, device=device),
             out,
         ]
+        wp.synchronize_device(device)
+        clock.append(time.perf_counter())
         wp.launch(kernels.run, dim=len(row), inputs=inputs, device=device, block_dim=BLOCK)
+        wp.synchronize_device(device)
+        clock.append(time.perf_counter())
+        self.seconds = dict(zip(("objects", "upload", "kernel"), np.diff(clock).tolist(), strict=True))
         found = {name: getattr(out, name).numpy().reshape(whiskers, count).T for name in names}
         return SweepResult(
             wrench=out.wrench,

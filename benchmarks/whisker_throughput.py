@@ -1,0 +1,147 @@
+"""Whisker-steps per second of the ``rod`` backend: free, and sweeping over meshes. Run on a GPU, or with --device cpu.
+
+PYTHONPATH=. python benchmarks/whisker_throughput.py [--device cuda] [--only free,sweep,low,high]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+
+import numpy as np
+
+from brainbench.stimuli import Fidelity
+from brainbench.stimuli.backends.rod._device import to_struct, warp
+from brainbench.stimuli.backends.rod._pack import Shapes, Tracks, still_knots
+from brainbench.stimuli.backends.rod.fast import BLOCK, SweepLauncher
+from brainbench.stimuli.collections import resolve_objects
+from brainbench.stimuli.sweeps import GRIDS, SweepScenes
+
+
+def timed(wp, device, run, repeats: int = 3) -> float:
+    """Median seconds of a launch, warmed up."""
+    run()
+    wp.synchronize_device(device)
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        run()
+        wp.synchronize_device(device)
+        seconds.append(time.perf_counter() - started)
+    return statistics.median(seconds)
+
+
+def free(device_name: str, lanes: int, links: int, steps: int, block: int, most: int = 0, precision: str = "single") -> None:
+    """Whiskers that swing under gravity, nothing near: pure integration."""
+    wp = warp()
+    objects = resolve_objects(["torus-1"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-low"], {name: item.load for name, item in objects.items()})
+    step = 1e-4
+    launcher = SweepLauncher(scenes, Fidelity(links=links, time_step=step, precision=precision), device_name)
+    kernels, device, real = launcher.kernels, launcher.device, launcher.real
+    tracks, shapes = Tracks(), Shapes(device)
+    tracks.add(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])), 0.0, 1.0)
+    shapes.first.append(0)
+    which = np.sort(np.arange(lanes, dtype=np.int32) % len(launcher.steps))
+    zeros = np.zeros(lanes, dtype=np.int32)
+    lane = {
+        "whisker": which,
+        "scene": zeros,
+        "base": zeros,
+        "step": np.full(lanes, step * 1e3),
+        "row": zeros,
+        "column": zeros,
+        "load_first": np.zeros(lanes + 1, dtype=np.int32),
+        "load_link": np.zeros(0, dtype=np.int32),
+        "load_share": np.zeros(0),
+        "load_force": np.zeros((0, 3)),
+        "load_stop": np.zeros(0),
+    }
+    out = kernels.Results()
+    out.wrench = wp.zeros((1, 1, 1, 6), dtype=real, device=device)
+    out.contact = wp.zeros((1, 1, 1), dtype=real, device=device)
+    out.points = wp.zeros((1, 1, 1), dtype=kernels.vec3, device=device)
+    out.depth, out.failed = (wp.zeros(lanes, dtype=real, device=device) for _ in range(2))
+    for name in ("status", "steps", "touching", "crowded", "unsolved"):
+        setattr(out, name, wp.zeros(lanes, dtype=wp.int32, device=device))
+    options = kernels.Options()
+    options.gravity = kernels.vec3(0.0, 0.0, -9.81e-3)
+    options.axes = kernels.mat33(*np.eye(3).ravel().tolist())
+    readings = wp.array([steps * step * 1e3], dtype=real, device=device)
+    inputs = [
+        launcher._chains,
+        to_struct(kernels.Tracks, tracks.arrays(), device),
+        to_struct(kernels.Bodies, shapes.arrays(), device),
+        to_struct(kernels.Lanes, lane, device),
+        options,
+        readings,
+        out,
+    ]
+    seconds = timed(wp, device, lambda: wp.launch(kernels.run, lanes, inputs, device=device, block_dim=block, max_blocks=most))
+    done = int(out.steps.numpy().astype(np.int64).sum())
+    bad = int((out.status.numpy() != 0).sum())
+    print(
+        f"free  N={links} {precision} lanes={lanes} block={block} blocks={most or 'all'}: {done / seconds:.3e} whisker-steps/s "
+        f"({seconds:.3f} s, {bad} failed)",
+        flush=True,
+    )
+
+
+def sweep(device_name: str, recipe: str, words: list[str], fidelity: Fidelity, sweeps: int) -> None:
+    """Sweeps of a recipe over procedural objects: steps, sweeps per second, and what that means for whole sets."""
+    wp = warp()
+    objects = resolve_objects(words, surfaces=True)
+    scenes = SweepScenes(GRIDS[recipe], {name: item.load for name, item in objects.items()})
+    launcher = SweepLauncher(scenes, fidelity, device_name)
+    started = time.perf_counter()
+    groups = [(name, scenes.grid.sweeps(name)[: max(1, sweeps // len(objects))]) for name in scenes.objects]
+    launcher.launch(groups[:1])
+    for name, _ in groups:
+        scenes.solid(name)
+    loaded = time.perf_counter() - started
+    started = time.perf_counter()
+    result = launcher.launch(groups)
+    wp.synchronize_device(launcher.device)
+    seconds = time.perf_counter() - started
+    count = sum(len(some) for _, some in groups)
+    steps, full = int(result.steps.astype(np.int64).sum()), result.steps_in_full
+    print(
+        f"sweep {recipe} {count} sweeps of {len(objects)} objects, {fidelity}: {seconds:.2f} s (kernel "
+        f"{launcher.seconds.get('kernel', float('nan')):.2f} s; objects {loaded:.1f} s), "
+        f"{steps / seconds:.3e} whisker-steps/s, {steps / full:.1%} of the steps computed, "
+        f"{result.touching.sum() / max(steps, 1):.1%} of those in contact; {count / seconds:.0f} sweeps/s; "
+        f"failed {int((result.status != 0).sum())}, unsolved steps {int(result.unsolved.sum())}; "
+        f"159,696 sweeps in {159696 / count * seconds:.0f} s, 2,076,048 in {2076048 / count * seconds / 60:.1f} min; "
+        f"phases { ({k: round(v, 3) for k, v in launcher.seconds.items()}) }",
+        flush=True,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--only", default="free,sweep")
+    parser.add_argument("--lanes", type=int, default=262_144)
+    parser.add_argument("--blocks", default=f"{BLOCK}:0", help="block size : most blocks (0 = all), several by commas")
+    parser.add_argument("--objects", default="procedural-24:2")
+    parser.add_argument("--sweeps", type=int, default=768)
+    args = parser.parse_args()
+    small = args.device == "cpu"
+    chosen = args.only.split(",")
+    if "free" in chosen:
+        for links in (10, 20):
+            for pair in args.blocks.split(","):
+                block, most = map(int, pair.split(":"))
+                free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, most)
+    if "sweep" in chosen:
+        for recipe, fidelity in (
+            ("thesis-low", Fidelity(links=20, time_step=2e-4)),
+            ("thesis-low", Fidelity(links=10, time_step=1e-3)),
+            ("thesis-high", Fidelity(links=10, time_step=1e-3)),
+        ):
+            sweep(args.device, recipe, args.objects.split(","), fidelity, args.sweeps)
+
+
+if __name__ == "__main__":
+    main()
