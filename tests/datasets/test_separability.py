@@ -59,6 +59,16 @@ def test_the_interval_covers_the_true_accuracy_of_two_gaussians():
     assert covered >= 6
 
 
+def test_the_kernel_is_that_of_scikit_learn():
+    from sklearn.metrics.pairwise import rbf_kernel
+
+    from brainbench.datasets.separability import _kernel
+
+    values = np.random.default_rng(0).normal(size=(40, 30)) * 3 + 1
+    expected = rbf_kernel(values, gamma=1 / (30 * values.var()))  # what SVC(gamma="scale") takes
+    np.testing.assert_allclose(_kernel(values), expected, rtol=1e-4)
+
+
 def test_few_objects_make_it_unreliable_and_one_makes_it_impossible():
     found = separate(*_made(objects=3, by_class=3.0), count=2, names=NAMES)
     assert found.status == "unreliable"

@@ -1,4 +1,5 @@
 import dataclasses
+import io
 import json
 
 import h5py
@@ -14,6 +15,7 @@ from brainbench.stimuli.generation.shard import (
     OK,
     UNSTABLE,
     UNUSABLE,
+    _write_all,
     make_shard,
     prepare_shard,
     simulate_shard,
@@ -139,3 +141,13 @@ def test_a_shard_of_another_data_set_is_not_taken_for_ones_own(tmp_path):
     other = small_plan(seed=1).shards[0]
     with pytest.raises(DataError, match="belongs to another data set"):
         is_whole(tmp_path / task.name, other)
+
+
+def test_a_write_that_the_system_cuts_short_goes_on():
+    class Short(io.BytesIO):
+        def write(self, data):
+            return super().write(data[:7])
+
+    stream, array = Short(), np.arange(100, dtype=np.float32).reshape(5, 20)
+    _write_all(stream, array)
+    assert stream.getvalue() == array.tobytes()
