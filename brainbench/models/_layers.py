@@ -121,6 +121,12 @@ class Conv2d(nn.Conv2d):
         """Convolve [B, C, H, W]."""
         return super().forward(input if self._extra is None else functional.pad(input, self._extra))
 
+    def share(self, input: torch.Tensor, start: int, *, use_bias: bool) -> torch.Tensor:
+        """Convolve some of the input channels, those from ``start`` on; the shares of all add up to the whole."""
+        padded = input if self._extra is None else functional.pad(input, self._extra)
+        weight = self.weight[:, start : start + input.shape[1]]
+        return self._conv_forward(padded, weight, self.bias if use_bias else None)
+
 
 class Linear(nn.Linear):
     """Linear layer [..., in] → [..., out] with this module's initial weights."""

@@ -1,6 +1,7 @@
 r"""Convolutional recurrent cells.
 
-Every cell maps an input x [B, C, H, W] and a state s to an output y [B, out, H, W] and the next state.
+Every cell maps an input x [B, C, H, W] and a state s to an output y [B, out, H, W] and the next state. The input's
+share of the gates can be computed for all time steps at once (:meth:`Cell.project`).
 Gates come from one fused "same" convolution of cat(x, s). ``layer_norm`` normalises each gate's
 pre-activation over channels at every place (Ba et al. 2016). A gate that keeps the old state carries a
 fixed +1 inside its sigmoid, so that a fresh cell remembers: it passes on 1 − σ(1) = 27 % of what is new,
@@ -24,6 +25,9 @@ from brainbench.models._layers import Conv2d, pair
 from brainbench.models._tnn_state import load_named
 
 FORGET_BIAS = 1.0
+
+Projected = tuple[torch.Tensor, ...]
+"""What :meth:`Cell.project` gives, one step of it."""
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -67,6 +71,14 @@ class Cell(nn.Module):
         like = next(self.parameters())
         shape = (batch, self.state_factor * self.out_channels, *spatial)
         return torch.zeros(shape, device=device or like.device, dtype=dtype or like.dtype)
+
+    def project(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return what the input alone adds to the gates, for any number of inputs [N, C, H, W] at once.
+
+        ``forward(x, state, projected)`` then computes the recurrence only. A cell without gates has nothing to add.
+        """
+        del x
+        return ()
 
     def load_tnn_state(self, state: Mapping[str, Any]) -> None:
         """Load arrays or tensors under PyTorchTNN's parameter names, such as ``conv.weight``.
@@ -124,8 +136,11 @@ class TimeDecay(Cell):
         self.tau = nn.Parameter(torch.tensor(float(tau)))
         self.norm = ChannelNorm(out_channels) if layer_norm else nn.Identity()
 
-    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, C, ...]."""
+        del projected
         state = x + self.tau * self._check(x, state)
         return self.norm(state), state
 
@@ -146,9 +161,18 @@ class _GatedCell(Cell):
         size = pair(kernel_size, "kernel size of a cell")
         return Conv2d(self.in_channels + self.out_channels, gates * self.out_channels, kernel_size=size, gain=1.0)
 
-    def _gates(self, x: torch.Tensor, memory: torch.Tensor) -> list[torch.Tensor]:
+    def project(self, x: torch.Tensor) -> Projected:
+        """Return the input's share of the fused convolution, biases included, for inputs [N, C, H, W]."""
+        return (self.conv.share(x, 0, use_bias=True),)
+
+    def _gates(self, x: torch.Tensor, memory: torch.Tensor, projected: Projected) -> list[torch.Tensor]:
         """Return each gate's pre-activation [B, out, H, W] in the order of :attr:`gates`."""
-        return self._normalised(self.conv(torch.cat((x, memory), 1)), self.gates)
+        return self._normalised(self._fused(self.conv, x, memory, projected[:1]), self.gates)
+
+    def _fused(self, conv: Conv2d, x: torch.Tensor, memory: torch.Tensor, projected: Projected) -> torch.Tensor:
+        if projected:
+            return projected[0] + conv.share(memory, self.in_channels, use_bias=False)
+        return conv(torch.cat((x, memory), 1))
 
     def _normalised(self, fused: torch.Tensor, names: tuple[str, ...]) -> list[torch.Tensor]:
         parts = fused.chunk(len(names), 1)
@@ -163,10 +187,12 @@ class UGRNN(_GatedCell):
     gates = ("g", "c")
     tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv", "norms.g": "ln_g_act", "norms.c": "ln_c_act"}
 
-    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, out, H, W]."""
         state = self._check(x, state)
-        keep, candidate = self._gates(x, state)
+        keep, candidate = self._gates(x, state, projected)
         keep = torch.sigmoid(keep + FORGET_BIAS)
         state = keep * state + (1 - keep) * torch.tanh(candidate)
         return state, state
@@ -191,10 +217,12 @@ class IntersectionRNN(_GatedCell):
             )
         super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
 
-    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, out, H, W]."""
         state = self._check(x, state)
-        keep, candidate, through, output = self._gates(x, state)
+        keep, candidate, through, output = self._gates(x, state, projected)
         keep = torch.sigmoid(keep + FORGET_BIAS)
         through = torch.sigmoid(through + FORGET_BIAS)
         y = through * x + (1 - through) * torch.relu(output)
@@ -225,12 +253,19 @@ class GRU(_GatedCell):
         if layer_norm:
             self.norms["c"] = ChannelNorm(out_channels)
 
-    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def project(self, x: torch.Tensor) -> Projected:
+        """Return the input's shares of both convolutions, biases included, for inputs [N, C, H, W]."""
+        return self.conv.share(x, 0, use_bias=True), self.candidate.share(x, 0, use_bias=True)
+
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, out, H, W]."""
         state = self._check(x, state)
-        reset, keep = self._gates(x, state)
+        reset, keep = self._gates(x, state, projected)
         reset, keep = torch.sigmoid(reset + FORGET_BIAS), torch.sigmoid(keep)
-        (candidate,) = self._normalised(self.candidate(torch.cat((x, reset * state), 1)), ("c",))
+        fused = self._fused(self.candidate, x, reset * state, projected[1:])
+        (candidate,) = self._normalised(fused, ("c",))
         state = keep * state + (1 - keep) * torch.tanh(candidate)
         return state, state
 
@@ -259,10 +294,12 @@ class LSTM(_GatedCell):
         if layer_norm:
             self.norms["c"] = ChannelNorm(out_channels)
 
-    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y [B, out, H, W], state [B, 2 out, H, W])."""
         memory, hidden = self._check(x, state).chunk(2, 1)
-        write, candidate, keep, read = self._gates(x, hidden)
+        write, candidate, keep, read = self._gates(x, hidden, projected)
         memory = memory * torch.sigmoid(keep + FORGET_BIAS) + torch.sigmoid(write) * torch.tanh(candidate)
         (memory,) = self._normalised(memory, ("c",))
         hidden = torch.tanh(memory) * torch.sigmoid(read)

@@ -144,6 +144,8 @@ class EAD(nn.Module):
         Raises:
             UsageError: as for :meth:`forward`.
         """
+        if last and self.attender is None and isinstance(self.encoder, TemporalGraph):
+            return self.encoder(self._normalise(x), **self._unroll, last=True)
         features = self.encoder(self._normalise(x), **self._unroll)
         features = features if self.attender is None else self.attender(features)
         return features[:, -1] if last else features

@@ -24,6 +24,7 @@ from brainbench.models._layers import Conv2d, Linear
 from brainbench.models._node import NodeModule
 from brainbench.models._tnn_config import read_graph
 from brainbench.models._tnn_state import check_named, copy_named
+from brainbench.models._unrolling import delays, needed_steps
 from brainbench.models.graph_spec import GraphSpec, Shape, Unroll, check_unroll
 
 _log = logging.getLogger(__name__)
@@ -249,16 +250,23 @@ class TemporalGraph(nn.Module):
         x: torch.Tensor,
         unroll: Unroll = "biological",
         return_activations: bool | Collection[str] = False,
+        *,
+        last: bool = False,
     ) -> Any:
         """Process a sweep [B, T, C, H, W].
+
+        Only what the answer reads is computed and kept: steps whose effect comes too late are left out, and steps that
+        the stimulus has not reached are computed for one stimulus and shared.
 
         Args:
             x: The sweep.
             unroll: ``biological`` or ``full``.
             return_activations: True for every node, or the names of the nodes wanted.
+            last: Return the output of the last step alone.
 
         Returns:
-            The outputs [B, T, ...], and with ``return_activations`` also ``{node: [B, T, ...]}``.
+            The outputs [B, T, ...] or, with ``last``, [B, ...]; with ``return_activations`` also
+            ``{node: [B, T, ...]}``.
 
         Raises:
             UsageError: the shape does not fit, or a node or unrolling does not exist.
@@ -270,19 +278,18 @@ class TemporalGraph(nn.Module):
                 f"A temporal graph expects [batch, time, channels, rows, columns]; received {list(x.shape)}."
             )
         self._accept(tuple(x.shape[2:]))
-        kept: dict[str, torch.Tensor] = {}
-        for position, group in enumerate(self._groups):
-            later = {name for other in self._groups[position + 1 :] for name in other}
-            needed = {e.source for name in later for e in self._predecessors[name]} | wanted | {self.spec.output}
-            cyclic = any(edge.source in group for name in group for edge in self._predecessors[name])
-            compute = self._compute_loop if cyclic else self._compute_sweep
-            kept.update(compute(group, x, kept, unroll, needed))
-            for name in [name for name in kept if name not in needed]:
-                del kept[name]
-        output = kept[self.spec.output]
+        if x.is_cuda:
+            # Tensor cores and norms over channels both want channels innermost.
+            x = x.flatten(0, 1).to(memory_format=torch.channels_last).unflatten(0, x.shape[:2])
+        output = self.spec.output
+        whole, final = (wanted, {output}) if last else (wanted | {output}, set())
+        pass_ = _Pass(self, x, unroll, needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final))
+        kept = pass_.run(whole | final)
+        y = kept[output][1]
+        y = y[:, -1] if last else y
         if return_activations is False:
-            return output
-        return output, {name: kept[name] for name in self.layers if name in wanted}
+            return y
+        return y, {name: kept[name][1] for name in self.layers if name in wanted}
 
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{node: [B, T, ...]}`` of the biological unrolling for the nodes asked for (all by default)."""
@@ -296,62 +303,10 @@ class TemporalGraph(nn.Module):
                 raise unknown_name("node", name, self.layers)
         return set(return_activations)
 
-    def _compute_sweep(
-        self,
-        group: tuple[str, ...],
-        x: torch.Tensor,
-        kept: Mapping[str, torch.Tensor],
-        unroll: Unroll,
-        needed: Collection[str],
-    ) -> dict[str, torch.Tensor]:
-        """Compute a node outside every loop for all steps at once, which reads its weights once."""
-        del needed
-        (name,) = group
-        node, (batch, steps) = self.node(name), x.shape[:2]
-        inputs = [x.flatten(0, 1)] if name in self.spec.inputs else []
-        for edge in self._predecessors[name]:
-            source = kept[edge.source]
-            if unroll == "biological" or edge.feedback:
-                source = torch.cat((torch.zeros_like(source[:, :1]), source[:, :-1]), 1)
-            inputs.append(source.flatten(0, 1))
-        y = node.operate(inputs)
-        if node.memory is not None:
-            sequence, state, outputs = y.unflatten(0, (batch, steps)), None, []
-            for t in range(steps):
-                output, state = node.memory(sequence[:, t], state)
-                outputs.append(output)
-            y = torch.stack(outputs, 1).flatten(0, 1)
-        return {name: node.after(y).unflatten(0, (batch, steps))}
-
-    def _compute_loop(
-        self,
-        group: tuple[str, ...],
-        x: torch.Tensor,
-        kept: Mapping[str, torch.Tensor],
-        unroll: Unroll,
-        needed: Collection[str],
-    ) -> dict[str, torch.Tensor]:
-        """Compute nodes that feed back on one another step by step; keep the outputs that are needed."""
-        batch, steps = x.shape[:2]
-        previous = {name: x.new_zeros(batch, *self._shapes[name]) for name in group}
-        memories: dict[str, torch.Tensor] = {}
-        history: dict[str, list[torch.Tensor]] = {name: [] for name in group if name in needed}
-        for t in range(steps):
-            current: dict[str, torch.Tensor] = {}
-            for name in group:
-                inputs = [x[:, t]] if name in self.spec.inputs else []
-                for edge in self._predecessors[name]:
-                    delayed = unroll == "biological" or edge.feedback
-                    if edge.source in previous:
-                        inputs.append((previous if delayed else current)[edge.source])
-                        continue
-                    source, at = kept[edge.source], t - delayed
-                    inputs.append(source[:, at] if at >= 0 else torch.zeros_like(source[:, 0]))
-                current[name] = self._advance(name, self.node(name).operate(inputs), memories, memories)
-            previous = current
-            for name, outputs in history.items():
-                outputs.append(current[name])
-        return {name: torch.stack(outputs, 1) for name, outputs in history.items()}
+    @property
+    def _draws(self) -> bool:
+        """Whether nodes draw random numbers, which every stimulus then needs for itself."""
+        return self.training and any(node.dropout.p > 0 for _, node in self._items())
 
     def _items(self) -> list[tuple[str, NodeModule]]:
         return [(name, self.node(name)) for name in self.layers]
@@ -359,3 +314,100 @@ class TemporalGraph(nn.Module):
 
 def _tnn_owner(name: str, node: NodeModule) -> str:
     return f"{name}._pre_memory.{'lin' if isinstance(node.operation, Linear) else 'conv'}"
+
+
+class _Pass:
+    """One sweep through a graph. Kept outputs are (first step, [B, steps, ...])."""
+
+    def __init__(
+        self, graph: TemporalGraph, x: torch.Tensor, unroll: Unroll, steps: Mapping[str, tuple[int, int]]
+    ) -> None:
+        self.graph, self.x, self.steps = graph, x, steps
+        self.batch = len(x)
+        self.delay = delays(graph.spec, unroll)
+        self.arrival = dict.fromkeys(graph.layers, 0) if graph._draws else graph.spec.first_response(unroll)
+        self.kept: dict[str, tuple[int, torch.Tensor]] = {}
+
+    def run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
+        """Compute every group of nodes in turn; drop what no later one reads."""
+        groups = self.graph._groups
+        for position, group in enumerate(groups):
+            later = {name for other in groups[position + 1 :] for name in other}
+            read = {e.source for name in later for e in self.graph._predecessors[name]} | set(wanted)
+            cyclic = any(edge.source in group for name in group for edge in self.graph._predecessors[name])
+            if cyclic:
+                self._loop(group, read)
+            elif self.steps[group[0]][1]:
+                self._sweep(group[0])
+            for name in [name for name in self.kept if name not in read]:
+                del self.kept[name]
+        return self.kept
+
+    def _window(self, source: str, first: int, stop: int) -> torch.Tensor:
+        """Return the outputs of a node at steps first to stop [B, stop − first, ...]; before its first step, zeros."""
+        start, values = self.kept.get(source, (0, self.x.new_zeros(self.batch, 0, *self.graph._shapes[source])))
+        missing = max(0, -first)
+        part = values[:, max(first, 0) - start : max(stop, 0) - start]
+        if not missing:
+            return part
+        return torch.cat((part.new_zeros(self.batch, min(missing, stop - first), *values.shape[2:]), part), 1)
+
+    def _sweep(self, name: str) -> None:
+        """Compute a node outside every loop: all steps at once, but for its recurrence."""
+        graph = self.graph
+        node, (first, stop) = graph.node(name), self.steps[name]
+        count = stop - first
+        inputs = [self.x[:, first:stop].flatten(0, 1)] if name in graph.spec.inputs else []
+        for edge in graph._predecessors[name]:
+            lag = self.delay[edge.source, name]
+            inputs.append(self._window(edge.source, first - lag, stop - lag).flatten(0, 1))
+        y = node.operate(inputs)
+        if node.memory is not None:
+            projected = node.memory.project(y)
+            rows = [part.unflatten(0, (self.batch, count)) for part in (y, *projected)]
+            state, outputs = None, []
+            for t in range(count):
+                x, *shares = (row[:, t] for row in rows)
+                output, state = node.memory(x, state, tuple(shares))
+                outputs.append(output)
+            y = torch.stack(outputs, 1).flatten(0, 1)
+        self.kept[name] = first, node.after(y).unflatten(0, (self.batch, count))
+
+    def _loop(self, group: tuple[str, ...], read: Collection[str]) -> None:
+        """Compute nodes that feed back on one another step by step."""
+        graph = self.graph
+        previous = {name: self.x.new_zeros(1, *graph._shapes[name]) for name in group}
+        memories: dict[str, torch.Tensor] = {}
+        history: dict[str, list[torch.Tensor]] = {name: [] for name in group if name in read}
+        for t in range(max(self.steps[name][1] for name in group)):
+            current: dict[str, torch.Tensor] = {}
+            for name in group:
+                if t >= self.steps[name][1]:
+                    continue
+                # What the stimulus has not reached yet is the same for all: one row stands for the batch.
+                rows = self.batch if t >= self.arrival[name] else 1
+                inputs = [_rows(self.x[:, t], rows)] if name in graph.spec.inputs else []
+                for edge in graph._predecessors[name]:
+                    lag = self.delay[edge.source, name]
+                    if edge.source in previous:
+                        value = (previous if lag else current)[edge.source]
+                    else:
+                        value = self._window(edge.source, t - lag, t - lag + 1)[:, 0]
+                    inputs.append(_rows(value, rows))
+                if name in memories:
+                    memories[name] = _rows(memories[name], rows)
+                current[name] = graph._advance(name, graph.node(name).operate(inputs), memories, memories)
+            previous = {**previous, **current}
+            for name, outputs in history.items():
+                if name in current:
+                    outputs.append(current[name])
+        for name, outputs in history.items():
+            if outputs:
+                self.kept[name] = 0, torch.stack([_rows(output, self.batch) for output in outputs], 1)
+
+
+def _rows(values: torch.Tensor, rows: int) -> torch.Tensor:
+    """Give one row to all, or take one of rows that are equal."""
+    if len(values) == rows:
+        return values
+    return values[:1].expand(rows, *values.shape[1:])

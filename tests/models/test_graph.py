@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 import json
 import logging
 
@@ -225,3 +226,45 @@ def test_a_step_with_time_is_refused():
     graph = _small()
     with pytest.raises(UsageError, match=r"A step expects \[batch, channels, rows, columns\]"):
         graph.step(torch.zeros(1, 1, 30, 5, 7), graph.init_state(1))
+
+
+@pytest.mark.parametrize("unroll", UNROLLS)
+@pytest.mark.parametrize("cell", ["time-decay", "gru", "intersection"])
+@pytest.mark.parametrize("steps", [1, 2, 3, 4, 5, 9])
+def test_the_last_answer_alone_equals_the_last_of_all(cell, unroll, steps):
+    graph, x = _small(cell), torch.randn(2, steps, 30, 5, 7)
+    with torch.no_grad():
+        every = graph(x, unroll=unroll)
+        torch.testing.assert_close(graph(x, unroll=unroll, last=True), every[:, -1], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("spec", [ZhuangEncoder("lstm", True, True).spec(), _uneven()], ids=["zhuang", "uneven"])
+@pytest.mark.parametrize("last", [False, True])
+def test_gradients_are_those_of_streaming_step_by_step(spec, last):
+    graph = TemporalGraph(spec).double()
+    x = torch.randn(3, 9, *spec.input_shape, dtype=torch.float64)
+    weights = torch.randn(9, dtype=torch.float64)
+    weights[:-1] *= not last
+    state, outputs = graph.init_state(3), []
+    for t in range(9):
+        y, state = graph.step(x[:, t], state)
+        outputs.append(y)
+    (torch.stack(outputs, 1) * weights[:, None]).square().sum().backward()
+    expected = {name: value.grad.clone() for name, value in graph.named_parameters()}
+    graph.zero_grad()
+    y = graph(x, last=True)[:, None] * weights[-1] if last else graph(x) * weights[:, None]
+    y.square().sum().backward()
+    for name, value in graph.named_parameters():
+        torch.testing.assert_close(value.grad, expected[name], msg=name)
+
+
+def test_a_node_that_draws_random_numbers_draws_them_for_every_stimulus():
+    spec = ZhuangEncoder("ugrnn", small=True).spec()
+    nodes = tuple(
+        dataclasses.replace(node, operation=dataclasses.replace(node.operation, dropout=0.5)) for node in spec.nodes
+    )
+    graph = TemporalGraph(dataclasses.replace(spec, nodes=nodes)).train()
+    graph.node("conv6").operation.bias.data.fill_(1.0)
+    with torch.no_grad():
+        y = graph(torch.zeros(4, 3, 30, 5, 7), return_activations=("fc7",))[1]["fc7"]
+    assert not torch.equal(y[0], y[1])

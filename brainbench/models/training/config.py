@@ -14,7 +14,7 @@ from brainbench.models.checkpoints import DTYPES
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, Setting, recipe_for
 
 PRECISIONS = ("float32", "bf16")
-COMPILE = ("off", "default", "graphs")
+COMPILE = ("off", "parts", "default", "graphs")
 AUGMENTATIONS = ("none", "physical", "thesis", "image")
 
 
@@ -44,7 +44,8 @@ class TrainingConfig:
     precision: str = "bf16"
     """``float32``, or ``bf16``: mixed precision with float32 weights."""
     compile: str = "off"
-    """``off``, ``default`` (torch.compile) or ``graphs`` (torch.compile with CUDA graphs)."""
+    """``off``, ``parts`` (torch.compile of cells and blocks, each once: quick to compile), ``default`` (of the whole
+    unrolled step) or ``graphs`` (the same with CUDA graphs)."""
     clip: float = 1.0
     """Largest norm of the gradient; 0 leaves it alone."""
     probe_epochs: int = 100

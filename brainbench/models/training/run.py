@@ -22,8 +22,13 @@ import torch
 from brainbench.errors import DataError, UsageError
 from brainbench.files import read_json, write_json
 from brainbench.models._seeding import seeded
+from brainbench.models.attenders.gpt import GPTBlock
+from brainbench.models.attenders.mamba import MambaBlock
 from brainbench.models.augment import Augmentation
+from brainbench.models.cells import Cell
 from brainbench.models.checkpoints import WEIGHTS, load_weights, save_checkpoint
+from brainbench.models.encoders.resnet import BasicBlock
+from brainbench.models.encoders.s4 import S4Block
 from brainbench.models.evaluation import Evaluation, evaluate
 from brainbench.models.extract import evaluating
 from brainbench.models.objectives import make_learner
@@ -42,6 +47,8 @@ _log = logging.getLogger(__name__)
 
 RUN, STATE, BEST, FAILED = "run.json", "state.safetensors", "best", "failed-batch.safetensors"
 _LOG_STEPS = 50
+PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)
+"""What is compiled on its own: called at every step or block, with few shapes."""
 
 
 @dataclass(frozen=True)
@@ -365,14 +372,24 @@ class _Run:
         )
 
     def _compiled(self, module: torch.nn.Module) -> Any:
-        if self.config.compile == "off":
-            return module
-        return torch.compile(module, mode="reduce-overhead" if self.config.compile == "graphs" else "default")
+        return compiled(module, self.config.compile)
 
     def _precision(self) -> Any:
         if self.config.precision == "float32":
             return nullcontext()
         return torch.autocast(self.where.device.type, dtype=torch.bfloat16)
+
+
+def compiled(module: torch.nn.Module, how: str) -> Any:
+    """Return a module compiled in one of the ways of :data:`~brainbench.models.training.config.COMPILE`."""
+    if how == "off":
+        return module
+    if how == "parts":
+        for part in module.modules():
+            if isinstance(part, PARTS):
+                part.compile()
+        return module
+    return torch.compile(module, mode="reduce-overhead" if how == "graphs" else "default")
 
 
 def _generator(seed: int, step: int, view: int) -> torch.Generator:

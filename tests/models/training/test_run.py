@@ -219,7 +219,8 @@ def test_two_processes_train_as_one(tmp_path):
 # PyTorch's compiler uses a part of PyTorch that PyTorch has deprecated.
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
 @pytest.mark.slow
-def test_a_compiled_run_learns_too(tmp_path):
-    result = train(_config(epochs=4, compile="default", model="zhuang-small"), tiny(), out=tmp_path, device="cpu")
+@pytest.mark.parametrize("how", ["parts", "default"])
+def test_a_compiled_run_learns_too(how, tmp_path):
+    result = train(_config(epochs=4, compile=how, model="zhuang-small"), tiny(), out=tmp_path, device="cpu")
     assert result.status == "finished"
     assert result.evaluation.top1 > 0.5
