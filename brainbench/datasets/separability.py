@@ -37,7 +37,7 @@ class Separability:
     accuracy: float
     """Mean over the classes of each choice, then over the choices."""
     interval: Interval
-    """From resampling the objects of every class."""
+    """From resampling the objects of every class; binomial where all objects are right."""
     chance: float
     """1 / count."""
     choices: tuple[tuple[str, ...], ...]
@@ -67,9 +67,9 @@ def separability(
     """Tell classes apart by the forces and moments of all whiskers.
 
     A sweep's features are its forces and moments averaged over steps of five frames, all whiskers side by side,
-    divided by the root mean square of each channel; the machine is an SVC with radial kernel (C = 10, its width from the
-    variance of the features, as scikit-learn's ``gamma='scale'``), tested by five-fold cross-validation over objects.
-    Nothing was tuned. Memory grows with the square of the number of sweeps: 10 MB for 1,600.
+    divided by the root mean square of each channel; the machine is an SVC with radial kernel (C = 10, its width from
+    the variance of the features, as scikit-learn's ``gamma='scale'``), tested by five-fold cross-validation over
+    objects. Nothing was tuned. Memory grows with the square of the number of sweeps: 10 MB for 1,600.
 
     Args:
         data: the sweeps; ``split='all'`` uses every object.
@@ -246,4 +246,9 @@ def _interval(
             counts = np.array([hits[name] for name in members[number]])[drawn[number]].sum(axis=1)
             means += counts[:, 0] / counts[:, 1] / len(choice) / len(choices)
     low, high = np.quantile(means, [0.025, 0.975])
+    if np.ptp(means) == 0 and means[0] in (0.0, 1.0):
+        # Resampling cannot show the doubt that is left when every object is right: the exact bound of n of n does.
+        doubt = 0.025 ** (1 / sum(map(len, members)))
+        low, high = (doubt, 1.0) if means[0] == 1 else (0.0, 1 - doubt)
+        return Interval(low, high, 0.95, "exact binomial (Clopper and Pearson) over objects, which are all alike")
     return Interval(float(low), float(high), 0.95, f"bootstrap over objects within classes, {RESAMPLES} resamples")

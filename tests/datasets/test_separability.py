@@ -69,6 +69,15 @@ def test_the_kernel_is_that_of_scikit_learn():
     np.testing.assert_allclose(_kernel(values), expected, rtol=1e-4)
 
 
+def test_when_every_object_is_right_the_interval_is_that_of_n_of_n():
+    from scipy.stats import binomtest
+
+    found = separate(*_made(by_class=30.0), count=2, names=NAMES)
+    assert found.accuracy == 1
+    exact = binomtest(40, 40).proportion_ci(0.95, method="exact")
+    assert (found.interval.low, found.interval.high) == pytest.approx((exact.low, exact.high))
+
+
 def test_few_objects_make_it_unreliable_and_one_makes_it_impossible():
     found = separate(*_made(objects=3, by_class=3.0), count=2, names=NAMES)
     assert found.status == "unreliable"
