@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,6 +32,15 @@ def test_the_scene_file_of_the_stimuli_page_is_valid(tmp_path: Path):
     path.write_text(block)
     recipe = load_scene(path)
     assert [scene.label for scene in recipe.scenes] == ["near", "far"]
+
+
+def test_the_data_set_of_the_datasets_page_can_be_made_and_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from brainbench.datasets import WhiskingDataset
+
+    monkeypatch.chdir(tmp_path)
+    made: dict[str, Any] = {}
+    exec(compile(_blocks("docs/datasets.md", "python")[0], "docs/datasets.md", "exec"), made)
+    assert made["manifest"]["sweeps"] == WhiskingDataset("mine", split="all").sweeps == 6
 
 
 @pytest.mark.parametrize(
