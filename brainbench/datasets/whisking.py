@@ -373,19 +373,23 @@ class _Buffers:
     """Memory for batches, used again once nobody holds it: fresh memory is slower than copying into it."""
 
     def __init__(self) -> None:
-        self._held: list[NDArray[np.float32]] = []
+        self._held: list[NDArray[np.float32]] = [np.empty(0, np.float32)]
         self._lock = threading.Lock()
+        # Every tensor or view on an array holds a reference more than this.
+        self._free = self._references(0)
 
     def take(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
         """Return an array of ``shape`` with any content that no tensor or view refers to."""
         with self._lock:
             for index in range(len(self._held)):
-                # The list's own reference and the argument's; every tensor on the memory holds another.
-                if self._held[index].shape == shape and sys.getrefcount(self._held[index]) == 2:
+                if self._held[index].shape == shape and self._references(index) == self._free:
                     return self._held[index]
             made = np.empty(shape, np.float32)
             self._held = [*self._held[-_BUFFERS:], made]
             return made
+
+    def _references(self, index: int) -> int:
+        return sys.getrefcount(self._held[index])
 
 
 def _most_open() -> int:
