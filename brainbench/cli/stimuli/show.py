@@ -123,7 +123,8 @@ def _rows(scene: dict[str, Any]) -> list[list[str]]:
         what = (
             f"{' × '.join(_milli(value) for value in size)} mm" if size else f"diagonal {_milli(solid['diagonal'])} mm"
         )
-        notes = [f"{solid['parts']} convex part{'s' if solid['parts'] > 1 else ''}", what]
+        count = solid["parts"]
+        notes = [f"{count} convex part{'s' if count > 1 else ''}" if count else "the triangles of its surface", what]
         notes += [] if friction is None else [f"friction {friction:g}"]
         notes += solid["notes"]
         place = _point(item["position"]), _angles(item["rotation"])
@@ -143,6 +144,10 @@ def _motion(config: dict[str, Any]) -> str:
     if kind == "translation":
         velocity = ", ".join(_milli(value) for value in config["velocity"])
         return f"({velocity}) mm/s, onset {_milli(config['onset'])} ms"
+    if kind == "spin":
+        speed = math.degrees(math.hypot(*config["velocity"]))
+        axis = ", ".join(f"{math.degrees(value):.4g}" for value in config["velocity"])
+        return f"turns by {speed:.4g}°/s about ({axis}), onset {_milli(config['onset'])} ms"
     if kind == "recorded":
         start = f"from azimuth {math.degrees(config['start']):g}°"
         return f"recorded for {config['duration']:g} s, {start}, trajectory {config['trajectory']}"
