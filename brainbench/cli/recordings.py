@@ -1,4 +1,4 @@
-"""``brainbench recordings``: look into files and at what their responses can support."""
+"""``brainbench recordings``: look into files, check and copy them, and see what their responses can support."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _LARGEST_SHOWN = 12
 """RDMs of more conditions are only written as JSON."""
 
-app = typer.Typer(no_args_is_help=True, help="Inspect neural recordings and their reliability.")
+app = typer.Typer(no_args_is_help=True, help="Inspect, check, copy and fetch neural recordings.")
 
 
 @app.command("inspect")

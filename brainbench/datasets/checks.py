@@ -100,10 +100,10 @@ def _check_file(
             message = "holds responses that are already counted; spikes, clock and tables cannot be checked"
             yield Finding("note", "file", path.name, message)
             return
-    for session, found in each_session(path, recipe):
-        name = f"{session.subject} / {session.session}"
-        names.append(name)
-        yield from check_session(session, found, conditions, name)
+        for session, found in each_session(file, path, recipe):
+            name = f"{session.subject} / {session.session}"
+            names.append(name)
+            yield from check_session(session, found, conditions, name)
 
 
 def check_session(

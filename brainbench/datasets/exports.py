@@ -23,6 +23,7 @@ from brainbench.datasets.reading import Source, each_session, find_recordings
 from brainbench.datasets.recipes import resolve_selection
 from brainbench.datasets.selection import EVERYTHING, Selection, Tally
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, Table, as_labels, decode, ragged
+from brainbench.datasets.sources import open_file
 from brainbench.errors import DataError, UsageError, unknown_name
 from brainbench.files import atomic_path
 
@@ -50,11 +51,12 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
     chosen = EVERYTHING if select is None else resolve_selection(select)
     sessions, skipped = [], []
     for path in paths:
-        for session, found in each_session(path, recipe):
-            if chosen.subjects and session.subject not in chosen.subjects:
-                skipped.append(session.subject)
-            elif has_units(session):
-                sessions.append(subset(session, chosen, found.conditions.table if found else "trials"))
+        with open_file(path) as file:
+            for session, found in each_session(file, path, recipe):
+                if chosen.subjects and session.subject not in chosen.subjects:
+                    skipped.append(session.subject)
+                elif has_units(session):
+                    sessions.append(subset(session, chosen, found.conditions.table if found else "trials"))
     if not sessions:
         if skipped:
             raise unknown_name("subject", chosen.subjects[0], sorted(set(skipped)))

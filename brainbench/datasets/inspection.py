@@ -13,9 +13,9 @@ import numpy as np
 from brainbench.datasets import hdf5
 from brainbench.datasets._extract import has_units, no_units, read_spikes, recorded_span
 from brainbench.datasets.proposals import EXAMPLES, ColumnSummary, Proposal, propose, summarise_columns
-from brainbench.datasets.recipes import detect_recipe
+from brainbench.datasets.reading import each_session
 from brainbench.datasets.sessions import SPIKES, Session, Table, natural_order
-from brainbench.datasets.sources import find_files, open_file, read_file
+from brainbench.datasets.sources import find_files, open_file
 from brainbench.errors import DataError
 from brainbench.files import to_json
 
@@ -126,9 +126,7 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
         with open_file(file_path) as file:
             if hdf5.is_ours(file) and hdf5.read_kind(file, file_path) == "counts":
                 return _counted(hdf5.read_counts(file, file_path), file_path)
-            for session in read_file(file, file_path):
-                found = detect_recipe(session)
-                session = session if found is None else found.adapted(session)
+            for session, found in each_session(file, file_path):
                 recipes[found.name if found else None] = None
                 formats[session.format] = None
                 own = propose([session])

@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from brainbench.datasets.recipes import Recipe, detect_recipe, get_recipe, split_source
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.sources import find_files, open_file, read_file
+from brainbench.datasets.sources import find_files, read_file
+
+if TYPE_CHECKING:
+    import h5py
 
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A file, a folder, a glob, a list of these, or ``RECIPE:PATH``."""
@@ -27,15 +31,15 @@ def find_recordings(source: Source) -> tuple[Recipe | None, list[Path]]:
     return (get_recipe(name) if name else None), find_files(rest)
 
 
-def each_session(path: Path, recipe: Recipe | None = None) -> Iterator[tuple[Session, Recipe | None]]:
-    """Yield the sessions of a file with the recipe that fits each: the given one, else by its layout.
+def each_session(file: h5py.File, path: Path, recipe: Recipe | None = None) -> Iterator[tuple[Session, Recipe | None]]:
+    """Yield the sessions of an open file with the recipe that fits each: the given one, else by its layout.
 
-    A session comes as its recipe adapts it, and is valid until the next one is asked for.
+    A session comes as its recipe adapts it. Read it while the file is open, inside the block of
+    :func:`~brainbench.datasets.sources.open_file`, which names the file if reading fails.
 
     Raises:
         DataError: the file cannot be read; see :func:`~brainbench.datasets.sources.read_file`.
     """
-    with open_file(path) as file:
-        for session in read_file(file, path):
-            found = recipe or detect_recipe(session)
-            yield (session if found is None else found.adapted(session)), found
+    for session in read_file(file, path):
+        found = recipe or detect_recipe(session)
+        yield (session if found is None else found.adapted(session)), found

@@ -103,17 +103,18 @@ class _Reader:
 
     def read(self, path: Path) -> None:
         """Read the sessions of one file."""
-        for session, found in each_session(path, self.recipe if self.named else None):
-            if not has_units(session):
-                self.skipped.append(no_units(session))
-                continue
-            self._once(session)
-            plan = self._plan(session, found)
-            if plan.selection.subjects and session.subject not in plan.selection.subjects:
-                self.other_subjects.append(session.subject)
-                continue
-            self.notes += session.notes
-            self.parts.append(extract(session, plan))
+        with open_file(path) as file:
+            for session, found in each_session(file, path, self.recipe if self.named else None):
+                if not has_units(session):
+                    self.skipped.append(no_units(session))
+                    continue
+                self._once(session)
+                plan = self._plan(session, found)
+                if plan.selection.subjects and session.subject not in plan.selection.subjects:
+                    self.other_subjects.append(session.subject)
+                    continue
+                self.notes += session.notes
+                self.parts.append(extract(session, plan))
 
     def _once(self, session: Session) -> None:
         keys = [("subject and session", session.subject, session.session)]

@@ -10,6 +10,7 @@ from brainbench.datasets._check_spikes import coincidences
 from brainbench.datasets.exports import subset
 from brainbench.datasets.reading import each_session
 from brainbench.datasets.sessions import SPIKES, Table, ragged
+from brainbench.datasets.sources import open_file
 from brainbench.datasets.synthetic import Design, Geometry, make_sessions, write_files
 from brainbench.errors import DataFileNotFoundError, UsageError
 
@@ -83,7 +84,9 @@ def test_weakly_tuned_neurons_of_the_demo_keep_a_clock_that_can_be_judged(demo_f
 
 @pytest.mark.parametrize("shift", [10.0, -25.0])
 def test_a_shifted_demo_session_is_caught(demo_files, tmp_path, shift):
-    for session, _ in each_session(sorted(demo_files.glob("*.nwb"))[0]):
+    path = sorted(demo_files.glob("*.nwb"))[0]
+    with open_file(path) as file:
+        ((session, _),) = each_session(file, path)
         copied = subset(session)
     session = with_spikes(copied, lambda spikes: [times + shift for times in spikes])
     items, _ = examine(tmp_path, session, "clock", "error")
@@ -114,6 +117,27 @@ def test_a_clock_without_touch_or_without_an_answer_is_not_called_right(tmp_path
     _, text = examine(tmp_path, short, "clock", "warning")
     assert text.startswith("12 touches near the recording and")
     assert "too few" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("units", [3, 30])
+def test_in_sixty_sessions_no_clock_is_misjudged(units):
+    """Over-dispersed, drifting neurons; the shifts include one within the rhythm of touches."""
+    from brainbench.datasets._check_clock import check_clock
+    from brainbench.datasets._extract import read_spikes
+
+    random = np.random.default_rng(0)
+    design = Design(animals=1, units=units, trials=12, dispersion=0.3, shared_gain=0.3, drift=-0.3)
+    for seed in range(30):
+        (session,) = make_sessions(GEOMETRY, design, seed=seed)
+        spikes = read_spikes(session.units, [])
+        for shift in (0.0, 10.0, -3.0, 0.3):
+            (finding,) = check_clock(session, [times + shift for times in spikes], None, "")
+            assert finding.severity == ("error" if shift else "note"), finding
+            assert finding.values["lag"] == pytest.approx(shift, abs=0.05)
+        noise = [np.sort(random.uniform(0, times[-1], len(times))) for times in spikes]
+        (finding,) = check_clock(session, noise, None, "")
+        assert finding.severity == "warning", finding
 
 
 # Units

@@ -5,12 +5,25 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from brainbench.datasets import Selection, Session, make_session, open_recordings, write_recordings
+from brainbench.datasets import (
+    Selection,
+    Session,
+    check,
+    export,
+    inspect,
+    make_session,
+    open_recordings,
+    write_recordings,
+)
 from brainbench.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.types import check_recordings
 
 from .fakes import make_simple_session
 from .test_nwb import write_nwb
+
+
+def export_to(path):
+    return export(path, path.with_name("copy.h5"))
 
 
 def write(path, made=None, **options):
@@ -225,6 +238,19 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=message):
             open_recordings(tmp_path / name, conditions="trials:stimulus")
+
+
+@pytest.mark.parametrize("use", [lambda path: open_recordings(path, conditions="trials:stimulus"), inspect, export_to])
+def test_damage_inside_a_file_names_the_file(tmp_path, use):
+    path = write(tmp_path / "a.h5")
+    with h5py.File(path) as file:
+        chunk = file["sessions/mouse-1/units/spike_times"].id.get_chunk_info(0)
+    with path.open("r+b") as stream:
+        stream.seek(chunk.byte_offset)
+        stream.write(bytes(chunk.size))
+    with pytest.raises(DataError, match=r"a\.h5 cannot be read, it seems damaged"):
+        use(path)
+    assert "seems damaged" in check(path).findings[0].message
 
 
 def test_foreign_hdf5_is_refused_with_what_it_holds(tmp_path):
