@@ -116,6 +116,13 @@ def score(
     emit(data, f"{_text(record)}\n\nrecord  {path}\nreport  {report}", as_json=as_json)
 
 
+def _alike(record: ResultRecord, animals: Score) -> str:
+    """Test the score against the animals' own consistency (NeuroAI Turing test)."""
+    from brainbench.metrics import turing_test
+
+    return turing_test(record.score, animals).summary()
+
+
 def _explain_splits(path: Path, *, as_json: bool) -> None:
     """Print the walk through stored split halves."""
     import numpy as np
@@ -185,6 +192,8 @@ def _text(record: ResultRecord) -> str:
         [name, f"{_number(item.value)} {_interval(item)}", item.status] for name, item in others if item is not None
     ]
     text = "\n".join(lines) + "\n\n" + table("", ["", "", ""], facts)
+    if record.animal_to_animal is not None and score.estimator == "default":
+        text += f"\n\nAs much like the animals as they are like one another? {_alike(record, record.animal_to_animal)}"
     if walk := score.provenance.get("statistics", {}).get("estimator_walk"):
         text += f"\n\n{_walk(walk)}"
     if rows:

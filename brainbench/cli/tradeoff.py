@@ -93,3 +93,35 @@ def whisker(
         columns = ["error", "processor s / whisker-s", "collision", "pieces", "links", "step ms", "backend", "note"]
         text += "\n\n" + table("whisking into the hollow of a concave object:", columns, rows, right=(0, 1, 3, 4, 5))
     emit({"points": points, "front": best, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)
+
+
+@app.command("score")
+def score(
+    animals: Annotated[int, typer.Option(help="Synthetic animals.")] = 4,
+    units: Annotated[int, typer.Option(help="Units of each.")] = 40,
+    trials: Annotated[int, typer.Option(help="Trials of each stimulus.")] = 20,
+    repeats: Annotated[int, typer.Option(help="Seeds per setting; their spread is the error.")] = 8,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure the Monte-Carlo error of a score against its time: split halves, bootstrap draws, permutations."""
+    from brainbench.metrics.tradeoff import measure_tradeoff
+
+    with progress_bar() as progress:
+        points = measure_tradeoff(animals=animals, units=units, trials=trials, repeats=repeats, progress=progress)
+    rows = [
+        [
+            point.quantity.replace("_", " "),
+            f"{point.count:,}" + ("  (default)" if point.default else ""),
+            f"{point.error:.2g}",
+            point.of,
+            f"{point.seconds:.2f}",
+        ]
+        for point in points
+    ]
+    text = table(
+        f"{animals} animals, {units} units, {trials} trials per stimulus; standard deviation over {repeats} seeds",
+        ["quantity", "number", "error", "of", "s"],
+        rows,
+        right=(2, 4),
+    )
+    emit({"points": points}, text, as_json=as_json)

@@ -97,7 +97,7 @@ def split_half(
     comparison: str = "pearson",
     splits: int = SPLITS,
     seed: int = 0,
-    noise: str = "shrinkage_diag",
+    noise: str = "diag",
     draws: int = 0,
     draw_splits: int = DRAW_SPLITS,
 ) -> SplitHalf:
@@ -114,8 +114,9 @@ def split_half(
         comparison: Comparison between the halves' RDMs, see :func:`brainbench.metrics.compare`.
         splits: Number S of random splits.
         seed: Seed of the splits and draws.
-        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``, see
-            :func:`brainbench.metrics.noise_precision`.
+        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``: ``diag``, ``none`` or another of
+            :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave crossnobis
+            unbiased; shrinkage leaves a bias of up to .01 per unit (docs/statistics.md).
         draws: Number D of bootstrap draws (sessions, then trials within them); fewer where their RDMs
             would not fit in 256 MiB.
         draw_splits: Split halves within each draw.

@@ -61,7 +61,7 @@ def subject_rdm(
     comparison: str = "pearson",
     splits: int = SPLITS,
     seed: int = 0,
-    noise: str = "shrinkage_diag",
+    noise: str = "diag",
     draws: int = 0,
     draw_splits: int = DRAW_SPLITS,
 ) -> SubjectRDM:

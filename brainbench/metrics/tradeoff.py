@@ -1,0 +1,151 @@
+"""Monte-Carlo error of a score against its time: splits, bootstrap draws and permutations.
+
+Each setting is repeated with other seeds on the same synthetic animals; what varies is the error that
+a larger number would take away. At the defaults the error of a score is near .0002, that of an
+interval's end near .006 and that of a p of .05 near .0025: far below what the number of animals leaves
+open. Fewer splits would do, but they are the cheapest of the three.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from brainbench.metrics._pairs import Floats, permuted_pairs
+from brainbench.metrics.bootstrap import bootstrap_score
+from brainbench.metrics.compare import compare
+from brainbench.metrics.rdm import rdm
+from brainbench.metrics.reliability import TrialBlock
+from brainbench.metrics.score import score_rdms
+from brainbench.metrics.subject import SubjectRDM, subject_rdm
+from brainbench.types import Progress
+
+SPLITS = (10, 30, 100, 300, 1000, 3000)
+DRAWS = (30, 100, 300, 1000, 3000)
+DRAW_SPLITS = (1, 5, 20, 60)
+PERMUTATIONS = (100, 1000, 10_000)
+REPEATS = 8
+
+_STIMULI = 12
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting."""
+
+    quantity: str
+    """``splits``, ``draws``, ``draw_splits`` or ``permutations``."""
+    count: int
+    error: float
+    """Standard deviation over seeds, of what :attr:`of` names."""
+    of: str
+    seconds: float
+    """Median time for all animals."""
+    default: bool
+
+
+def measure_tradeoff(
+    *,
+    animals: int = 4,
+    units: int = 40,
+    trials: int = 20,
+    noise: float = 3.0,
+    splits: Sequence[int] = SPLITS,
+    draws: Sequence[int] = DRAWS,
+    draw_splits: Sequence[int] = DRAW_SPLITS,
+    permutations: Sequence[int] = PERMUTATIONS,
+    repeats: int = REPEATS,
+    progress: Progress | None = None,
+) -> tuple[Point, ...]:
+    """Measure Monte-Carlo error and time of each number, the others at their defaults.
+
+    Args:
+        animals: Synthetic animals of one geometry, six stimuli.
+        units: Units of each.
+        trials: Trials of each stimulus.
+        noise: Standard deviation of trial noise relative to tuning of variance 4.
+        splits: Numbers of split halves.
+        draws: Numbers of bootstrap draws.
+        draw_splits: Split halves within each draw.
+        permutations: Random orders of the stimuli (for more than eight stimuli).
+        repeats: Seeds per setting, at least 2.
+        progress: Called with (done, total, what).
+
+    Raises:
+        UsageError: fewer than two repeats, or numbers that are not positive.
+    """
+    if repeats < 2 or min(*splits, *draws, *draw_splits, *permutations, animals, units, trials) < 1:
+        raise UsageError("A trade-off needs at least 2 repeats and positive numbers.")
+    blocks, layer = _data(animals, units, trials, noise)
+
+    def subjects(seed: int, splits: int, draws: int = 0, inner: int = 1) -> list[SubjectRDM]:
+        return [
+            subject_rdm(str(i), [block], 6, seed=seed, splits=splits, draws=draws, draw_splits=inner)
+            for i, block in enumerate(blocks)
+        ]
+
+    def value(seed: int, count: int) -> float:
+        return score_rdms({"a": layer}, subjects(seed, count), name="x", stimuli=list("abcdef")).value
+
+    def interval_end(seed: int, number: int, inner: int) -> float:
+        found = bootstrap_score(
+            [layer], subjects(seed, splits=100, draws=number, draw_splits=inner), draws=number, seed=seed
+        )
+        interval = found.interval("percentile")
+        return float("nan") if interval is None else interval.low
+
+    model, brain, threshold = _p_near_five_percent()
+
+    def p_value(seed: int, count: int) -> float:
+        return (1 + int((_relabelled(model, brain, count, seed) >= threshold).sum())) / (count + 1)
+
+    jobs: list[tuple[str, int, str, bool, Callable[[int], float]]] = [
+        *(("splits", n, "score", n == 1000, lambda seed, n=n: value(seed, n)) for n in splits),
+        *(("draws", n, "interval end", n == 1000, lambda seed, n=n: interval_end(seed, n, 20)) for n in draws),
+        *(
+            ("draw_splits", n, "interval end", n == 20, lambda seed, n=n: interval_end(seed, 1000, n))
+            for n in draw_splits
+        ),
+        *(("permutations", n, "p near .05", n == 10_000, lambda seed, n=n: p_value(seed, n)) for n in permutations),
+    ]
+    points = []
+    for index, (quantity, count, of, default, job) in enumerate(jobs):
+        if progress is not None:
+            progress(index, len(jobs), "measuring Monte-Carlo error")
+        found, seconds = [], []
+        for seed in range(repeats):
+            start = time.perf_counter()
+            found.append(job(seed))
+            seconds.append(time.perf_counter() - start)
+        points.append(Point(quantity, count, float(np.std(found, ddof=1)), of, float(np.median(seconds)), default))
+    if progress is not None:
+        progress(len(jobs), len(jobs), "measuring Monte-Carlo error")
+    return tuple(points)
+
+
+def _relabelled(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
+    """Return comparisons [N] under random orders of the stimuli."""
+    orders = np.random.default_rng(seed).permuted(np.tile(np.arange(_STIMULI), (count, 1)), axis=1)
+    return compare(model[permuted_pairs(orders)], brain)
+
+
+def _p_near_five_percent() -> tuple[Floats, Floats, float]:
+    """Return RDMs of more stimuli than are permuted exactly, and the statistic whose p is .05."""
+    rng = np.random.default_rng(1)
+    model, brain = (rdm(rng.normal(size=(_STIMULI, 10))) for _ in range(2))
+    return model, brain, float(np.quantile(_relabelled(model, brain, 20_000, 2), 0.95))
+
+
+def _data(animals: int, units: int, trials: int, noise: float) -> tuple[list[TrialBlock], Floats]:
+    rng = np.random.default_rng(0)
+    latent = rng.normal(size=(6, 4))
+    labels = np.repeat(np.arange(6), trials)
+    blocks = []
+    for animal in range(animals):
+        responses = (latent @ rng.normal(size=(4, units)))[labels] + noise * rng.normal(size=(len(labels), units))
+        blocks.append(TrialBlock(responses, labels, [f"{animal}/{trial}" for trial in range(len(labels))]))
+    return blocks, rdm((latent + 0.3 * rng.normal(size=latent.shape)) @ rng.normal(size=(4, 500)))

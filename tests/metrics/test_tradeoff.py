@@ -1,0 +1,33 @@
+"""The trade-off between Monte-Carlo error and time."""
+
+from __future__ import annotations
+
+import pytest
+
+from brainbench.errors import UsageError
+from brainbench.metrics.tradeoff import measure_tradeoff
+
+
+def test_the_error_falls_and_the_time_grows_with_every_number():
+    points = measure_tradeoff(
+        animals=2,
+        units=10,
+        trials=8,
+        splits=(10, 1000),
+        draws=(30, 300),
+        draw_splits=(5,),
+        permutations=(100, 10_000),
+        repeats=6,
+    )
+    by = {(point.quantity, point.count): point for point in points}
+    assert by["splits", 1000].error < by["splits", 10].error / 3
+    assert by["splits", 1000].seconds > by["splits", 10].seconds
+    assert by["permutations", 10_000].error < by["permutations", 100].error
+    assert by["permutations", 10_000].error == pytest.approx((0.05 * 0.95 / 10_000) ** 0.5, rel=0.8)
+    assert by["draws", 100].error > 0
+    assert [point.count for point in points if point.default] == [1000, 10_000]
+
+
+def test_misuse_is_told_in_a_sentence():
+    with pytest.raises(UsageError, match="at least 2 repeats"):
+        measure_tradeoff(repeats=1)
