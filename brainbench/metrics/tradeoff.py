@@ -92,9 +92,7 @@ def measure_tradeoff(
         return score_rdms({"a": layer}, subjects(seed, count), name="x", stimuli=list("abcdef")).value
 
     def interval_end(seed: int, number: int, inner: int) -> float:
-        found = bootstrap_score(
-            [layer], subjects(seed, splits=100, draws=number, draw_splits=inner), draws=number, seed=seed
-        )
+        found = bootstrap_score([layer], subjects(seed, 100, number, inner), draws=number, seed=seed)
         interval = found.interval("percentile")
         return float("nan") if interval is None else interval.low
 
