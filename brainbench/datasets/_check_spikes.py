@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets._findings import Finding, Severity, share, some
+from brainbench.datasets._findings import Finding, Severity, repeats, share, some
 from brainbench.datasets.sessions import Session, as_labels
 
 Spikes = list[NDArray[np.float64]]
@@ -33,8 +33,7 @@ def check_spikes(session: Session, spikes: Spikes, where: str) -> Iterator[Findi
     yield from _impossible(spikes, names, where)
     yield from _refractory(spikes, names, where)
     yield from _duplicates(spikes, names, where)
-    repeated = sorted({name for name in ids if ids.count(name) > 1}) if len(set(ids)) < len(ids) else []
-    if repeated:
+    if repeated := repeats(ids):
         message = f"{len(repeated)} unit ids occur more than once ({some(repeated)})"
         yield Finding("warning", "units", where, message, "Fine for several probes; else units were merged wrongly.")
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.datasets._extract import merged_spans, recorded_span
-from brainbench.datasets._findings import Finding, Severity, share, some
+from brainbench.datasets._findings import Finding, Severity, repeats, share, some
 from brainbench.datasets.conditions import Conditions
 from brainbench.datasets.recipes import Recipe
 from brainbench.datasets.sessions import OBSERVED, Session, Table, as_labels
@@ -51,12 +51,9 @@ def _damaged(table: Table, where: str) -> Iterator[Finding]:
             elif len(table.data[name]) != len(table):
                 table.column(name)
         except BrainbenchError as error:
-            yield Finding(
-                "error", "tables", where, str(error), "Rows no longer belong together: write the table again."
-            )
-    ids = as_labels(table.ids()).tolist()
-    if len(set(ids)) < len(ids):
-        repeated = sorted({name for name in ids if ids.count(name) > 1})
+            advice = "Rows no longer belong together: write the table again."
+            yield Finding("error", "tables", where, str(error), advice)
+    if repeated := repeats(as_labels(table.ids()).tolist()):
         yield Finding("warning", "tables", where, f"table {table.name!r} has ids more than once ({some(repeated)})")
 
 
@@ -78,9 +75,12 @@ def _times(table: Table, where: str) -> Iterator[Finding]:
             message = f"{share(int(bad.sum()), rows)} rows of {name} have {what}"
             yield Finding(severity, "times", where, message, "Such rows cannot be counted.")
     duration = stop - start
-    long = len(table) >= _MANY_ROWS and np.nanmedian(duration) > _LONGEST_TRIAL
-    if long or np.nanmax(start) > _LONGEST_SESSION:
-        message = f"{name} runs to {np.nanmax(stop):g} s with rows of {np.nanmedian(duration):g} s (median)"
+    known = np.isfinite(duration)
+    if not known.any():
+        return
+    middle, last = float(np.median(duration[known])), float(stop[known].max())
+    if (rows >= _MANY_ROWS and middle > _LONGEST_TRIAL) or last > _LONGEST_SESSION:
+        message = f"{name} runs to {last:g} s with rows of {middle:g} s (median)"
         yield Finding("error", "times", where, message, "Its times look like milliseconds or samples, not seconds.")
     if table.name == "trials" and np.any(np.diff(start) < 0):
         message = f"{name} is not in the order of time"
@@ -219,9 +219,9 @@ def _observed(units: Table, start: NDArray[np.float64], stop: NDArray[np.float64
 
 def _gaps(spikes: list[NDArray[np.float64]], low: float, high: float) -> list[tuple[float, float]]:
     """Spans without any spike longer than ``_GAP``, found on a grid of one second."""
-    edges = np.arange(np.floor(low), np.ceil(high) + 2)
-    if len(edges) > 10 * _LONGEST_SESSION:
+    if high - low > _LONGEST_SESSION:
         return []  # Times that cannot be seconds are told by another check.
+    edges = np.arange(np.floor(low), np.ceil(high) + 2)
     fired = np.zeros(len(edges), dtype=bool)
     for times in spikes:
         fired[(times - edges[0]).astype(np.int64)] = True

@@ -18,7 +18,7 @@ from brainbench.datasets._check_labels import check_labels
 from brainbench.datasets._check_spikes import check_spikes
 from brainbench.datasets._check_tables import check_coverage, check_tables
 from brainbench.datasets._extract import has_units, no_units, read_spikes
-from brainbench.datasets._findings import SEVERITIES, Finding
+from brainbench.datasets._findings import SEVERITIES, Finding, repeats
 from brainbench.datasets.conditions import Conditions
 from brainbench.datasets.reading import Source, each_session, find_recordings
 from brainbench.datasets.recipes import Recipe
@@ -131,6 +131,6 @@ def check_session(
 
 
 def _check_together(names: list[str]) -> Iterator[Finding]:
-    for name in sorted({name for name in names if names.count(name) > 1}):
+    for name in repeats(names):
         message = f"{names.count(name)} files hold this session; its trials would count more than once"
         yield Finding("error", "file", name, message, "Leave all but one of them out.")

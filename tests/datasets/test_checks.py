@@ -257,6 +257,17 @@ def test_impossible_times_of_trials_are_named(tmp_path):
     assert checkup.verdict == "error"
 
 
+def test_rows_without_any_end_and_ids_that_repeat_are_told(tmp_path):
+    session = make_healthy()
+    changed = with_column(session, "trials", stop_time=np.full(90, np.nan), id=np.arange(90) // 2)
+    checkup = check(write_recordings(tmp_path / "a.h5", changed))
+    assert "table 'trials' has ids more than once (0, 1, 10, 11, 12 and 40 more)" in str(checkup)
+    assert "none of 90 trials has the events of the window start..stop" in str(checkup)
+    units = {**session.units.data, "id": np.zeros(20, dtype=np.int64)}
+    _, text = examine(tmp_path, replace(session, units=Table("units", units)), "units", "warning")
+    assert text == "1 unit ids occur more than once (0)"
+
+
 def test_contacts_on_another_clock_than_trials_are_found(tmp_path):
     session = make_healthy()
     contacts = session.tables["contacts_by_whisker_C1"].data
