@@ -7,9 +7,7 @@ B batch, T time step, S sub-step, C channel, W whisker, H×W whisker grid, N swe
 from __future__ import annotations
 
 import os
-import sys
-import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from brainbench.datasets._whisking_files import Shard, open_shard, read_manifest, verify_shard
+from brainbench.datasets._whisking_files import open_shard, read_manifest, verify_shard
+from brainbench.datasets._whisking_memory import Buffers, Maps
 from brainbench.errors import DataError, UsageError, listing, unknown_name
 from brainbench.files import cache_dir, content_hash, read_json, write_json
 from brainbench.types import CHANNELS, GRID_SHAPE
@@ -35,7 +34,6 @@ SPLITS = ("train", "validation", "test", "all")
 """What ``split`` may be; ``all`` is the three together."""
 
 _AHEAD = 2
-_BUFFERS = 2 * (_AHEAD + 2)
 _BLOCK = 64
 
 
@@ -125,8 +123,8 @@ class WhiskingDataset:
         entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]
         self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
         self._choose()
-        self._buffers = _Buffers()
-        self._maps: OrderedDict[int, NDArray[np.float32]] = OrderedDict()
+        self._buffers = Buffers(2 * (_AHEAD + 2))
+        self._maps = Maps(self._shards)
         self.epoch = 0
         """Number of the epoch that the next batch belongs to, from 0."""
         self._batch = 0
@@ -251,7 +249,7 @@ class WhiskingDataset:
         for place, (shard, row) in enumerate(
             zip(self._where[sweeps].tolist(), self._row[sweeps].tolist(), strict=True)
         ):
-            np.copyto(result[place], self._map(shard)[row])
+            np.copyto(result[place], self._maps.forces(shard)[row])
         if self.unstable == "zero":
             np.nan_to_num(result, copy=False, nan=0.0)
         return result
@@ -324,17 +322,6 @@ class WhiskingDataset:
         starts = np.cumsum([0, *(len(column) for column in columns)])
         return np.concatenate(columns)[starts[self._where] + self._row]
 
-    def _map(self, index: int) -> NDArray[np.float32]:
-        """Return the memory-mapped forces [sweep, frame, W, C] of a shard."""
-        mapped = self._maps.get(index)
-        if mapped is None:
-            shard: Shard = self._shards[index]
-            mapped = np.memmap(shard.path, "<f4", "r", shard.offset, (shard.sweeps, *shard.shape)).view(np.ndarray)
-            self._maps[index] = mapped
-            if len(self._maps) > _most_open():
-                self._maps.popitem(last=False)
-        return mapped
-
     def _check_grid(self) -> None:
         frames = self._shards[0].shape[0]
         if self.substeps < 1 or frames % self.substeps:
@@ -367,35 +354,3 @@ class WhiskingDataset:
             grid = rows.index_select(1, source)
         grid.view(-1, GRID_SHAPE[0] * GRID_SHAPE[1]).index_fill_(1, empty, 0.0)
         return grid.view(count, frames // self.substeps, self.substeps * len(CHANNELS), *GRID_SHAPE)
-
-
-class _Buffers:
-    """Memory for batches, used again once nobody holds it: fresh memory is slower than copying into it."""
-
-    def __init__(self) -> None:
-        self._held: list[NDArray[np.float32]] = [np.empty(0, np.float32)]
-        self._lock = threading.Lock()
-        # Every tensor or view on an array holds a reference more than this.
-        self._free = self._references(0)
-
-    def take(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Return an array of ``shape`` with any content that no tensor or view refers to."""
-        with self._lock:
-            for index in range(len(self._held)):
-                if self._held[index].shape == shape and self._references(index) == self._free:
-                    return self._held[index]
-            made = np.empty(shape, np.float32)
-            self._held = [*self._held[-_BUFFERS:], made]
-            return made
-
-    def _references(self, index: int) -> int:
-        return sys.getrefcount(self._held[index])
-
-
-def _most_open() -> int:
-    """Shards that may be mapped at a time: each takes one of the files that a process may open."""
-    try:
-        import resource
-    except ImportError:
-        return 512
-    return max(16, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
