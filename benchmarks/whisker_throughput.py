@@ -32,13 +32,15 @@ def timed(wp, device, run, repeats: int = 3) -> float:
     return statistics.median(seconds)
 
 
-def free(device_name: str, lanes: int, links: int, steps: int, block: int, most: int = 0, precision: str = "single") -> None:
+def free(
+    device_name: str, lanes: int, links: int, steps: int, block: int, most: int = 0, bounds=None, precision: str = "single"
+) -> None:
     """Whiskers that swing under gravity, nothing near: pure integration."""
     wp = warp()
     objects = resolve_objects(["torus-1"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-low"], {name: item.load for name, item in objects.items()})
     step = 1e-4
-    launcher = SweepLauncher(scenes, Fidelity(links=links, time_step=step, precision=precision), device_name)
+    launcher = SweepLauncher(scenes, Fidelity(links=links, time_step=step, precision=precision), device_name, bounds)
     kernels, device, real = launcher.kernels, launcher.device, launcher.real
     tracks, shapes = Tracks(), Shapes(device)
     tracks.add(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])), 0.0, 1.0)
@@ -82,7 +84,7 @@ def free(device_name: str, lanes: int, links: int, steps: int, block: int, most:
     done = int(out.steps.numpy().astype(np.int64).sum())
     bad = int((out.status.numpy() != 0).sum())
     print(
-        f"free  N={links} {precision} lanes={lanes} block={block} blocks={most or 'all'}: {done / seconds:.3e} whisker-steps/s "
+        f"free  N={links} {precision} lanes={lanes} block={block} blocks={most or 'all'} bounds={bounds}: {done / seconds:.3e} whisker-steps/s "
         f"({seconds:.3f} s, {bad} failed)",
         flush=True,
     )
@@ -124,6 +126,7 @@ def main() -> None:
     parser.add_argument("--only", default="free,sweep")
     parser.add_argument("--lanes", type=int, default=262_144)
     parser.add_argument("--blocks", default=f"{BLOCK}:0", help="block size : most blocks (0 = all), several by commas")
+    parser.add_argument("--bounds", default="0", help="CUDA launch bounds such as 64x6, several by commas; 0 = none")
     parser.add_argument("--objects", default="procedural-24:2")
     parser.add_argument("--sweeps", type=int, default=768)
     args = parser.parse_args()
@@ -133,7 +136,9 @@ def main() -> None:
         for links in (10, 20):
             for pair in args.blocks.split(","):
                 block, most = map(int, pair.split(":"))
-                free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, most)
+                for words in args.bounds.split(","):
+                    bounds = None if words == "0" else tuple(map(int, words.split("x")))
+                    free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, most, bounds)
     if "sweep" in chosen:
         for recipe, fidelity in (
             ("thesis-low", Fidelity(links=20, time_step=2e-4)),

@@ -314,13 +314,14 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> N
     for k in range(3):
         to_next, to_last = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
         angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_last), axis=1), np.sum(to_next * to_last, axis=1))
-        np.add.at(at_vertex, faces[:, k], normals * angle[:, None])
+        for axis in range(3):
+            at_vertex[:, axis] += np.bincount(faces[:, k], normals[:, axis] * angle, len(vertices))
     edges = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1), axis=2)
-    _, which = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    names = edges[..., 0].astype(np.int64) * len(vertices) + edges[..., 1]
+    _, which = np.unique(names, return_inverse=True)
     which = which.reshape(-1, 3)
-    at_edge = np.zeros((which.max() + 1, 3))
-    for k in range(3):
-        np.add.at(at_edge, which[:, k], normals)
+    spread = np.repeat(normals, 3, axis=0)
+    at_edge = np.stack([np.bincount(which.ravel(), spread[:, axis]) for axis in range(3)], axis=1)
     found = np.concatenate([normals[:, None], at_vertex[faces], at_edge[which]], axis=1)
     length = np.linalg.norm(found, axis=2, keepdims=True)
     return found / np.where(length > 0, length, 1.0)

@@ -19,9 +19,6 @@ CONTACTS = 4
 """Contacts of one whisker that are solved together; the tightest are kept when there are more."""
 SWEEPS = 20
 """Most Gauss-Seidel sweeps over the contacts of one step."""
-PROXIMAL = 0.0
-"""Compliance of a contact, as a share of the whisker's own, against changes of its force from step to step. It makes
-neighbouring contacts well-conditioned and vanishes when forces are steady."""
 LARGEST_BEND = 1.5
 """Bend of one joint (rad) beyond which a chain means nothing."""
 REST = 1e-6
@@ -30,6 +27,12 @@ FAR = 3.0
 """How far (mm) a distance query looks; a link further away is looked at again when it may have come nearer."""
 NEAR = 0.2
 """How much further (mm) than needed a search among triangles looks, so that it need not be made in every step."""
+TRAVEL = 0.25
+"""Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
+FINEST = 16
+"""Most parts into which a step is split for that."""
+WIDEST = 0.8
+"""Widest search for contacts (mm)."""
 CREVICE = 0.02
 """Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
 
@@ -38,7 +41,7 @@ OK, BENT, LOST = 0, 1, 2
 
 
 @cache
-def solver(real: type, capacity: int) -> SimpleNamespace:
+def solver(real: type, capacity: int, bounds: tuple[int, int] | None = None) -> SimpleNamespace:
     """Return the structures and the kernel for chains of at most ``capacity`` links in one precision.
 
     Args:
@@ -384,7 +387,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                 touch.clear = real(0.0)
         return touch
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds)
     def run(ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, opt: Options, readings: wp.array(dtype=real), out: Results):
         lane = wp.tid()
         zero = real(0.0)
@@ -426,7 +429,6 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         c_link = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
         c_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_ahead = wp.zeros(wp.static(CONTACTS), dtype=real)
-        c_old = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_gap = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_mu = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_at = wp.zeros(wp.static(CONTACTS), dtype=vec3)
@@ -440,8 +442,16 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
         held_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
         held_force = wp.zeros(wp.static(CONTACTS), dtype=vec3)
         held_count = int(0)
+        stance = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
+        ratio = wp.zeros(wp.static(2 * CONTACTS), dtype=real)
+        asked = wp.zeros(wp.static(CONTACTS), dtype=real)
+        load_n = wp.zeros(wp.static(CONTACTS), dtype=real)
+        square = wp.zeros(wp.static(CONTACTS * CONTACTS), dtype=real)
+        work = wp.zeros(wp.static(CONTACTS * CONTACTS), dtype=real)
         comply = wp.zeros(wp.static(rows * rows), dtype=real)
 
+        near = int(0)
+        quickest = zero
         look_near = real(wp.static(NEAR))
         object_speed = zero
         for s in range(shapes_from, shapes_to):
@@ -523,13 +533,22 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                     qd[i] = vec2(zero, zero)
                 before = upto
                 continue
-            count = wp.max(1, int(wp.ceil(span / longest - real(1e-3))))
-            h = span / real(count)
-            step_damping = wp.max(beta - h, zero)
             arc_sum = zero
             force_sum = zero
-            for sub in range(count):
-                now = before + span * (real(sub) / real(count))
+            left = span
+            last = int(0)
+            while last == 0:
+                now = upto - left
+                # Where something is near, a step moves no point of the whisker further than a contact search looks.
+                wanted = longest
+                if near == 1 and quickest * longest > real(wp.static(TRAVEL)):
+                    wanted = wp.max(longest / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / quickest)
+                count = wp.max(1, int(wp.ceil(left / wanted - real(1e-3))))
+                h = left / real(count)
+                left = left - h
+                if count == 1:
+                    last = 1
+                step_damping = wp.max(beta - h, zero)
                 pose0 = pose_at(tr, base, now)
                 pose1 = pose_at(tr, base, now + h)
                 origin = pose0.place
@@ -573,7 +592,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                 contacts = int(0)
                 closing = int(0)
                 travel = h * (quickest + object_speed)
-                margin = real(1.5) * travel + h * jump + real(0.001)
+                margin = wp.min(real(1.5) * travel + h * jump + real(0.001), real(wp.static(WIDEST)))
                 near = int(0)
                 if shapes_to > shapes_from:
                     for i in range(links):
@@ -849,7 +868,6 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                 if apart < real(0.3) * ch.taper[c_link[c], who][3]:
                                     guess = held_force[e]
                             force[3 * c] = wp.max(zero, wp.dot(guess, axis[3 * c]))
-                            c_old[c] = force[3 * c]
                             force[3 * c + 1] = wp.dot(guess, axis[3 * c + 1])
                             force[3 * c + 2] = wp.dot(guess, axis[3 * c + 2])
                         held_count = int(0)
@@ -907,8 +925,6 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                             b1 += comply[(r + 1) * wp.static(rows) + e] * force[e]
                                             b2 += comply[(r + 2) * wp.static(rows) + e] * force[e]
                                     nn = comply[r * wp.static(rows) + r]
-                                    bn = bn - real(wp.static(PROXIMAL)) * nn * c_old[c]
-                                    nn = nn * real(wp.static(1.0 + PROXIMAL))
                                     n1 = comply[r * wp.static(rows) + r + 1]
                                     n2 = comply[r * wp.static(rows) + r + 2]
                                     c11 = comply[(r + 1) * wp.static(rows) + r + 1]
@@ -968,8 +984,104 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                                         missed = wp.min(missed, zero)
                                     slipped = c11 * wp.abs(f1 - p0) + c22 * wp.abs(f2 - q0)
                                     change = wp.max(change, h * (wp.abs(missed) + slipped))
-                                if change <= real(1e-5):
+                                if change <= real(1e-4):
                                     settled = 1
+                                if settled == 0 and contacts > 1:
+                                    # Neighbouring contacts share a load in ways that Gauss-Seidel finds slowly: solve
+                                    # for all normal forces at once, those of sliding contacts with their friction.
+                                    for c in range(contacts):
+                                        stance[c] = int(0)
+                                        if force[3 * c] > zero:
+                                            stance[c] = int(1)
+                                        ratio[2 * c] = zero
+                                        ratio[2 * c + 1] = zero
+                                        f1 = force[3 * c + 1]
+                                        f2 = force[3 * c + 2]
+                                        size = wp.sqrt(f1 * f1 + f2 * f2)
+                                        if size > zero and size >= real(0.999) * c_mu[c] * force[3 * c]:
+                                            ratio[2 * c] = c_mu[c] * f1 / size
+                                            ratio[2 * c + 1] = c_mu[c] * f2 / size
+                                    for c in range(contacts):
+                                        r = 3 * c
+                                        rest = c_gap[c] - free[r]
+                                        for e in range(contacts):
+                                            near_n = comply[r * wp.static(rows) + 3 * e]
+                                            near_1 = comply[r * wp.static(rows) + 3 * e + 1]
+                                            near_2 = comply[r * wp.static(rows) + 3 * e + 2]
+                                            if ratio[2 * e] != zero or ratio[2 * e + 1] != zero:
+                                                near_n += near_1 * ratio[2 * e] + near_2 * ratio[2 * e + 1]
+                                            else:
+                                                rest -= near_1 * force[3 * e + 1] + near_2 * force[3 * e + 2]
+                                            square[c * wp.static(CONTACTS) + e] = near_n
+                                        asked[c] = rest
+                                    agreed = int(0)
+                                    for _ in range(3 * wp.static(CONTACTS)):
+                                        if agreed == 0:
+                                            for c in range(contacts):
+                                                for e in range(contacts):
+                                                    keep = square[c * wp.static(CONTACTS) + e]
+                                                    if stance[c] == 0 or stance[e] == 0:
+                                                        keep = zero
+                                                        if c == e:
+                                                            keep = one
+                                                    work[c * wp.static(CONTACTS) + e] = keep
+                                                load_n[c] = zero
+                                                if stance[c] == 1:
+                                                    load_n[c] = asked[c]
+                                            for p in range(contacts):
+                                                for c in range(p + 1, contacts):
+                                                    part = (
+                                                        work[c * wp.static(CONTACTS) + p]
+                                                        / work[p * wp.static(CONTACTS) + p]
+                                                    )
+                                                    for e in range(p + 1, contacts):
+                                                        work[c * wp.static(CONTACTS) + e] -= (
+                                                            part * work[p * wp.static(CONTACTS) + e]
+                                                        )
+                                                    load_n[c] -= part * load_n[p]
+                                            for back in range(contacts):
+                                                c = contacts - 1 - back
+                                                for e in range(c + 1, contacts):
+                                                    load_n[c] -= work[c * wp.static(CONTACTS) + e] * load_n[e]
+                                                load_n[c] = load_n[c] / work[c * wp.static(CONTACTS) + c]
+                                            worst_c = int(-1)
+                                            lowest = zero
+                                            for c in range(contacts):
+                                                if not (wp.abs(load_n[c]) < real(1e6)):
+                                                    agreed = int(-1)
+                                                if load_n[c] < lowest:
+                                                    lowest = load_n[c]
+                                                    worst_c = c
+                                            if worst_c >= 0:
+                                                stance[worst_c] = int(0)
+                                            else:
+                                                lowest = real(-1e-6) / h
+                                                for c in range(contacts):
+                                                    if stance[c] == 0:
+                                                        opening = -asked[c]
+                                                        for e in range(contacts):
+                                                            opening += square[c * wp.static(CONTACTS) + e] * load_n[e]
+                                                        if opening < lowest:
+                                                            lowest = opening
+                                                            worst_c = c
+                                                if worst_c >= 0:
+                                                    stance[worst_c] = int(1)
+                                                else:
+                                                    agreed = int(1)
+                                    if agreed == 1:
+                                        for c in range(contacts):
+                                            fn = load_n[c]
+                                            if ratio[2 * c] != zero or ratio[2 * c + 1] != zero:
+                                                force[3 * c + 1] = ratio[2 * c] * fn
+                                                force[3 * c + 2] = ratio[2 * c + 1] * fn
+                                            else:
+                                                f1 = force[3 * c + 1]
+                                                f2 = force[3 * c + 2]
+                                                size = wp.sqrt(f1 * f1 + f2 * f2)
+                                                if size > c_mu[c] * fn:
+                                                    force[3 * c + 1] = f1 * (c_mu[c] * fn / size)
+                                                    force[3 * c + 2] = f2 * (c_mu[c] * fn / size)
+                                            force[3 * c] = fn
                         if settled == 0 and change > real(1e-2):
                             unsolved = unsolved + 1
                         held_count = contacts
@@ -1021,14 +1133,14 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
 
                 jump = wp.max(h * wp.length(tip_push), real(0.5) * jump)
                 touched = int(0)
-                if sub == count - 1:
+                if last == 1:
                     arc_sum = zero
                     force_sum = zero
                 if contacts > 0:
                     for c in range(contacts):
                         if closing == 1 and force[3 * c] > zero:
                             touched = 1
-                            if sub == count - 1:
+                            if last == 1:
                                 arc_sum += force[3 * c] * c_arc[c]
                                 force_sum += force[3 * c]
                 touching += touched
@@ -1057,7 +1169,7 @@ def solver(real: type, capacity: int) -> SimpleNamespace:
                 if busy == 0 and worst < real(wp.static(REST)) and may_rest == 1:
                     resting = 1
                     idle = zero
-                if sub == count - 1 and status == 0:
+                if last == 1 and status == 0:
                     acting = opt.axes * reaction_v * real(-1e-3)
                     turning = opt.axes * reaction_w * real(-1e-6)
                     for d in range(3):

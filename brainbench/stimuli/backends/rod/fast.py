@@ -59,7 +59,9 @@ class SweepLauncher:
         UsageError: the head of the grid moves, or the device is unknown.
     """
 
-    def __init__(self, scenes: SweepScenes, fidelity: Fidelity, device: str = "cpu") -> None:
+    def __init__(
+        self, scenes: SweepScenes, fidelity: Fidelity, device: str = "cpu", bounds: tuple[int, int] | None = None
+    ) -> None:
         from brainbench.stimuli.backends.rod._solver import solver
 
         grid = scenes.grid
@@ -77,7 +79,7 @@ class SweepLauncher:
         chains = [build_chain(m.whisker, fidelity.link_count(m.whisker.arc_length)) for m in mounts]
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.real = wp.float32 if fidelity.precision == "single" else wp.float64
-        self.kernels = solver(self.real, self.capacity)
+        self.kernels = solver(self.real, self.capacity, bounds)
         self._chains = to_struct(self.kernels.Chains, Chains(self.capacity, chains).arrays(), self.device)
         self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in chains])
         self.readings = grid.frames.readings * MILLI
