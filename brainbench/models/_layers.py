@@ -20,6 +20,8 @@ from brainbench.errors import UsageError, unknown_name
 
 RECTIFIER_GAIN = math.sqrt(2.0)
 
+_MANY_WEIGHTS = 1 << 18
+
 ACTIVATIONS: Mapping[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
@@ -119,13 +121,35 @@ class Conv2d(nn.Conv2d):
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Convolve [B, C, H, W]."""
-        return super().forward(input if self._extra is None else functional.pad(input, self._extra))
+        return self._convolve(input, self.weight, self.bias)
 
     def share(self, input: torch.Tensor, start: int, *, use_bias: bool) -> torch.Tensor:
         """Convolve some of the input channels, those from ``start`` on; the shares of all add up to the whole."""
-        padded = input if self._extra is None else functional.pad(input, self._extra)
         weight = self.weight[:, start : start + input.shape[1]]
-        return self._conv_forward(padded, weight, self.bias if use_bias else None)
+        return self._convolve(input, weight, self.bias if use_bias else None)
+
+    def _convolve(self, input: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+        padded = input if self._extra is None else functional.pad(input, self._extra)
+        # Asked first: an exported program must not depend on the size of its example's batch.
+        if weight.numel() < _MANY_WEIGHTS or torch.compiler.is_exporting() or torch.compiler.is_compiling():
+            return self._conv_forward(padded, weight, bias)
+        if len(input) > 1 or input.is_cuda or torch.is_grad_enabled():
+            return self._conv_forward(padded, weight, bias)
+        # The convolutions of CPUs rearrange their weights at every call, which for one stimulus takes longest.
+        size = [
+            (length + 2 * around - kernel) // stride + 1
+            for length, around, kernel, stride in zip(
+                padded.shape[2:], _two(self.padding), self.kernel_size, self.stride, strict=True
+            )
+        ]
+        columns = functional.unfold(padded, self.kernel_size, padding=_two(self.padding), stride=_two(self.stride))
+        y = weight.flatten(1) @ columns[0]
+        y = y if bias is None else y + bias[:, None]
+        return y.view(1, -1, *size)
+
+
+def _two(value: Any) -> tuple[int, int]:
+    return (int(value[0]), int(value[1]))
 
 
 class Linear(nn.Linear):

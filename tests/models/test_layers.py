@@ -57,3 +57,14 @@ def test_an_unknown_activation_names_the_nearest():
 def test_a_bad_kernel_size_says_what_was_received(value):
     with pytest.raises(UsageError, match="kernel size must be a positive integer or a pair"):
         pair(value, "kernel size")
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("padding", ["same", "valid", (1, 0)])
+@pytest.mark.parametrize("stride", [(1, 1), (2, 1)])
+def test_one_stimulus_gives_what_many_give(padding, stride):
+    options = {} if padding == "same" and stride != (1, 1) else {"stride": stride}
+    layer, x = Conv2d(400, 200, kernel_size=(2, 2), padding=padding, **options), torch.randn(3, 400, 4, 6)
+    torch.testing.assert_close(layer(x[:1]), layer(x)[:1], atol=1e-4, rtol=1e-4)
+    whole = layer.share(x[:1, :150], 0, use_bias=True) + layer.share(x[:1, 150:], 150, use_bias=False)
+    torch.testing.assert_close(whole, layer(x)[:1], atol=1e-4, rtol=1e-4)

@@ -218,6 +218,7 @@ def test_two_processes_train_as_one(tmp_path):
 
 # PyTorch's compiler uses a part of PyTorch that PyTorch has deprecated.
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["parts", "default"])
 def test_a_compiled_run_learns_too(how, tmp_path):

@@ -1,0 +1,237 @@
+"""Speed of a training step, of a forward pass, of streaming and of long sweeps; peers measured in the same run.
+
+    PYTHONPATH=. python benchmarks/training_step.py --part train --model zhuang-intersection-ln+gpt --batch 256
+    PYTHONPATH=. python benchmarks/training_step.py --part stream --model zhuang-intersection-ln-small
+    PYTHONPATH=. python benchmarks/training_step.py --part length
+
+The peer is what a reader of the published description would write: a loop over time steps and, within it, over areas;
+inputs concatenated, convolved, concatenated with the state and convolved again; every step's outputs kept; float32. It
+computes the same function with the same weights (checked). ``ceiling`` is the fastest square matrix product of the
+device in the same precision.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+import torch
+from results import table, write_section
+
+from brainbench.models.extract import evaluating
+from brainbench.models.registry import describe_model, load_model
+from brainbench.models.streaming import StreamingStep
+from brainbench.models.training.run import compiled
+
+STEPS = 22
+
+
+class Loop(torch.nn.Module):
+    """The peer: a model's graph unrolled over nodes and time steps, one after the other."""
+
+    def __init__(self, model: Any) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        model, graph = self.model, self.model.encoder
+        x = model.normaliser(x)
+        outputs = {name: x.new_zeros(len(x), *graph._shapes[name]) for name in graph.layers}
+        memories, features = {}, []
+        for t in range(x.shape[1]):
+            new = {}
+            for name in graph.layers:
+                node = graph.node(name)
+                inputs = [x[:, t]] if name in graph.spec.inputs else []
+                inputs += [outputs[edge.source] for edge in graph._predecessors[name]]
+                y = node.operate(inputs)
+                if node.memory is not None:
+                    y, memories[name] = node.memory(y, memories.get(name))
+                new[name] = node.after(y)
+            outputs = new
+            features.append(outputs[graph.spec.output])
+        features = torch.stack(features, 1)
+        if model.attender is not None:
+            features = model.attender(features)
+        return model.decoder(features[:, -1])
+
+
+def clock(device: torch.device, work: Callable[[], Any], repeats: int, warm: int = 2) -> float:
+    """Return the median seconds of one call."""
+    for _ in range(warm):
+        work()
+    times = []
+    for _ in range(repeats):
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        start = time.perf_counter()
+        work()
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def ceiling(device: torch.device, dtype: torch.dtype) -> float:
+    """Return the best measured matrix rate [FLOP/s]."""
+    best = 0.0
+    for size in (1024, 2048) if device.type == "cpu" else (4096, 8192, 16384):
+        a = torch.randn(size, size, device=device).to(dtype)
+        best = max(best, 2 * size**3 / clock(device, lambda a=a: a @ a, 3))
+    return best
+
+
+def sweeps(batch: int, device: torch.device, steps: int = STEPS) -> torch.Tensor:
+    scale = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+    generator = torch.Generator().manual_seed(0)
+    return (torch.randn(batch, steps, 30, 5, 7, generator=generator) * scale).to(device)
+
+
+def training_step(module: Any, model: Any, x: torch.Tensor, labels: torch.Tensor, autocast: Any) -> Callable[[], None]:
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=x.is_cuda)
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        with autocast():
+            loss = torch.nn.functional.cross_entropy(module(x).float(), labels)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+
+    return step
+
+
+def train_part(options: argparse.Namespace, device: torch.device) -> str:
+    x, labels = sweeps(options.batch, device), torch.randint(117, (options.batch,), device=device)
+    model = load_model(options.model).to(device).eval()
+    with torch.no_grad():
+        torch.testing.assert_close(Loop(model)(x[:2]), model(x[:2]), atol=1e-3, rtol=1e-3)
+    operations = 2 * describe_model(options.model).multiply_adds * STEPS
+    half = lambda: torch.autocast(device.type, dtype=torch.bfloat16)  # noqa: E731
+    rows, rates, ceilings = [], {}, {"float32": ceiling(device, torch.float32), "bf16": ceiling(device, torch.bfloat16)}
+    for who in options.who.split(","):
+        peer, precision, how = who.split(":")
+        model = load_model(options.model).to(device).train()
+        if device.type == "cuda" and peer == "ours":
+            model = model.to(memory_format=torch.channels_last)
+        module = compiled(Loop(model) if peer == "loop" else model, how)
+        autocast = half if precision == "bf16" else nullcontext
+        start = time.perf_counter()
+        step = training_step(module, model, x, labels, autocast)
+        step()
+        first = time.perf_counter() - start
+        seconds = clock(device, step, options.repeats, warm=1)
+        with evaluating(model), torch.no_grad(), autocast():
+            forward = clock(device, lambda module=module: module(x), options.repeats, warm=1)
+        rates[who] = options.batch / seconds
+        share = 3 * operations * options.batch / seconds / ceilings[precision]
+        share_forward = operations * options.batch / forward / ceilings[precision]
+        timed = [f"{first:.1f}", f"{seconds * 1e3:,.0f}", f"{rates[who]:,.1f}", f"{share:.0%}"]
+        rows.append([peer, precision, how, *timed, f"{options.batch / forward:,.1f}", f"{share_forward:.0%}"])
+        print(rows[-1], flush=True)
+    head = [
+        "who",
+        "precision",
+        "compiled",
+        "first step s",
+        "step ms",
+        "sweeps/s",
+        "of ceiling",
+        "forward sweeps/s",
+        "of ceiling",
+    ]
+    reference = rates.get("loop:float32:off")
+    best = max(rates, key=lambda who: rates[who])
+    text = (
+        f"{options.model}, batch {options.batch} × {STEPS} steps. Ceiling: float32 {ceilings['float32'] / 1e12:.3g}, "
+    )
+    text += f"bf16 {ceilings['bf16'] / 1e12:.3g} TFLOP/s.\n\n{table(head, rows)}\n\nFastest: {best}"
+    text += f", {rates[best] / reference:.2f} × the float32 loop" if reference else ""
+    peers = [rate for who, rate in rates.items() if who.startswith("loop") and who != "loop:float32:off"]
+    text += f", {rates[best] / max(peers):.2f} × the best other loop" if peers else ""
+    hours = 100 * 100_000 / rates[best] / 60
+    return f"{text}. 100 epochs of 100,000 sweeps: {hours:,.0f} minutes."
+
+
+def bandwidth() -> float:
+    """Return the rate at which one thread reads memory [bytes/s]."""
+    a = torch.ones(64 * 2**20)
+    return 4 * a.numel() / clock(torch.device("cpu"), a.sum, 5)
+
+
+def stream_part(options: argparse.Namespace, device: torch.device) -> str:
+    torch.set_num_threads(1)
+    rows = []
+    speed = bandwidth() if device.type == "cpu" else float("nan")
+    for name in options.model.split(","):
+        model = load_model(name).to(device)
+        step = StreamingStep(model)
+        x = sweeps(1, device)[:, 0]
+        weights = 4 * sum(p.numel() for p in model.parameters())
+        bound = weights / speed * 1e3
+        for what in ("step", "flat state"):
+            times = []
+            with torch.no_grad():
+                state = model.init_state(1) if what == "step" else step.init_state(1)
+                for count in range(options.repeats * 20):
+                    if model.spec.max_steps and count % model.spec.max_steps == 0:
+                        state = model.init_state(1) if what == "step" else step.init_state(1)
+                    start = time.perf_counter()
+                    _, state = model.step(x, state) if what == "step" else step(x, state)
+                    if device.type == "cuda":
+                        torch.cuda.synchronize()
+                    times.append((time.perf_counter() - start) * 1e3)
+            p50, p99 = np.percentile(times[10:], [50, 99])
+            rows.append([name, what, f"{p50:.2f}", f"{p99:.2f}", f"{weights / 1e6:.1f}", f"{bound:.2f}"])
+            print(rows[-1], flush=True)
+    head = ["model", "call", "p50 ms", "p99 ms", "weights MB", "ms to read them once"]
+    return f"Batch 1, one thread; memory read at {speed / 1e9:.1f} GB/s by a plain sum.\n\n{table(head, rows)}"
+
+
+def length_part(options: argparse.Namespace, device: torch.device) -> str:
+    rows = []
+    for name in ("s4-small", "resnet18-small+mamba"):
+        model = load_model(name).to(device)
+        for steps in (100, 1000, 10_000):
+            x = sweeps(1, device, steps)
+            with torch.no_grad():
+                seconds = clock(device, lambda model=model, x=x: model(x), 2, warm=1)
+            rows.append([name, f"{steps:,}", f"{seconds:.3f}", f"{seconds / steps * 1e6:.0f}"])
+            print(rows[-1], flush=True)
+    return table(["model", "steps", "s", "µs per step"], rows)
+
+
+PARTS = {"train": train_part, "stream": stream_part, "length": length_part}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--part", choices=PARTS, default="train")
+    parser.add_argument("--model", default="zhuang-intersection-ln-small")
+    parser.add_argument("--batch", type=int, default=32)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument(
+        "--who",
+        default="loop:float32:off,loop:bf16:off,ours:float32:off,ours:bf16:off",
+        help="comma-separated PEER:PRECISION:COMPILED with loop|ours, float32|bf16, off|parts|default|graphs",
+    )
+    parser.add_argument("--write", action="store_true", help="write the section into RESULTS.md")
+    options = parser.parse_args()
+    device = torch.device(options.device)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} threads"
+    body = f"{name}. " + PARTS[options.part](options, device)
+    print(f"\n{body}")
+    if options.write:
+        command = f"PYTHONPATH=. python benchmarks/training_step.py --part {options.part} --model {options.model}"
+        command += f" --batch {options.batch}" if options.part == "train" else ""
+        title = {"train": "Training step", "stream": "Streaming step", "length": "Long sweeps"}[options.part]
+        write_section(f"{title} ({options.model}, {device.type})", command, body)
+
+
+if __name__ == "__main__":
+    main()
