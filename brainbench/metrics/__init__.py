@@ -14,6 +14,7 @@ from brainbench.metrics.ceiling import NoiseCeiling, noise_ceiling
 from brainbench.metrics.compare import COMPARISONS, compare
 from brainbench.metrics.equivalence import EquivalenceTest, equivalence_test, turing_test
 from brainbench.metrics.inference import PermutationTest, permutation_test
+from brainbench.metrics.movies import rdm_movie
 from brainbench.metrics.multiple import LayerTest, ModelComparison, compare_models, layer_tests
 from brainbench.metrics.noise import ESTIMATORS, RELIABILITY_GATE, Corrected, noise_corrected, spearman_brown
 from brainbench.metrics.patterns import PatternMetric
@@ -59,6 +60,7 @@ __all__ = [
     "noise_precision",
     "permutation_test",
     "rdm",
+    "rdm_movie",
     "rdm_problem",
     "register_metric",
     "score_animals",
