@@ -86,9 +86,10 @@ def read_kind(file: h5py.File, path: Path) -> str:
     """
     version, kind = file.attrs.get("version"), text(file.attrs.get("kind", ""))
     if version != VERSION or kind not in ("spikes", "counts"):
+        newer = isinstance(version, (int, np.integer)) and version > VERSION
         raise DataError(
             f"{path} is {FORMAT} version {version}, kind {kind!r}; this brainbench reads version {VERSION}, kinds "
-            f"'spikes' and 'counts'."
+            f"'spikes' and 'counts'.{' A newer brainbench wrote it: update this one.' if newer else ''}"
         )
     return kind
 

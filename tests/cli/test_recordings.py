@@ -49,3 +49,11 @@ def test_sessions_and_animals_are_pooled_on_request(run, folder, pool, names):
     result = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", pool, "--json")
     assert len(json.loads(result.out)["animals"]) == names
     assert run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", "al").status == 2
+
+
+def test_fetching_without_the_client_says_how_to_get_it(run, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    result = run("recordings", "fetch", "rodgers", "--out", str(tmp_path / "data"))
+    assert result.status == 1
+    assert "pip install dandi" in result.err
+    assert "did you mean 'rodgers'" in run("recordings", "fetch", "rogers").err
