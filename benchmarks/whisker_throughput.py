@@ -40,7 +40,7 @@ def free(
     objects = resolve_objects(["torus-1"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-low"], {name: item.load for name, item in objects.items()})
     step = 1e-4
-    launcher = SweepLauncher(scenes, Fidelity(links=links, time_step=step, precision=precision), device_name, bounds)
+    launcher = SweepLauncher(scenes, Fidelity(links=links, time_step=step, precision=precision), device_name, 0, bounds)
     kernels, device, real = launcher.kernels, launcher.device, launcher.real
     tracks, shapes = Tracks(), Shapes(device)
     tracks.add(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])), 0.0, 1.0)

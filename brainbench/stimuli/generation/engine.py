@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.fidelity import Fidelity
     from brainbench.stimuli.sweeps import SweepScenes
 
-FAST_PATHS: dict[str, tuple[str, str]] = {}
+FAST_PATHS: dict[str, tuple[str, str]] = {"rod": ("brainbench.stimuli.backends.rod.fast", "simulate_sweeps")}
 """Backend → module and function that simulates many sweeps at once, without a scene per sweep. The function takes the
 arguments of :func:`simulate_sweeps` but the backend, and must give the same whatever the batch and its order."""
 

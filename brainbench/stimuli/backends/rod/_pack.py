@@ -263,6 +263,13 @@ class Shapes:
         self.triangles += len(faces)
         return int(mesh.id), first
 
+    @property
+    def needs(self) -> int:
+        """What the kernel must be able to touch."""
+        from brainbench.stimuli.backends.rod._solver import MESHES, NOTHING, PRIMITIVES
+
+        return MESHES if self.meshes else PRIMITIVES if self.rows else NOTHING
+
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``Bodies`` hold."""
 

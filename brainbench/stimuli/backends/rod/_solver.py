@@ -36,17 +36,22 @@ WIDEST = 0.8
 CREVICE = 0.02
 """Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
 
+NOTHING, PRIMITIVES, MESHES = 0, 1, 2
+"""What whiskers may touch: a kernel holds only the code that its scenes need."""
+
 OK, BENT, LOST = 0, 1, 2
 """How a whisker ended: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
 
 
 @cache
-def solver(real: type, capacity: int, bounds: tuple[int, int] | None = None) -> SimpleNamespace:
+def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, int] | None = None) -> SimpleNamespace:
     """Return the structures and the kernel for chains of at most ``capacity`` links in one precision.
 
     Args:
         real: ``warp.float32`` or ``warp.float64``.
         capacity: links that fit; a module is compiled for each.
+        against: what there is to touch, :data:`NOTHING`, :data:`PRIMITIVES` or :data:`MESHES`.
+        bounds: threads per block and blocks per multiprocessor that the CUDA compiler aims at.
     """
     import warp as wp
 
@@ -387,6 +392,16 @@ def solver(real: type, capacity: int, bounds: tuple[int, int] | None = None) -> 
                 touch.clear = real(0.0)
         return touch
 
+    if against < MESHES:
+
+        @wp.func
+        def near_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, margin: real) -> Touch:
+            return Touch()
+
+        @wp.func
+        def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, look: real) -> Touch:
+            return Touch()
+
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds)
     def run(ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, opt: Options, readings: wp.array(dtype=real), out: Results):
         lane = wp.tid()
@@ -402,7 +417,7 @@ def solver(real: type, capacity: int, bounds: tuple[int, int] | None = None) -> 
         beta = ch.beta[who]
         longest = ln.step[lane]
         shapes_from = bodies.first[scene]
-        shapes_to = bodies.first[scene + 1]
+        shapes_to = shapes_from + (bodies.first[scene + 1] - shapes_from) * wp.static(min(against, 1))
         loads_from = ln.load_first[lane]
         loads_to = ln.load_first[lane + 1]
         still_base = int(0)
@@ -594,12 +609,12 @@ def solver(real: type, capacity: int, bounds: tuple[int, int] | None = None) -> 
                 travel = h * (quickest + object_speed)
                 margin = wp.min(real(1.5) * travel + h * jump + real(0.001), real(wp.static(WIDEST)))
                 near = int(0)
-                if shapes_to > shapes_from:
+                if wp.static(against > NOTHING):
                     for i in range(links):
                         clear[i] = clear[i] - real(1.02) * travel
                         if clear[i] <= margin + ch.taper[i, who][0]:
                             near = 1
-                if near == 1:
+                if wp.static(against > NOTHING) and near == 1:
                     cvw = bw
                     cvv = bv
                     for i in range(links):

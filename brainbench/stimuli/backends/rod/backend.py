@@ -166,7 +166,7 @@ def _simulate(
     if not lanes:
         return found
     real = wp.float32 if fidelity.precision == "single" else wp.float64
-    kernels = solver(real, capacity)
+    kernels = solver(real, capacity, batch.shapes.needs)
     readings = first.times * MILLI
     count, frames = len(lanes), len(readings)
     out = kernels.Results()

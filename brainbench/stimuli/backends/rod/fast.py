@@ -60,9 +60,11 @@ class SweepLauncher:
     """
 
     def __init__(
-        self, scenes: SweepScenes, fidelity: Fidelity, device: str = "cpu", bounds: tuple[int, int] | None = None
+        self, scenes: SweepScenes, fidelity: Fidelity, device: str = "cpu", against: int | None = None, bounds: tuple[int, int] | None = None
     ) -> None:
-        from brainbench.stimuli.backends.rod._solver import solver
+        from brainbench.stimuli.backends.rod._solver import MESHES, solver
+
+        against = MESHES if against is None else against
 
         grid = scenes.grid
         if grid.mover != "object":
@@ -70,7 +72,6 @@ class SweepLauncher:
         wp = warp()
         self.device = pick_device(device)
         self.scenes, self.grid, self.fidelity = scenes, grid, fidelity
-        self._solids: dict[str, Solid] = {}
         self.seconds: dict[str, float] = {}
         """What the last launch spent on placing objects, uploading, and computing."""
         self._head = grid.head.matrix
@@ -79,7 +80,7 @@ class SweepLauncher:
         chains = [build_chain(m.whisker, fidelity.link_count(m.whisker.arc_length)) for m in mounts]
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.real = wp.float32 if fidelity.precision == "single" else wp.float64
-        self.kernels = solver(self.real, self.capacity, bounds)
+        self.kernels = solver(self.real, self.capacity, against, BOUNDS if bounds is None else bounds)
         self._chains = to_struct(self.kernels.Chains, Chains(self.capacity, chains).arrays(), self.device)
         self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in chains])
         self.readings = grid.frames.readings * MILLI
@@ -98,11 +99,8 @@ class SweepLauncher:
         tracks = Tracks()
         bases = [tracks.add(knot, 0.0, 1.0) for knot in self._bases]
         shapes = Shapes(device)
-        for name, _ in objects:
-            if name not in self._solids:
-                self._solids = {name: self.scenes.solid(name)} | dict(list(self._solids.items())[:64])
         for name, sweeps in objects:
-            self._add(shapes, tracks, self._solids[name], sweeps)
+            self._add(shapes, tracks, self.scenes.solid(name), sweeps)
         clock.append(time.perf_counter())
         count, whiskers = len(shapes.first) - 1, len(self._bases)
         # Neighbouring threads take the same whisker past the same object.
@@ -229,6 +227,8 @@ class SweepLauncher:
 
 BLOCK = 64
 """Threads of one block on a GPU."""
+BOUNDS = (BLOCK, 8)
+"""CUDA launch bounds: registers are spilled for twice as many threads at a time (benchmarks/RESULTS.md)."""
 
 
 def _base_knot(mount: Any, grid: SweepGrid) -> NDArray[np.float64]:
