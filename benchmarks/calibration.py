@@ -217,7 +217,7 @@ def make_pool(
 
 def recovery(simulations: int) -> Result:
     rows, points = [], []
-    for noise in (0.5, 1.0, 2.0, 4.0, 6.0, 9.0, 14.0, 25.0):
+    for noise in (1.0, 3.0, 5.0, 7.0, 9.0, 12.0, 15.0, 20.0):
         pool = make_pool(simulations, noise, units=200, repeats=20, individual=0.0, mix=0.235, seed=7)
         reliability = np.array([subject.reliability for subject in pool.subjects])
         raw = np.array([float(compare(pool.model, subject.rdm)) for subject in pool.subjects])
@@ -264,8 +264,8 @@ def recovery(simulations: int) -> Result:
                 marker="." if style != ":" else None,
             )
         axes[0].axvline(0.5, ls=":", color="#999999")
-        axes[0].set(xlabel="mean reliability of an animal's RDM", ylabel="comparison with the model", ylim=(0, 1.6))
-        axes[0].legend(frameon=False)
+        axes[0].set(xlabel="mean reliability of an animal's RDM", ylabel="comparison with the model", ylim=(0, 1.4))
+        axes[0].legend(frameon=False, loc="lower left", fontsize=7)
         _save(figure, "calibration_recovery.png")
 
     return Result(
@@ -325,7 +325,13 @@ def coverage(simulations: int) -> Result:
                 axis.plot(
                     [line[1] for line in own], [line[2][index] for line in own], color=colour, marker=".", label=name
                 )
-            axis.set(xlabel="animals", ylabel="coverage of 90 % intervals", ylim=(0.55, 1), title=f"{word} trial noise")
+            axis.set(
+                xlabel="animals",
+                ylabel="coverage of 90 % intervals",
+                ylim=(0.55, 1),
+                title=f"{word} trial noise",
+                xticks=(3, 5, 8, 11, 20),
+            )
         axes[0].legend(frameon=False, fontsize=7)
         _save(figure, "calibration_coverage.png")
 
@@ -404,7 +410,7 @@ def faults(simulations: int) -> Result:
 
     studies = max(10, simulations // 50)
     rows = []
-    for imbalance in (0.0, 0.3):
+    for imbalance in (0.0, 0.5):
         design = Recordings(animals=11, sessions=3, units=20, imbalance=imbalance)
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
             values, reliable = [], []

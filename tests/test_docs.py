@@ -69,3 +69,22 @@ def run_help():
     from brainbench.cli import app
 
     return lambda *words: CliRunner().invoke(app, [*words, "--help"]).output
+
+
+def test_the_metric_of_the_statistics_page_scores(tmp_path: Path):
+    import numpy as np
+
+    from brainbench.metrics import TrialBlock, find_metric
+
+    (block,) = _blocks("docs/statistics.md", "python")
+    path = tmp_path / "mine.py"
+    path.write_text(block, encoding="utf-8")
+    metric = find_metric(f"{path}:NearestNeighbour")
+    rng = np.random.default_rng(0)
+    latent, labels = rng.normal(size=(6, 3)), np.repeat(np.arange(6), 6)
+    trials = [
+        TrialBlock((latent @ rng.normal(size=(3, 20)))[labels] + rng.normal(size=(36, 20)), labels) for _ in "abc"
+    ]
+    animals = [metric.animal(str(i), [block], 6) for i, block in enumerate(trials)]
+    score = metric.score({"same": latent}, animals, name="x", stimuli=list("abcdef"))
+    assert score.value > 0.5

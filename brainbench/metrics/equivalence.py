@@ -49,7 +49,7 @@ class EquivalenceTest:
         if self.status == "undefined" or self.interval is None:
             return f"undefined: {self.reason}"
         text = (
-            f"{self.verdict} within ±{self.margin:g}: model − animals {self.difference:+.3f} "
+            f"{self.verdict} (margin ±{self.margin:g}): model − animals {self.difference:+.3f} "
             f"[{self.interval.low:+.3f}, {self.interval.high:+.3f}], p = {self.p:.2g}"
         )
         return text if self.status == "ok" else f"{text} ({self.status}: {self.reason})"
