@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from brainbench.cli._shared import JsonOption, emit, progress_bar, table
 
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
-
-
-@app.callback()
-def _group() -> None:
-    """Keep ``whisker`` a subcommand while it is the only one."""
 
 
 @app.command("whisker")
@@ -125,3 +120,69 @@ def score(
         right=(2, 4),
     )
     emit({"points": points}, text, as_json=as_json)
+
+
+@app.command("model")
+def model(
+    name: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
+    precisions: Annotated[str, typer.Option(help="float32, bf16, int8, comma-separated.")] = "float32,bf16,int8",
+    unrolls: Annotated[str, typer.Option(help="biological, full, comma-separated.")] = "biological",
+    steps: Annotated[str, typer.Option(help="Last steps of the sweeps that are shown, comma-separated.")] = "22",
+    score: Annotated[bool, typer.Option(help="Also score every setting on the demo recordings.")] = False,
+    data: Annotated[Path | None, typer.Option(help="Folder of sweeps: also measure test accuracy.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure error, latency, score and accuracy of a network over precision, unrolling and number of steps."""
+    from brainbench.errors import UsageError
+    from brainbench.models import tradeoff
+    from brainbench.stimuli import load_stimuli
+
+    try:
+        counts = [int(item) for item in _items(steps)]
+    except ValueError as error:
+        raise UsageError(f"--steps takes whole numbers separated by commas; received {steps!r}.") from error
+    chosen = tradeoff.settings(_items(precisions), _items(unrolls), counts)
+    results = []
+    with progress_bar() as progress:
+        sweeps = load_stimuli("rodgers", whiskers="all", fidelity=None, progress=progress).input
+        for done, setting in enumerate(chosen):
+            point = tradeoff.measure(name, setting, sweeps, seed=seed)
+            found = {"setting": setting, "error": point.error, "ms": point.cost, **point.settings}
+            reduced = tradeoff.Reduced(name, setting, seed=seed)
+            if score:
+                import brainbench
+
+                found["score"] = brainbench.score(reduced, normalize=False).value
+            if data is not None:
+                found |= _accuracy(reduced, data)
+            results.append(found)
+            progress(done + 1, len(chosen), "settings")
+    rows = [
+        [
+            str(item["precision"]),
+            str(item["unroll"]),
+            str(item["steps"]),
+            f"{item['error']:.2%}",
+            f"{item['ms']:.2f}",
+            f"{item['p99_ms']:.2f}",
+            f"{item['stored_bytes'] / 1e6:.2f}",
+            f"{item['score']:.3f}" if "score" in item else "–",
+            f"{item['top1']:.3f}" if "top1" in item else "–",
+        ]
+        for item in results
+    ]
+    columns = ["precision", "unrolling", "steps", "error", "ms / sweep", "p99 ms", "MB", "score", "top-1"]
+    emit(results, table(f"{name}, batch 1:", columns, rows, right=tuple(range(2, 9))), as_json=as_json)
+
+
+def _items(text: str) -> list[str]:
+    return [item.strip() for item in text.split(",") if item.strip()]
+
+
+def _accuracy(reduced: Any, data: Path) -> dict[str, float]:
+    from brainbench.datasets import WhiskingDataset
+    from brainbench.models.evaluation import evaluate
+
+    found = evaluate(reduced, WhiskingDataset(data, split="test", shuffle=False))
+    return {"top1": found.top1, "top5": found.top5}

@@ -232,6 +232,14 @@ class EAD(nn.Module):
                 f"The model expects {self._expected('batch', 'time')} ({self.spec.sub_steps} sub-steps × "
                 f"{len(CHANNELS)} channels on the whisker grid, SI units); received {list(x.shape)}."
             )
+        # On CUDA, and inside compiled or training steps, looking would stop the queue; training checks its loss.
+        quick = x.is_cuda or self.training or torch.compiler.is_compiling() or torch.compiler.is_exporting()
+        if not quick and not torch.isfinite(x).all():
+            count = int((~torch.isfinite(x)).sum())
+            raise UsageError(
+                f"{count:,} of {x.numel():,} values of the stimulus are not finite (NaN or infinite); a missing "
+                "whisker is zero, and an unstable simulation must be left out."
+            )
         return self.normaliser(x)
 
     def _expected(self, *leading: str) -> str:

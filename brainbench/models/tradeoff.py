@@ -1,0 +1,134 @@
+"""Speed against accuracy of a network: precision, unrolling and number of steps.
+
+Every setting is compared with the same network in float32, unrolled biologically over all steps.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterable
+from dataclasses import asdict, dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from brainbench.errors import UsageError, unknown_name
+from brainbench.fidelity import TradeoffPoint
+from brainbench.models.ead import EAD
+from brainbench.models.graph import TemporalGraph
+from brainbench.models.graph_spec import UNROLLS, Unroll
+from brainbench.models.registry import load_model
+
+PRECISIONS = ("float32", "bf16", "int8")
+"""``bf16`` computes in mixed precision; ``int8`` stores weights in 8 bits, with one scale per output channel, and
+computes in float32."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to run a network."""
+
+    precision: str = "float32"
+    unroll: Unroll = "biological"
+    steps: int = 22
+    """The sweep's last steps that are shown."""
+
+    def __post_init__(self) -> None:
+        if self.precision not in PRECISIONS:
+            raise unknown_name("precision", self.precision, PRECISIONS)
+        if self.unroll not in UNROLLS:
+            raise unknown_name("unrolling", self.unroll, UNROLLS)
+        if self.steps < 1:
+            raise UsageError(f"A sweep has at least 1 step; received {self.steps}.")
+
+
+class Reduced(nn.Module):
+    """A network run in one setting; it can be scored and extracted from like the network itself.
+
+    Raises:
+        UsageError: the network cannot be unrolled that way.
+    """
+
+    def __init__(self, name: str, setting: Setting, *, seed: int = 0) -> None:
+        super().__init__()
+        model = load_model(name, seed=seed)
+        if not isinstance(model, EAD):
+            raise UsageError(f"{name!r} is no encoder-attender-decoder network, so its settings cannot be changed.")
+        if setting.unroll != "biological":
+            if not isinstance(model.encoder, TemporalGraph):
+                raise UsageError(f"The encoder of {name!r} knows one unrolling only; leave out {setting.unroll!r}.")
+            model = load_model(name, seed=seed, unroll=setting.unroll)
+        if setting.precision == "int8":
+            round_weights(model)
+        self.model: Any = model
+        self.setting = setting
+        self.layers: tuple[str, ...] = self.model.layers
+        self.spec = self.model.spec
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the answer [B, classes] to the sweep's last steps."""
+        with self._precision(x):
+            return self.model(x[:, -self.setting.steps :]).float()
+
+    def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
+        """Return ``{layer: [B, steps, ...]}`` of the sweep's last steps."""
+        with self._precision(x):
+            return self.model.activations(x[:, -self.setting.steps :], layers)
+
+    def stored_bytes(self) -> int:
+        """Return the size of the weights as they would be stored."""
+        size = {"float32": 4, "bf16": 2, "int8": 1}[self.setting.precision]
+        return sum(p.numel() * (size if p.ndim > 1 else 4) for p in self.model.parameters())
+
+    def _precision(self, x: torch.Tensor) -> Any:
+        return torch.autocast(x.device.type, torch.bfloat16, enabled=self.setting.precision == "bf16")
+
+
+@torch.no_grad()
+def round_weights(model: nn.Module) -> None:
+    """Round every weight of more than one axis to 8 bits, symmetrically, with one scale per output channel."""
+    for weight in model.parameters():
+        if weight.ndim > 1:
+            scale = weight.flatten(1).abs().amax(1).clamp_min(1e-30).view(-1, *(1,) * (weight.ndim - 1)) / 127
+            weight.copy_((weight / scale).round() * scale)
+
+
+def settings(
+    precisions: Iterable[str] = PRECISIONS,
+    unrolls: Iterable[str] = ("biological",),
+    steps: Iterable[int] = (22,),
+) -> list[Setting]:
+    """Return every combination of the choices."""
+    return [Setting(p, u, s) for p, u, s in product(precisions, unrolls, steps)]  # pyright: ignore[reportArgumentType]
+
+
+def measure(name: str, setting: Setting, sweeps: Any, *, seed: int = 0, repeats: int = 5) -> TradeoffPoint:
+    """Measure one setting on sweeps [K, T, C, H, W] in SI.
+
+    Returns:
+        A point whose ``error`` is the relative difference of the answers from those of the reference setting on all
+        steps, and whose ``cost`` is the median time of one sweep at batch 1 in ms, with the settings, the stored size
+        and the p99 time beside them.
+
+    Raises:
+        UsageError: the setting does not fit the network or the sweeps.
+    """
+    x = torch.as_tensor(sweeps, dtype=torch.float32)
+    if x.ndim != 5 or x.shape[1] < setting.steps:
+        raise UsageError(f"{setting.steps} steps cannot be taken from sweeps of shape {list(x.shape)}.")
+    reduced = Reduced(name, setting, seed=seed)
+    with torch.no_grad():
+        expected = load_model(name, seed=seed)(x)
+        found = reduced(x)
+        times = []
+        for _ in range(repeats + 1):
+            start = time.perf_counter()
+            reduced(x[:1])
+            times.append((time.perf_counter() - start) * 1e3)
+    error = float((found - expected).norm() / expected.norm().clamp_min(1e-30))
+    p50, p99 = np.percentile(times[1:], [50, 99])
+    described = {**asdict(setting), "p99_ms": float(p99), "stored_bytes": reduced.stored_bytes()}
+    return TradeoffPoint(error, float(p50), described)

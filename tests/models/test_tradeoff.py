@@ -1,0 +1,63 @@
+import pytest
+import torch
+
+from brainbench.errors import UsageError
+from brainbench.models.registry import load_model
+from brainbench.models.tradeoff import Reduced, Setting, measure, round_weights, settings
+
+SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+NAME = "zhuang-ugrnn-ln-small"
+
+
+def _sweeps(count=3, steps=10):
+    return torch.randn(count, steps, 30, 5, 7) * SCALE
+
+
+def test_the_reference_setting_has_no_error():
+    point = measure(NAME, Setting(steps=10), _sweeps())
+    assert point.error == pytest.approx(0.0, abs=1e-6)
+    assert 0 < point.cost <= point.settings["p99_ms"]
+
+
+def test_lower_precision_costs_a_little_accuracy_and_saves_memory():
+    points = {item.precision: measure(NAME, item, _sweeps()) for item in settings(steps=(10,))}
+    assert 0 < points["bf16"].error < 0.1
+    assert 0 < points["int8"].error < 0.2
+    sizes = [points[name].settings["stored_bytes"] for name in ("float32", "bf16", "int8")]
+    assert sizes[0] > 1.8 * sizes[1] > 3 * sizes[2]
+
+
+def test_rounding_to_eight_bits_moves_no_weight_by_more_than_half_a_level():
+    model = load_model(NAME)
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
+    round_weights(model)
+    for name, value in model.named_parameters():
+        if value.ndim > 1:
+            level = before[name].flatten(1).abs().amax(1) / 127
+            moved = (value - before[name]).flatten(1).abs().amax(1)
+            assert (moved <= 0.501 * level).all()
+        else:
+            assert torch.equal(value, before[name])
+
+
+def test_fewer_steps_and_another_unrolling_change_the_answer():
+    assert measure(NAME, Setting(steps=5), _sweeps()).error > 0.01
+    assert measure(NAME, Setting(unroll="full", steps=10), _sweeps()).error > 0.01
+
+
+def test_a_reduced_network_is_scored_like_the_network():
+    reduced, x = Reduced(NAME, Setting("bf16", steps=6)), _sweeps()
+    assert reduced.layers == load_model(NAME).layers
+    with torch.no_grad():
+        assert reduced.activations(x, ["decoder"])["decoder"].shape == (3, 6, 117)
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(UsageError, match="Unknown precision 'int4'"):
+        Setting("int4")
+    with pytest.raises(UsageError, match="at least 1 step; received 0"):
+        Setting(steps=0)
+    with pytest.raises(UsageError, match="knows one unrolling only"):
+        Reduced("s4-small", Setting(unroll="full"))
+    with pytest.raises(UsageError, match="22 steps cannot be taken"):
+        measure(NAME, Setting(), _sweeps())
