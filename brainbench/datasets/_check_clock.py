@@ -27,7 +27,7 @@ BEFORE = 0.060
 """Baseline before it, s."""
 LARGEST = 600.0
 """Largest shift that is searched for, s."""
-CLEAR = 7.0
+CLEAR = 6.5
 """Standard deviations from which a response at any of 240,000 lags is taken for real; Poisson noise of
 one to thirty units reached 6 in 450 sessions."""
 PRESENT, ABSENT = 3.5, 2.5
