@@ -144,6 +144,11 @@ class EAD(nn.Module):
         Raises:
             UsageError: as for :meth:`forward`.
         """
+        if self.spec.max_steps is not None and x.ndim == 5 and x.shape[1] > self.spec.max_steps:
+            # Said before the encoder has worked for nothing.
+            raise UsageError(
+                f"The model remembers at most {self.spec.max_steps} steps; received {x.shape[1]:,}. Shorten the sweep."
+            )
         if last and self.attender is None and isinstance(self.encoder, TemporalGraph):
             return self.encoder(self._normalise(x), **self._unroll, last=True)
         features = self.encoder(self._normalise(x), **self._unroll)
