@@ -8,7 +8,7 @@ The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`spli
 
 from __future__ import annotations
 
-from brainbench.metrics.animal_to_animal import score_animals
+from brainbench.metrics.animal_to_animal import pairwise_consistency, score_animals
 from brainbench.metrics.bootstrap import DRAWS, Bootstrap, bootstrap_ceiling, bootstrap_comparisons, bootstrap_score
 from brainbench.metrics.ceiling import NoiseCeiling, noise_ceiling
 from brainbench.metrics.compare import COMPARISONS, compare
@@ -24,6 +24,7 @@ from brainbench.metrics.rdm import RDM_METHODS, rdm, rdm_problem
 from brainbench.metrics.reliability import SUBJECT_METHODS, SplitHalf, TrialBlock, split_half
 from brainbench.metrics.score import score_rdms
 from brainbench.metrics.subject import SubjectRDM, subject_rdm
+from brainbench.metrics.units import reliable_units, unit_reliability
 
 __all__ = [
     "COMPARISONS",
@@ -58,15 +59,18 @@ __all__ = [
     "noise_ceiling",
     "noise_corrected",
     "noise_precision",
+    "pairwise_consistency",
     "permutation_test",
     "rdm",
     "rdm_movie",
     "rdm_problem",
     "register_metric",
+    "reliable_units",
     "score_animals",
     "score_rdms",
     "spearman_brown",
     "split_half",
     "subject_rdm",
     "turing_test",
+    "unit_reliability",
 ]

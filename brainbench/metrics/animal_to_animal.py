@@ -110,6 +110,38 @@ def score_animals(
     )
 
 
+def pairwise_consistency(
+    subjects: Sequence[SubjectRDM], *, estimator: str = "default", compare: str = "pearson"
+) -> tuple[tuple[str, ...], Floats]:
+    """Return the names [A] and the noise-corrected comparison [A, A] of every two animals, both sides corrected.
+
+    NaN on the diagonal and where either animal has no usable RDM or no positive reliability. Single pairs
+    are noisier than :func:`score_animals`, which compares each animal with the mean of the others.
+
+    Raises:
+        UsageError: no animals, RDMs that do not fit, unknown estimator or comparison.
+    """
+    check_comparison(compare)
+    if not subjects:
+        raise UsageError("There are no animals to compare; give at least two SubjectRDM.")
+    animals = gather(subjects, estimator=estimator, comparison=compare, pairs=len(subjects[0].rdm))
+    found = np.full((len(animals.subjects), len(animals.subjects)), np.nan)
+    for first in animals.usable:
+        for second in animals.usable:
+            if first < second:
+                one, two = animals.subjects[first], animals.subjects[second]
+                sides = [subject.split_half_by(compare) for subject in (one, two)]
+                count = min(map(len, sides))
+                result = noise_corrected(
+                    float(compare_rdms(one.rdm, two.rdm, method=compare)),
+                    sides[0][:count],
+                    estimator=estimator,
+                    other_split_half_r=sides[1][:count],
+                )
+                found[first, second] = found[second, first] = result.value
+    return tuple(subject.subject for subject in animals.subjects), found
+
+
 def _verdict(
     animals: Animals, results: dict[int, Corrected], found: list[int], count: int, smallest: float
 ) -> tuple[Status, tuple[str, ...]]:

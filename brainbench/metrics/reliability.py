@@ -213,7 +213,7 @@ def usable_sessions(
             raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
         check_finite(responses)
         recorded = np.isfinite(responses).any(axis=1)
-        hashes = _hashes(block, responses, codes)[recorded]
+        hashes = trial_hashes(block, responses, codes)[recorded]
         responses, codes = responses[recorded], codes[recorded]
         # A trial without any recorded unit is no trial, whatever its label.
         trials = np.bincount(codes, minlength=count)
@@ -258,7 +258,8 @@ def _without_noise(
     return kept, None, notes
 
 
-def _hashes(block: TrialBlock, responses: Floats, codes: Ints) -> Hashes:
+def trial_hashes(block: TrialBlock, responses: Floats, codes: Ints) -> Hashes:
+    """Return one hash per trial, of its key or of its content."""
     if block.keys is None:
         return content_hashes(responses, codes)
     if len(block.keys) != len(codes):
