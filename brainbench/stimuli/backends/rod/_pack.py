@@ -266,7 +266,7 @@ class Shapes:
     @property
     def needs(self) -> int:
         """What the kernel must be able to touch."""
-        from brainbench.stimuli.backends.rod._solver import MESHES, NOTHING, PRIMITIVES
+        from brainbench.stimuli.backends.rod._limits import MESHES, NOTHING, PRIMITIVES
 
         return MESHES if self.meshes else PRIMITIVES if self.rows else NOTHING
 

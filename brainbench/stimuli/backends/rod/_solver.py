@@ -12,36 +12,24 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+from brainbench.stimuli.backends.rod._limits import (
+    BENT,
+    CONTACTS,
+    CREVICE,
+    FAR,
+    FINEST,
+    LARGEST_BEND,
+    LOST,
+    MESHES,
+    NEAR,
+    NOTHING,
+    REST,
+    SWEEPS,
+    TRAVEL,
+    WIDEST,
+)
 from brainbench.stimuli.backends.rod._shapes import MESH, distances
 from brainbench.stimuli.backends.rod._tracks import tracks
-
-CONTACTS = 4
-"""Contacts of one whisker that are solved together; the tightest are kept when there are more."""
-SWEEPS = 20
-"""Most Gauss-Seidel sweeps over the contacts of one step."""
-LARGEST_BEND = 1.5
-"""Bend of one joint (rad) beyond which a chain means nothing."""
-REST = 1e-6
-"""Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
-FAR = 3.0
-"""How far (mm) a distance query looks; a link further away is looked at again when it may have come nearer."""
-NEAR = 0.2
-"""How much further (mm) than needed a search among triangles looks, so that it need not be made in every step."""
-TRAVEL = 0.25
-"""Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
-FINEST = 16
-"""Most parts into which a step is split for that."""
-WIDEST = 0.8
-"""Widest search for contacts (mm)."""
-CREVICE = 0.02
-"""Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
-
-NOTHING, PRIMITIVES, MESHES = 0, 1, 2
-"""What whiskers may touch: a kernel holds only the code that its scenes need."""
-
-OK, BENT, LOST = 0, 1, 2
-"""How a whisker ended: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
-
 
 @cache
 def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, int] | None = None) -> SimpleNamespace:
@@ -483,24 +471,16 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         resting = may_rest
         idle = opt.start
         closing = int(0)
-        for reading in range(readings.shape[0]):
-            upto = readings[reading]
+        # A reading takes the wrench of the step that begins at its time, so one more step follows the last.
+        pending = int(-1)
+        for reading in range(readings.shape[0] + 1):
+            upto = before + longest
+            if reading < readings.shape[0]:
+                upto = readings[reading]
             span = upto - before
             if span <= zero:
-                # A reading at the very start: unbent and silent.
-                if opt.shape == 1:
-                    pose0 = pose_at(tr, base, before)
-                    x = rotate(pose0.turn, vec3(one, zero, zero))
-                    y = rotate(pose0.turn, vec3(zero, one, zero))
-                    at = pose0.place
-                    out.points[reading, 0, lane] = at
-                    for i in range(links):
-                        b4 = ch.build[i, who]
-                        turned = x * b4[1] + y * b4[2]
-                        y = y * b4[1] - x * b4[2]
-                        x = turned
-                        at = at + x * b4[0]
-                        out.points[reading, i + 1, lane] = at
+                # A reading at the very start.
+                pending = reading
                 continue
             if resting == 1 and upto > idle:
                 # When may an object come near at the earliest? The whisker stands straight out of its base.
@@ -547,17 +527,16 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                     q[i] = vec2(zero, zero)
                     qd[i] = vec2(zero, zero)
                 before = upto
+                pending = int(-1)
                 continue
-            arc_sum = zero
-            force_sum = zero
             left = span
             last = int(0)
             while last == 0:
                 now = upto - left
                 # Where something is near, a step moves no point of the whisker further than a contact search looks.
                 wanted = longest
-                if near == 1 and quickest * longest > real(wp.static(TRAVEL)):
-                    wanted = wp.max(longest / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / quickest)
+                if near == 1 and (quickest + object_speed) * longest > real(wp.static(TRAVEL)):
+                    wanted = wp.max(longest / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / (quickest + object_speed))
                 count = wp.max(1, int(wp.ceil(left / wanted - real(1e-3))))
                 h = left / real(count)
                 left = left - h
@@ -1148,17 +1127,27 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
 
                 jump = wp.max(h * wp.length(tip_push), real(0.5) * jump)
                 touched = int(0)
-                if last == 1:
-                    arc_sum = zero
-                    force_sum = zero
-                if contacts > 0:
+                arc_sum = zero
+                force_sum = zero
+                if contacts > 0 and closing == 1:
                     for c in range(contacts):
-                        if closing == 1 and force[3 * c] > zero:
+                        if force[3 * c] > zero:
                             touched = 1
-                            if last == 1:
-                                arc_sum += force[3 * c] * c_arc[c]
-                                force_sum += force[3 * c]
+                            arc_sum += force[3 * c] * c_arc[c]
+                            force_sum += force[3 * c]
                 touching += touched
+                if pending >= 0:
+                    acting = opt.axes * reaction_v * real(-1e-3)
+                    turning = opt.axes * reaction_w * real(-1e-6)
+                    for d in range(3):
+                        out.wrench[row, pending, column, d] = acting[d]
+                        out.wrench[row, pending, column, 3 + d] = turning[d]
+                    if force_sum > zero:
+                        out.contact[row, pending, column] = real(1e-3) * arc_sum / force_sum
+                    if opt.shape == 1:
+                        for i in range(links + 1):
+                            out.points[pending, i, lane] = origin + node[i]
+                    pending = int(-1)
                 steps = steps + 1
                 busy = touched
                 moved_links = int(0)
@@ -1184,35 +1173,10 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                 if busy == 0 and worst < real(wp.static(REST)) and may_rest == 1:
                     resting = 1
                     idle = zero
-                if last == 1 and status == 0:
-                    acting = opt.axes * reaction_v * real(-1e-3)
-                    turning = opt.axes * reaction_w * real(-1e-6)
-                    for d in range(3):
-                        out.wrench[row, reading, column, d] = acting[d]
-                        out.wrench[row, reading, column, 3 + d] = turning[d]
-                    if force_sum > zero:
-                        out.contact[row, reading, column] = real(1e-3) * arc_sum / force_sum
-                    if opt.shape == 1:
-                        x = rotate(pose1.turn, vec3(one, zero, zero))
-                        y = rotate(pose1.turn, vec3(zero, one, zero))
-                        z = wp.cross(x, y)
-                        at = pose1.place
-                        out.points[reading, 0, lane] = at
-                        for i in range(links):
-                            b4 = ch.build[i, who]
-                            angle = q[i]
-                            turned = x * b4[1] + y * b4[2]
-                            y = y * b4[1] - x * b4[2]
-                            x = turned * cosine(angle[0]) - z * sine(angle[0])
-                            z = turned * sine(angle[0]) + z * cosine(angle[0])
-                            turned = x * cosine(angle[1]) + y * sine(angle[1])
-                            y = y * cosine(angle[1]) - x * sine(angle[1])
-                            x = turned
-                            at = at + x * b4[0]
-                            out.points[reading, i + 1, lane] = at
                 if status != 0:
                     break
             before = upto
+            pending = reading
             if status != 0:
                 break
         out.depth[lane] = deepest

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError
-from brainbench.stimuli.backends._engines import MILLI, warn_overdamped
+from brainbench.stimuli.backends._engines import MILLI, step_travel, strongest_force, too_strong, warn_overdamped
 from brainbench.stimuli.backends._reach import Reach, reachable
-from brainbench.stimuli.backends.protocol import Trace
+from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
+from brainbench.stimuli.backends.rod._limits import DOUBTFUL, FINEST, LOST, OK, WIDEST
 from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
 from brainbench.stimuli.chain import build_chain
 
@@ -153,16 +154,16 @@ def _simulate(
     first = jobs[0]
     batch = _Batch(device, fidelity, capacity, first.start, float(first.times[-1]))
     found: list[tuple[int, Trace]] = []
-    lanes: list[tuple[int, Job, Chain]] = []
+    lanes: list[tuple[int, Job, Chain, tuple[float, str]]] = []
     seen = np.linspace(first.start, first.times[-1], max(2, math.ceil((first.times[-1] - first.start) / KNOT)))
     for index, job in zip(indices, jobs, strict=True):
         position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
         reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
         moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
-        if reach or moves or job.loads or np.any(job.gravity) or record_shape:
-            lanes.append((index, job, batch.add(job, reach)))
+        if reach or moves or job.loads or np.any(job.gravity):
+            lanes.append((index, job, batch.add(job, reach), _too_fast(job, reach, position, euler, seen, fidelity)))
         else:
-            found.append((index, _silent(job, started)))
+            found.append((index, _silent(job, fidelity, record_shape, started)))
     if not lanes:
         return found
     real = wp.float32 if fidelity.precision == "single" else wp.float64
@@ -198,9 +199,9 @@ def _simulate(
         for name in ("wrench", "contact", "depth", "status", "failed", "steps", "touching", "crowded", "unsolved")
     }
     points = out.points.numpy() if record_shape else None
-    for lane, (index, job, chain) in enumerate(lanes):
+    for lane, (index, job, chain, missed) in enumerate(lanes):
         shape = None if points is None else points[:, : chain.links + 1, lane].astype(float) / MILLI
-        found.append((index, _trace(results, lane, job, shape, spent / count)))
+        found.append((index, _trace(results, lane, job, shape, missed, spent / count)))
     return found
 
 
@@ -234,48 +235,84 @@ def batch_structs(batch: _Batch, kernels: Any, device: Any) -> list[Any]:
     ]
 
 
-def _silent(job: Job, started: float) -> Trace:
+def _silent(job: Job, fidelity: Fidelity, record_shape: bool, started: float) -> Trace:
     count = len(job.times)
+    shape = None
+    if record_shape:
+        chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
+        position, euler = job.follicle.pose(job.times[:1])
+        rest = np.pad(chain.points, ((0, 0), (0, 1))) @ base_rotation(euler)[0].T + position[0]
+        shape = np.repeat(rest[None], count, axis=0)
     return Trace(
         wrench=np.zeros((count, 6)),
         contact=np.zeros(count, dtype=bool),
         contact_arc=np.full(count, np.nan),
         seconds=time.thread_time() - started,
+        link_positions=shape,
     )
 
 
-def _trace(results: dict[str, NDArray], lane: int, job: Job, shape: NDArray | None, seconds: float) -> Trace:
-    from brainbench.stimuli.backends.rod._solver import BENT
+def _too_fast(
+    job: Job, reach: Reach, position: NDArray, euler: NDArray, times: NDArray, fidelity: Fidelity
+) -> tuple[float, str]:
+    """When (s) an object first moves further against the whisker than the finest step looks, and that in words."""
+    chain = build_chain(job.whisker, 8)
+    finest = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi)) / FINEST
+    share = finest / np.diff(times)
+    for obstacle in reach.obstacles:
+        travel = step_travel(job.whisker, position, euler, obstacle, times) * share
+        if (travel > WIDEST / MILLI).any():
+            first = int(np.argmax(travel > WIDEST / MILLI))
+            return float(times[first]), (
+                f"an object moves by {travel[first] * MILLI:.3g} mm against the whisker in the shortest step at "
+                f"{times[first]:.6g} s, further than contacts are looked for; choose a smaller time step"
+            )
+    return np.inf, ""
 
-    status = int(results["status"][lane])
-    failed = float(results["failed"][lane]) / MILLI
-    good = np.ones(len(job.times), dtype=bool) if not status else job.times < failed - 1e-9
+
+def _trace(
+    results: dict[str, NDArray],
+    lane: int,
+    job: Job,
+    shape: NDArray | None,
+    missed: tuple[float, str],
+    seconds: float,
+) -> Trace:
+    steps, unsolved, crowded = (int(results[name][lane]) for name in ("steps", "unsolved", "crowded"))
     wrench = results["wrench"][lane, :, 0].astype(float)
     arc = results["contact"][lane, :, 0].astype(float)
+    end, reason = _end(int(results["status"][lane]), float(results["failed"][lane]) / MILLI)
+    strength = np.linalg.norm(wrench[:, :3], axis=1)
+    wild = ~(strength <= strongest_force(job.whisker))
+    if wild.any() and job.times[np.argmax(wild)] < end:
+        first = int(np.argmax(wild))
+        end, reason = float(job.times[first]), f"at {job.times[first]:.6g} s " + too_strong(strength[first], job.whisker)
+    if missed[0] < end:
+        end, reason = missed
+    if not reason and unsolved > DOUBTFUL * steps:
+        end, reason = -np.inf, f"the contact forces of {unsolved} of {steps} steps did not converge"
+    if not reason and crowded > DOUBTFUL * steps:
+        end, reason = -np.inf, f"more contacts than can be solved together in {crowded} of {steps} steps"
+    good = job.times < end - 1e-9
     touching = (arc >= 0) & good
-    reason = ""
-    if status:
-        what = (
-            "a joint bent by more than 1.5 rad, more than a chain of links can represent"
-            if status == BENT
-            else "the state stopped being finite"
-        )
-        reason = f"{what} at {failed:.6g} s; choose a smaller time step"
-    unsolved, crowded, steps = (int(results[name][lane]) for name in ("unsolved", "crowded", "steps"))
-    if not reason and unsolved > 0.02 * steps:
-        status, reason = 1, f"the contact forces of {unsolved} of {steps} steps did not converge"
-        good[:] = False
-    if not reason and crowded > 0.01 * steps:
-        status, reason = 1, f"more contacts than can be solved together in {crowded} of {steps} steps; use fewer links"
-        good[:] = False
     return Trace(
         wrench=np.where(good[:, None], wrench, np.nan),
-        contact=touching & good,
-        contact_arc=np.where(touching & good, arc, np.nan),
+        contact=touching,
+        contact_arc=np.where(touching, arc, np.nan),
         penetration=float(results["depth"][lane]) / MILLI,
-        status="unstable" if status else "ok",
+        status="unstable" if reason else "ok",
         reason=reason,
         steps=steps,
         seconds=seconds,
         link_positions=None if shape is None else np.where(good[:, None, None], shape, np.nan),
     )
+
+
+def _end(status: int, failed: float) -> tuple[float, str]:
+    """When (s) the numbers of a lane end, and why."""
+    if status == OK:
+        return np.inf, ""
+    what = "a joint bent by more than 1.5 rad, more than a chain of links can represent"
+    if status == LOST:
+        what = "the state stopped being finite"
+    return failed, f"{what}, at {failed:.6g} s; choose more links or a smaller time step"

@@ -16,6 +16,7 @@ import numpy as np
 from brainbench.errors import UsageError
 from brainbench.stimuli.backends._engines import MILLI
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
+from brainbench.stimuli.backends.rod._limits import DOUBTFUL
 from brainbench.stimuli.backends.rod._pack import Chains, Shapes, Tracks, capacity_for, quaternions, still_knots
 from brainbench.stimuli.backends.rod._shapes import MESH
 from brainbench.stimuli.chain import build_chain
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from brainbench.stimuli.objects import Solid
     from brainbench.stimuli.sweep_grid import SweepGrid
     from brainbench.stimuli.sweeps import SweepScenes
-
-OK_STATUS = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,8 @@ class SweepLauncher:
     def __init__(
         self, scenes: SweepScenes, fidelity: Fidelity, device: str = "cpu", against: int | None = None, bounds: tuple[int, int] | None = None
     ) -> None:
-        from brainbench.stimuli.backends.rod._solver import MESHES, solver
+        from brainbench.stimuli.backends.rod._limits import MESHES
+        from brainbench.stimuli.backends.rod._solver import solver
 
         against = MESHES if against is None else against
 
@@ -170,7 +170,7 @@ class SweepLauncher:
             moved = np.moveaxis(wrench, 1, 0)
             wrench = np.moveaxis(frames.reduce(moved.astype(float)), 0, 1).astype(np.float32)
             contact = np.moveaxis(frames.split(np.moveaxis(contact, 1, 0)).any(axis=1), 0, 1)
-        doubtful = result.unsolved > 0.02 * np.maximum(result.steps, 1)
+        doubtful = result.unsolved > DOUBTFUL * np.maximum(result.steps, 1)
         unstable = (result.status != 0) | doubtful
         names = [mount.name for mount in self.scenes.array]
         reasons = [""] * len(unstable)

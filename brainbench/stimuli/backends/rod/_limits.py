@@ -1,0 +1,30 @@
+"""Limits of the ``rod`` solver: what it looks at, how long it tries, and when it gives up. mm, ms, rad."""
+
+CONTACTS = 4
+"""Contacts of one whisker that are solved together; the tightest are kept when there are more."""
+SWEEPS = 20
+"""Most Gauss-Seidel sweeps over the contacts of one step."""
+LARGEST_BEND = 1.5
+"""Bend of one joint (rad) beyond which a chain means nothing."""
+DOUBTFUL = 0.02
+"""Share of the steps whose contact forces may fail to converge before a result counts as unstable."""
+REST = 1e-6
+"""Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
+FAR = 3.0
+"""How far (mm) a distance query looks; a link further away is looked at again when it may have come nearer."""
+NEAR = 0.2
+"""How much further (mm) than needed a search among triangles looks, so that it need not be made in every step."""
+TRAVEL = 0.25
+"""Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
+FINEST = 16
+"""Most parts into which a step is split for that."""
+WIDEST = 0.8
+"""Widest search for contacts (mm)."""
+CREVICE = 0.02
+"""Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
+
+NOTHING, PRIMITIVES, MESHES = 0, 1, 2
+"""What whiskers may touch: a kernel holds only the code that its scenes need."""
+
+OK, BENT, LOST = 0, 1, 2
+"""How a whisker ended: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
