@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from brainbench.stimuli.collections import resolve_objects
 from brainbench.stimuli.sweeps import GRIDS, SweepScenes
 
 
-def timed(wp, device, run, repeats: int = 3) -> float:
+def timed(wp: Any, device: Any, run: Callable[[], None], repeats: int = 3) -> float:
     """Median seconds of a launch, warmed up."""
     run()
     wp.synchronize_device(device)
@@ -33,7 +35,14 @@ def timed(wp, device, run, repeats: int = 3) -> float:
 
 
 def free(
-    device_name: str, lanes: int, links: int, steps: int, block: int, most: int = 0, bounds=None, precision: str = "single"
+    device_name: str,
+    lanes: int,
+    links: int,
+    steps: int,
+    block: int,
+    most: int = 0,
+    bounds: tuple[int, int] | None = None,
+    precision: str = "single",
 ) -> None:
     """Whiskers that swing under gravity, nothing near: pure integration."""
     wp = warp()
@@ -80,11 +89,14 @@ def free(
         readings,
         out,
     ]
-    seconds = timed(wp, device, lambda: wp.launch(kernels.run, lanes, inputs, device=device, block_dim=block, max_blocks=most))
+    seconds = timed(
+        wp, device, lambda: wp.launch(kernels.run, lanes, inputs, device=device, block_dim=block, max_blocks=most)
+    )
     done = int(out.steps.numpy().astype(np.int64).sum())
     bad = int((out.status.numpy() != 0).sum())
     print(
-        f"free  N={links} {precision} lanes={lanes} block={block} blocks={most or 'all'} bounds={bounds}: {done / seconds:.3e} whisker-steps/s "
+        f"free  N={links} {precision} lanes={lanes} block={block} blocks={most or 'all'} bounds={bounds}: "
+        f"{done / seconds:.3e} whisker-steps/s "
         f"({seconds:.3f} s, {bad} failed)",
         flush=True,
     )

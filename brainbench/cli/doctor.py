@@ -29,7 +29,7 @@ OPTIONAL = {
     "pybullet": ("bullet", "the whisker engine of WHISKiT as a second backend (Python < 3.12)"),
     "coacd": ("mesh", "convex decomposition of concave objects"),
     "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),
-    "warp-lang": ("gpu", "nothing yet: the batched whisker solver of a later version"),
+    "warp-lang": ("rod", "the rod backend: fast whiskers on CPU and GPU, exact concave surfaces"),
     "mujoco-warp": ("gpu", "nothing yet: robot hands on CUDA in a later version"),
     "distributed": ("cluster", "data sets made by a Dask cluster (brainbench stimuli sweep --scheduler)"),
     "scikit-learn": ("learn", "support vector machines (brainbench stimuli separability)"),

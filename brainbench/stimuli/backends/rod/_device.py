@@ -23,7 +23,9 @@ def warp() -> Any:
     try:
         import warp as wp
     except ImportError as error:
-        raise MissingDependencyError("The rod backend needs warp-lang; install it with: pip install warp-lang") from error
+        raise MissingDependencyError(
+            "The rod backend needs warp-lang; install it with: pip install 'brainbench[rod]'"
+        ) from error
     wp.config.quiet = True
     wp.config.enable_backward = False
     wp.init()

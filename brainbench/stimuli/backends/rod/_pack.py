@@ -113,9 +113,7 @@ def _knot_times(start: float, stop: float) -> tuple[NDArray[np.float64], float]:
     return start + KNOT * np.arange(count), KNOT * MILLI
 
 
-def _knots(
-    around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], start: float
-) -> NDArray[np.float64]:
+def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], start: float) -> NDArray[np.float64]:
     """Knots [n, 16] from places and rotations just before, at and just after the knot times."""
     (place0, turn0), (place, turn), (place1, turn1) = around
     # At the very start there may be no instant before: the difference is then one-sided.

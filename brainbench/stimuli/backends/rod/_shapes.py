@@ -1,4 +1,4 @@
-"""Distances between a link and the shapes it may touch, as Warp functions: primitives in closed form, triangles exactly.
+"""Distances between a link and the shapes it may touch, as Warp functions: closed forms and exact triangles.
 
 Lengths in mm, in the frame of the shape. A link is a segment with a radius that varies linearly along it.
 """

@@ -31,6 +31,7 @@ from brainbench.stimuli.backends.rod._limits import (
 from brainbench.stimuli.backends.rod._shapes import MESH, distances
 from brainbench.stimuli.backends.rod._tracks import tracks
 
+
 @cache
 def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, int] | None = None) -> SimpleNamespace:
     """Return the structures and the kernel for chains of at most ``capacity`` links in one precision.
@@ -188,7 +189,8 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
             y = x * x
             return x * (
                 real(1.0)
-                + y * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
+                + y
+                * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
             )
         return wp.sin(x)
 
@@ -199,10 +201,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
             return real(1.0) + y * (
                 real(-0.5)
                 + y
-                * (
-                    real(1.0 / 24.0)
-                    + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0)))
-                )
+                * (real(1.0 / 24.0) + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0))))
             )
         return wp.cos(x)
 
@@ -391,7 +390,9 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
             return Touch()
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds)
-    def run(ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, opt: Options, readings: wp.array(dtype=real), out: Results):
+    def run(
+        ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, opt: Options, readings: wp.array(dtype=real), out: Results
+    ):
         lane = wp.tid()
         zero = real(0.0)
         one = real(1.0)
@@ -455,6 +456,9 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
 
         near = int(0)
         quickest = zero
+        # Counts that the compiler does not know keep it from writing loops out.
+        slip_tries = int(8) + wp.min(0, lane)
+        guess_tries = int(3 * wp.static(CONTACTS)) + wp.min(0, lane)
         look_near = real(wp.static(NEAR))
         object_speed = zero
         for s in range(shapes_from, shapes_to):
@@ -536,7 +540,9 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                 # Where something is near, a step moves no point of the whisker further than a contact search looks.
                 wanted = longest
                 if near == 1 and (quickest + object_speed) * longest > real(wp.static(TRAVEL)):
-                    wanted = wp.max(longest / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / (quickest + object_speed))
+                    wanted = wp.max(
+                        longest / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / (quickest + object_speed)
+                    )
                 count = wp.max(1, int(wp.ceil(left / wanted - real(1e-3))))
                 h = left / real(count)
                 left = left - h
@@ -902,7 +908,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                         # Forces of rigid contacts with Coulomb friction: projected Gauss-Seidel, one contact at a time.
                         settled = int(0)
                         change = zero
-                        for turn in range(wp.static(SWEEPS)):
+                        for _ in range(wp.static(SWEEPS)):
                             if settled == 0:
                                 change = zero
                                 for c in range(contacts):
@@ -954,7 +960,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                                 f1 = p0
                                                 f2 = q0
                                                 pace = one / (c11 + c22)
-                                                for _ in range(8):
+                                                for _ in range(slip_tries):
                                                     fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
                                                     s1_ = f1 - pace * (b1 + n1 * fn + c11 * f1 + c12 * f2)
                                                     s2_ = f2 - pace * (b2 + n2 * fn + c12 * f1 + c22 * f2)
@@ -1009,7 +1015,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                             square[c * wp.static(CONTACTS) + e] = near_n
                                         asked[c] = rest
                                     agreed = int(0)
-                                    for _ in range(3 * wp.static(CONTACTS)):
+                                    for _ in range(guess_tries):
                                         if agreed == 0:
                                             for c in range(contacts):
                                                 for e in range(contacts):

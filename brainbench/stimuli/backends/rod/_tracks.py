@@ -10,7 +10,7 @@ from typing import Any
 
 @cache
 def tracks(real: type) -> SimpleNamespace:
-    """Return ``Tracks`` (the arrays), ``Pose`` (place, turn, rate) and ``pose_at(tracks, index, time)`` of a precision."""
+    """Return ``Tracks`` (the arrays), ``Pose`` and ``pose_at(tracks, index, time)`` of a precision."""
     import warp as wp
 
     vec3: Any = wp.types.vector(3, real)

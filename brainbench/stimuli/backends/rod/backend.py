@@ -128,7 +128,9 @@ class _Batch:
             self.chains.append(build_chain(job.whisker, self.fidelity.link_count(job.whisker.arc_length)))
         which = self._whiskers[job.whisker]
         chain = self.chains[which]
-        seen = tuple((id(item.motion), item.friction, *map(id, (item.surface, *item.parts))) for item in reach.obstacles)
+        seen = tuple(
+            (id(item.motion), item.friction, *map(id, (item.surface, *item.parts))) for item in reach.obstacles
+        )
         if seen not in self._scenes:
             self._scenes[seen] = self.shapes.add_scene(reach.obstacles, self.tracks, self.start, self.stop)
         knots, spacing = follicle_knots(job.follicle, self.start, self.stop)
@@ -286,7 +288,10 @@ def _trace(
     wild = ~(strength <= strongest_force(job.whisker))
     if wild.any() and job.times[np.argmax(wild)] < end:
         first = int(np.argmax(wild))
-        end, reason = float(job.times[first]), f"at {job.times[first]:.6g} s " + too_strong(strength[first], job.whisker)
+        end, reason = (
+            float(job.times[first]),
+            f"at {job.times[first]:.6g} s " + too_strong(strength[first], job.whisker),
+        )
     if missed[0] < end:
         end, reason = missed
     if not reason and unsolved > DOUBTFUL * steps:

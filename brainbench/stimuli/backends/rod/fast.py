@@ -59,7 +59,12 @@ class SweepLauncher:
     """
 
     def __init__(
-        self, scenes: SweepScenes, fidelity: Fidelity, device: str = "cpu", against: int | None = None, bounds: tuple[int, int] | None = None
+        self,
+        scenes: SweepScenes,
+        fidelity: Fidelity,
+        device: str = "cpu",
+        against: int | None = None,
+        bounds: tuple[int, int] | None = None,
     ) -> None:
         from brainbench.stimuli.backends.rod._limits import MESHES
         from brainbench.stimuli.backends.rod._solver import solver
@@ -104,7 +109,9 @@ class SweepLauncher:
         clock.append(time.perf_counter())
         count, whiskers = len(shapes.first) - 1, len(self._bases)
         # Neighbouring threads take the same whisker past the same object.
-        whisker, row = (grid.ravel().astype(np.int32) for grid in np.meshgrid(np.arange(whiskers), np.arange(count), indexing="ij"))
+        whisker, row = (
+            grid.ravel().astype(np.int32) for grid in np.meshgrid(np.arange(whiskers), np.arange(count), indexing="ij")
+        )
         lanes = {
             "whisker": whisker,
             "scene": row,
@@ -165,11 +172,11 @@ class SweepLauncher:
         from brainbench.stimuli.generation.engine import SweepBatch
 
         frames = self.grid.frames
-        wrench, contact = result.wrench.numpy(), result.contact.numpy() >= 0
+        wrench, contact = result.wrench.numpy(), np.greater_equal(result.contact.numpy(), 0)
         if frames.average > 1 or frames.lowpass is not None:
             moved = np.moveaxis(wrench, 1, 0)
             wrench = np.moveaxis(frames.reduce(moved.astype(float)), 0, 1).astype(np.float32)
-            contact = np.moveaxis(frames.split(np.moveaxis(contact, 1, 0)).any(axis=1), 0, 1)
+            contact = np.asarray(frames.split(np.moveaxis(contact, 1, 0)).any(axis=1)).swapaxes(0, 1)
         doubtful = result.unsolved > DOUBTFUL * np.maximum(result.steps, 1)
         unstable = (result.status != 0) | doubtful
         names = [mount.name for mount in self.scenes.array]
@@ -193,6 +200,8 @@ class SweepLauncher:
         """Append the scenes of one object's sweeps, expressed in the frame of the array."""
         grid, head = self.grid, self._head
         surface = solid.surface
+        if surface is None:
+            raise UsageError(f"The object {solid.name!r} has no exact surface to sweep over; use the mujoco backend.")
         diagonal = solid.diagonal
         mesh, face = shapes.add_mesh(surface.vertices * MILLI, surface.faces)
         radius = float(np.linalg.norm(surface.vertices, axis=1).max()) * MILLI
