@@ -45,6 +45,8 @@ class Fidelity:
         if not 1e-7 <= self.time_step <= 5e-3:
             raise UsageError(f"time_step must lie between 1e-7 and 5e-3 s; received {self.time_step!r}.")
 
+        if self.precision not in PRECISIONS:
+            raise unknown_name("precision", str(self.precision), PRECISIONS)
         if self.steps_per_period is not None and not 4 <= self.steps_per_period <= 1e4:
             raise UsageError(
                 f"steps_per_period must lie between 4 and 10000, or be None; received {self.steps_per_period!r}."
@@ -98,6 +100,7 @@ class Fidelity:
         return count
 
 
+PRECISIONS = ("single", "double")
 MOST_LINKS = 100
 """Links per whisker that are allowed; cost grows with the cube, and error is far below 0.1 % before."""
 

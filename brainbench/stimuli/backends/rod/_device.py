@@ -26,7 +26,8 @@ def warp() -> Any:
         raise MissingDependencyError(
             "The rod backend needs warp-lang; install it with: pip install 'brainbench[rod]'"
         ) from error
-    wp.config.quiet = True
+    # Only errors: a user need not hear which devices there are, nor that kernels were compiled.
+    wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
     wp.init()
     return wp

@@ -110,7 +110,7 @@ def body_knots(obstacle: Obstacle, start: float, stop: float) -> tuple[NDArray[n
 def _knot_times(start: float, stop: float) -> tuple[NDArray[np.float64], float]:
     # One knot beyond the end: the last step looks at the pose behind it.
     count = max(2, int(np.ceil((stop - start) / KNOT - 1e-9)) + 2)
-    return start + KNOT * np.arange(count), KNOT * MILLI
+    return np.asarray(start + KNOT * np.arange(count), dtype=np.float64), KNOT * MILLI
 
 
 def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], start: float) -> NDArray[np.float64]:

@@ -1,0 +1,165 @@
+"""What only the ``rod`` backend promises: exact surfaces, large steps, one result whatever the batch and the device."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.errors import UsageError
+from brainbench.stimuli import validation
+from brainbench.stimuli.backends.protocol import Job, StillFollicle
+from brainbench.stimuli.backends.rod import RodBackend
+from brainbench.stimuli.collections import resolve_objects
+from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.obstacle import Box, Capsule, Obstacle, TriangleMesh
+from brainbench.stimuli.sweep_grid import SweepGrid
+from brainbench.stimuli.sweeps import SweepScenes
+from brainbench.stimuli.whisker import Whisker
+
+pytest.importorskip("warp")
+
+C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
+COARSE = Fidelity(links=10, time_step=1e-3)
+
+
+def _moving(parts, velocity, surface=None, friction=0.0):
+    velocity = np.array(velocity)
+
+    def motion(times):
+        return times[:, None] * velocity, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+
+    return Obstacle(parts, motion, friction=friction, surface=surface)
+
+
+def _box_mesh(low, high):
+    import trimesh
+
+    mesh = trimesh.creation.box(bounds=[low, high])
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def _run(jobs, fidelity=COARSE, **options):
+    return RodBackend().run(jobs if isinstance(jobs, list) else [jobs], fidelity, **options)
+
+
+@pytest.mark.parametrize("step", [1e-4, 1e-3, 2e-3])
+def test_a_steady_load_does_not_depend_on_the_time_step(step):
+    found = validation.peg(
+        C2, 0.5 * C2.arc_length, 0.1 * C2.arc_length, peg_radius=5e-5, backend="rod",
+        fidelity=Fidelity(links=20, time_step=step),
+    )  # fmt: skip
+    assert found.moment_error < 5e-3
+    assert found.force_error < 5e-3
+
+
+@pytest.mark.parametrize("kind", ["peg", "knife"])
+def test_nothing_thin_passes_through_a_whisker_in_steps_of_a_millisecond(kind):
+    """60 mm/s in steps of 1 ms: each step is longer than the peg is thick, and sixty times the knife's edge."""
+    if kind == "peg":
+        thing = _moving((Capsule((0.008, -0.002, -0.02), (0.008, -0.002, 0.02), 5e-5),), (0.0, 0.06, 0.0))
+    else:
+        blade = _box_mesh((0.008, -0.0035, -0.02), (0.0081, -0.002, 0.02))
+        edge = blade.vertices.copy()
+        front = edge[:, 1] > -0.003
+        edge[front, 0] = 0.00805 + np.sign(edge[front, 0] - 0.00805) * 5e-7
+        thing = _moving((), (0.0, 0.06, 0.0), TriangleMesh(edge, blade.faces))
+    trace = _run(Job(C2, StillFollicle(), (thing,), np.arange(1, 61) * 1e-3))[0]
+    assert trace.status == "ok"
+    # From y = -2 mm at 60 mm/s it reaches the whisker after 33 ms and has pushed it by 1.6 mm at the end.
+    assert trace.contact[40:].all()
+    assert (np.diff(trace.wrench[36:, 1]) > 0).all()
+    assert trace.penetration < 2e-5
+
+
+def test_a_whisker_feels_the_wall_of_a_slot_and_not_its_hull():
+    """A U of three boxes as one closed surface: inside its slot there is nothing until the wall comes."""
+    import trimesh
+
+    u = trimesh.boolean.difference(
+        [
+            trimesh.creation.box(bounds=[(0.004, -0.004, -0.01), (0.012, 0.004, 0.01)]),
+            trimesh.creation.box(bounds=[(0.0, -0.003, -0.02), (0.02, 0.002, 0.02)]),
+        ],
+        engine="manifold",
+    )
+    surface = TriangleMesh(np.asarray(u.vertices), np.asarray(u.faces))
+    thing = _moving((), (0.0, 0.05, 0.0), surface)
+    # Its lower wall starts 3 mm below the whisker: after 60 ms it arrives.
+    trace = _run(Job(C2, StillFollicle(), (thing,), np.arange(1, 91) * 1e-3))[0]
+    assert trace.status == "ok"
+    assert not trace.contact[:57].any()
+    assert not trace.wrench[:57].any()
+    assert trace.contact[65:].all()
+    assert trace.wrench[-1, 1] > 0
+
+
+def test_a_box_and_its_triangles_are_felt_alike():
+    box = Box((0.009, -0.004, 0.0), (0.001, 0.001, 0.02))
+    mesh = _box_mesh((0.008, -0.005, -0.02), (0.010, -0.003, 0.02))
+    times = np.arange(1, 81) * 1e-3
+    jobs = [
+        Job(C2, StillFollicle(), (_moving((box,), (0.0, 0.05, 0.0), friction=0.4),), times),
+        Job(C2, StillFollicle(), (_moving((), (0.0, 0.05, 0.0), mesh, friction=0.4),), times),
+    ]
+    of_box, of_mesh = _run(jobs, Fidelity(links=10, time_step=2e-4))
+    peak = np.abs(of_box.wrench).max(axis=0)
+    assert peak[1] > 1e-5
+    assert np.abs(of_box.wrench - of_mesh.wrench)[:, [0, 1, 5]].max(axis=0) == pytest.approx(0, abs=0.02 * peak[1])
+
+
+def test_jobs_give_the_same_bytes_alone_together_and_on_two_threads():
+    things = [_moving((Capsule((x, -0.002, -0.02), (x, -0.002, 0.02), 3e-4),), (0.0, 0.05, 0.0)) for x in (0.006, 0.01)]
+    times = np.arange(1, 61) * 1e-3
+    jobs = [Job(replace(C2, friction=mu), StillFollicle(), (thing,), times) for thing in things for mu in (0.0, 0.48)]
+    alone = [_run(job)[0].wrench.tobytes() for job in jobs]
+    assert [trace.wrench.tobytes() for trace in _run(jobs, workers=1)] == alone
+    assert [trace.wrench.tobytes() for trace in _run(jobs, workers=2)] == alone
+
+
+@pytest.mark.slow
+def test_single_precision_loses_nothing_that_matters():
+    thing = _moving((Capsule((0.009, -0.002, -0.02), (0.009, -0.002, 0.02), 3e-4),), (0.0, 0.05, 0.0), friction=0.48)
+    job = Job(C2, StillFollicle(), (thing,), np.arange(1, 81) * 1e-3)
+    single = _run(job, Fidelity(links=20, time_step=2e-4))[0].wrench
+    double = _run(job, Fidelity(links=20, time_step=2e-4, precision="double"))[0].wrench
+    assert np.abs(single - double).max(axis=0) == pytest.approx(0, abs=2e-3 * np.abs(double[:, :3]).max())
+
+
+def test_sweeps_through_the_fast_path_equal_their_scenes():
+    from brainbench.stimuli import simulate
+    from brainbench.stimuli.backends.rod.fast import simulate_sweeps
+
+    objects = resolve_objects(["ellipsoid-1"], surfaces=True)
+    grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
+    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2,D2")
+    fidelity = Fidelity(links=10, time_step=5e-4)
+    fast = simulate_sweeps(scenes, [0, 1], fidelity=fidelity)
+    slow = simulate([scenes[0], scenes[1]], fidelity=fidelity, backend="rod", cache=False)
+    assert not fast.unstable.any()
+    assert (fast.contact > 0).any()
+    assert fast.steps < 0.6 * fast.steps_in_full
+    peak = np.abs(slow["wrench"].values[..., :3]).max()
+    # The same contacts, rounded differently: friction makes a few readings differ by more.
+    assert np.median(np.abs(fast.wrench - slow["wrench"].values)[..., :3]) < 1e-4 * peak
+    assert np.abs(fast.wrench - slow["wrench"].values)[..., :3].mean() < 2e-3 * peak
+
+
+def test_sweeps_do_not_depend_on_which_share_a_launch():
+    from brainbench.stimuli.backends.rod.fast import simulate_sweeps
+
+    objects = resolve_objects(["ellipsoid-1", "brick-2"], surfaces=True)
+    grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
+    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,D2")
+    together = simulate_sweeps(scenes, [0, 1, 2, 3], fidelity=COARSE, workers=2)
+    single = [simulate_sweeps(scenes, [index], fidelity=COARSE) for index in range(4)]
+    assert np.concatenate([batch.wrench for batch in single]).tobytes() == together.wrench.tobytes()
+
+
+def test_an_unknown_device_is_refused_in_words():
+    with pytest.raises(UsageError, match="'cpu' or 'cuda'; received 'tpu'"):
+        RodBackend(device="tpu").run([Job(C2, StillFollicle(), (), np.array([1e-3]))], COARSE)
+
+
+def test_more_precision_than_there_is_is_refused_in_words():
+    with pytest.raises(UsageError, match=r"precision .* 'single', 'double'"):
+        Fidelity(precision="quad")
