@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -146,15 +147,26 @@ def _one_by_one(scenes: SweepScenes, indices: Sequence[int], fidelity: Fidelity,
     )
 
 
+class _OtherThreads(logging.Filter):
+    """Lets through what other threads say than the one that made it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._thread = threading.get_ident()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return record.thread != self._thread
+
+
 @contextlib.contextmanager
 def _unlogged() -> Iterator[None]:
     """Keep quiet about each unstable whisker: among millions of sweeps they are marked and counted."""
-    logger = logging.getLogger("brainbench.stimuli.simulation")
-    before, logger.disabled = logger.disabled, True
+    logger, quiet = logging.getLogger("brainbench.stimuli.simulation"), _OtherThreads()
+    logger.addFilter(quiet)
     try:
         yield
     finally:
-        logger.disabled = before
+        logger.removeFilter(quiet)
 
 
 @dataclass(frozen=True, eq=False)

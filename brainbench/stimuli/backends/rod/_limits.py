@@ -6,6 +6,11 @@ SWEEPS = 20
 """Most Gauss-Seidel sweeps over the contacts of one step."""
 LARGEST_BEND = 1.5
 """Bend of one joint (rad) beyond which a chain means nothing."""
+FOLD = 1.2
+"""Bend (rad) beyond which a joint stiffens. The last links of a fine tip are so soft that the slightest force folds
+them double; what reaches the base through them is nothing."""
+STOP = 1e3
+"""Stiffness beyond :data:`FOLD` over that of the joint."""
 DOUBTFUL = 0.02
 """Share of the steps whose contact forces may fail to converge before a result counts as unstable."""
 REST = 1e-6

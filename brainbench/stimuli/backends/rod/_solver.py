@@ -18,12 +18,14 @@ from brainbench.stimuli.backends.rod._limits import (
     CREVICE,
     FAR,
     FINEST,
+    FOLD,
     LARGEST_BEND,
     LOST,
     MESHES,
     NEAR,
     NOTHING,
     REST,
+    STOP,
     SWEEPS,
     TRAVEL,
     WIDEST,
@@ -757,18 +759,32 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                     u2w = sym(ia, s2) + ib * m2
                     u2v = s2 * ib + sym(ic, m2)
                     k = i4[3]
-                    soft = h * k * (h + step_damping)
-                    d11 = wp.dot(s1, u1w) + wp.dot(m1, u1v) + soft
+                    lag = h + step_damping
+                    soft = h * k * lag
+                    rate = qd[i]
+                    spring1 = angle[0] + lag * rate[0]
+                    spring2 = angle[1] + lag * rate[1]
+                    soft1 = soft
+                    soft2 = soft
+                    bend = wp.abs(angle[0])
+                    if bend > real(wp.static(FOLD)):
+                        soft1 = soft * real(1.0 + wp.static(STOP))
+                        past = angle[0] * (one - real(wp.static(FOLD)) / bend)
+                        spring1 = spring1 + real(wp.static(STOP)) * (past + lag * rate[0])
+                    bend = wp.abs(angle[1])
+                    if bend > real(wp.static(FOLD)):
+                        soft2 = soft * real(1.0 + wp.static(STOP))
+                        past = angle[1] * (one - real(wp.static(FOLD)) / bend)
+                        spring2 = spring2 + real(wp.static(STOP)) * (past + lag * rate[1])
+                    d11 = wp.dot(s1, u1w) + wp.dot(m1, u1v) + soft1
                     d12 = wp.dot(s1, u2w) + wp.dot(m1, u2v)
-                    d22 = wp.dot(s2, u2w) + wp.dot(m2, u2v) + soft
+                    d22 = wp.dot(s2, u2w) + wp.dot(m2, u2v) + soft2
                     whole = one / (d11 * d22 - d12 * d12)
                     i11 = d22 * whole
                     i12 = -d12 * whole
                     i22 = d11 * whole
-                    rate = qd[i]
-                    lag = h + step_damping
-                    t1 = -k * (angle[0] + lag * rate[0]) - wp.dot(s1, pw) - wp.dot(m1, pv)
-                    t2 = -k * (angle[1] + lag * rate[1]) - wp.dot(s2, pw) - wp.dot(m2, pv)
+                    t1 = -k * spring1 - wp.dot(s1, pw) - wp.dot(m1, pv)
+                    t2 = -k * spring2 - wp.dot(s2, pw) - wp.dot(m2, pv)
                     f1 = i11 * t1 + i12 * t2
                     f2 = i12 * t1 + i22 * t2
                     g1w = u1w * i11 + u2w * i12
@@ -975,6 +991,11 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                                     if moved_by <= real(1e-4) * bound:
                                                         break
                                                 fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
+                                    # Two contacts at one point may leave nothing to divide by.
+                                    if not (fn + wp.abs(f1) + wp.abs(f2) < real(1e6)):
+                                        fn = zero
+                                        f1 = zero
+                                        f2 = zero
                                     force[r] = fn
                                     force[r + 1] = f1
                                     force[r + 2] = f2
@@ -1047,8 +1068,6 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                             worst_c = int(-1)
                                             lowest = zero
                                             for c in range(contacts):
-                                                if not (wp.abs(load_n[c]) < real(1e6)):
-                                                    agreed = int(-1)
                                                 if load_n[c] < lowest:
                                                     lowest = load_n[c]
                                                     worst_c = c
@@ -1068,6 +1087,9 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                                     stance[worst_c] = int(1)
                                                 else:
                                                     agreed = int(1)
+                                    for c in range(contacts):
+                                        if not (wp.abs(load_n[c]) < real(1e6)):
+                                            agreed = int(-1)
                                     if agreed == 1:
                                         for c in range(contacts):
                                             fn = load_n[c]

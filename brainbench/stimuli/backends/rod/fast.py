@@ -47,6 +47,8 @@ class SweepResult:
     """[sweep, whisker] steps with contact."""
     unsolved: NDArray[np.int32]
     """[sweep, whisker] steps whose contact forces did not converge, or for whose contacts there was no room."""
+    depth: NDArray[np.floating]
+    """[sweep, whisker] deepest overlap (mm)."""
     steps_in_full: int
     """Steps that every whisker takes from start to end."""
 
@@ -159,6 +161,7 @@ class SweepLauncher:
             steps=found["steps"],
             touching=found["touching"],
             unsolved=found["unsolved"] + found["crowded"],
+            depth=out.depth.numpy().reshape(whiskers, count).T,
             steps_in_full=int(self.steps_each.sum()) * count,
         )
 
