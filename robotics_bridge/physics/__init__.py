@@ -1,0 +1,25 @@
+"""One state interface for tactile sensors, filled by C MuJoCo on the processor or MuJoCo Warp on the GPU."""
+
+from __future__ import annotations
+
+from robotics_bridge.physics.benchmark_scene import initial_velocities, pyramid
+from robotics_bridge.physics.cpu import MujocoEngine
+from robotics_bridge.physics.gpu import MujocoWarpEngine
+from robotics_bridge.physics.scene import KINDS, Geometry, Scene, Variants
+from robotics_bridge.physics.state import CROWDED, DIVERGED, HandState
+from robotics_bridge.physics.variants import compile_variants
+
+__all__ = [
+    "CROWDED",
+    "DIVERGED",
+    "KINDS",
+    "Geometry",
+    "HandState",
+    "MujocoEngine",
+    "MujocoWarpEngine",
+    "Scene",
+    "Variants",
+    "compile_variants",
+    "initial_velocities",
+    "pyramid",
+]

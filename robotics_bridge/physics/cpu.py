@@ -1,0 +1,210 @@
+"""C MuJoCo on the processor: one simulation per environment, stepped by a pool of threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from robotics_bridge.physics._fields import check_fields
+from robotics_bridge.physics.scene import Scene
+from robotics_bridge.physics.state import HandState
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+class MujocoEngine:
+    """Batched C MuJoCo that fills a :class:`HandState`.
+
+    The state after :meth:`step` is the one from which MuJoCo computed the last step (poses, velocities and contacts
+    of one instant); :meth:`forward` refreshes it to the current positions.
+
+    Args:
+        model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only (see
+            :func:`~robotics_bridge.physics.variants.compile_variants`).
+        num_envs: number of environments B.
+        threads: how many work at once; every processor by default.
+        fields: values per environment [B, ...] of any model field, e.g. ``{"body_mass": …}``.
+        assignment: variant of environment e is ``assignment[e % len(assignment)]``; each in turn by default.
+        contacts: room for contacts per environment.
+
+    Raises:
+        UsageError: a field or a number of environments is not valid.
+    """
+
+    def __init__(
+        self,
+        model: Any | Sequence[Any],
+        num_envs: int,
+        *,
+        threads: int | None = None,
+        fields: Mapping[str, ArrayLike] | None = None,
+        assignment: Sequence[int] = (),
+        contacts: int = 64,
+    ) -> None:
+        import mujoco
+
+        if num_envs < 1:
+            raise UsageError(f"An engine needs at least one environment; received {num_envs}.")
+        models = list(model) if isinstance(model, (list, tuple)) else [model]
+        self.model: Any = models[0]
+        """The model, or the first of its variants."""
+        order = list(assignment) or list(range(len(models)))
+        self.scene: Scene = Scene.from_mujoco(models[0], models[1:], assignment)
+        self.num_envs = num_envs
+        varied = check_fields(models[0], fields or {}, num_envs)
+        self._models = [models[order[env % len(order)]] for env in range(num_envs)]
+        if varied:
+            self._models = [_with_fields(m, {k: v[env] for k, v in varied.items()}) for env, m in enumerate(self._models)]
+        self._data = [mujoco.MjData(m) for m in self._models]
+        self.state: HandState = HandState.empty(num_envs, self.model.nbody, contacts * num_envs, "cpu")
+        """Refreshed by :meth:`step`, :meth:`forward` and :meth:`reset`."""
+        self._gatherer = _Gatherer(self.model, self._data, self.state)
+        workers = max(1, min(threads or os.cpu_count() or 1, num_envs))
+        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        self._chunks = np.array_split(np.arange(num_envs), workers)
+        self.forward()
+
+    @property
+    def timestep(self) -> float:
+        """Seconds of one step."""
+        return float(self.model.opt.timestep)
+
+    @property
+    def data(self) -> Sequence[Any]:
+        """The ``mujoco.MjData`` of every environment."""
+        return self._data
+
+    @property
+    def qpos(self) -> NDArray[np.float64]:
+        """Positions [B, nq], a copy; write with :meth:`set`."""
+        return np.stack([data.qpos for data in self._data])
+
+    @property
+    def qvel(self) -> NDArray[np.float64]:
+        """Velocities [B, nv], a copy; write with :meth:`set`."""
+        return np.stack([data.qvel for data in self._data])
+
+    def set(self, **values: ArrayLike) -> None:
+        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
+        for name, value in values.items():
+            shape = getattr(self._data[0], name).shape
+            try:
+                rows = np.broadcast_to(np.asarray(value, dtype=float), (self.num_envs, *shape))
+            except ValueError:
+                raise UsageError(
+                    f"{name} has the shape {(self.num_envs, *shape)} here; received {np.shape(value)}."
+                ) from None
+            for data, row in zip(self._data, rows, strict=True):
+                getattr(data, name)[...] = row
+
+    def step(self, steps: int = 1) -> None:
+        """Advance every environment and refresh the state."""
+        import mujoco
+
+        self._each(lambda env: mujoco.mj_step(self._models[env], self._data[env], steps))
+
+    def forward(self) -> None:
+        """Refresh the state at the current positions and velocities, without advancing."""
+        import mujoco
+
+        self._each(lambda env: mujoco.mj_forward(self._models[env], self._data[env]))
+
+    def reset(self, env_ids: Sequence[int] | NDArray[np.int64] | None = None) -> None:
+        """Put environments (all by default) back to the model's start and refresh the state."""
+        import mujoco
+
+        for env in range(self.num_envs) if env_ids is None else np.asarray(env_ids, dtype=int).reshape(-1).tolist():
+            mujoco.mj_resetData(self._models[env], self._data[env])
+        self.forward()
+
+    def _each(self, work: Any) -> None:
+        gather = self._gatherer.gather
+
+        def run(chunk: NDArray[np.int64]) -> None:
+            for env in chunk.tolist():
+                work(env)
+                gather(env)
+
+        if self._pool is None:
+            run(self._chunks[0])
+        else:
+            list(self._pool.map(run, self._chunks))
+        self._gatherer.finish()
+
+
+class _Gatherer:
+    """Copies what each environment computed into the shared buffers."""
+
+    def __init__(self, model: Any, data: Sequence[Any], state: HandState) -> None:
+        bodies, count = model.nbody, len(data)
+        self._data, self._state = data, state
+        self._pose = state.pose.numpy()
+        self._velocity = state.velocity.numpy()
+        self._time = state.time.numpy()
+        self._twist = np.zeros((count, bodies, 6))
+        self._com = np.zeros((count, bodies, 3))
+        self._root = np.asarray(model.body_rootid)
+        self._views = [(d.xpos, d.xquat, d.cvel, d.subtree_com) for d in data]
+        self._contacts: list[tuple] = [()] * count
+        self._model = model
+
+    def gather(self, env: int) -> None:
+        data = self._data[env]
+        xpos, xquat, cvel, com = self._views[env]
+        pose = self._pose[env]
+        pose[:, :3] = xpos
+        pose[:, 3:6] = xquat[:, 1:]
+        pose[:, 6] = xquat[:, 0]
+        self._twist[env] = cvel
+        self._com[env] = com
+        self._time[env] = data.time
+        self._contacts[env] = ()
+        if data.ncon:
+            c = data.contact
+            self._contacts[env] = (c.geom.copy(), c.dist.copy(), c.pos.copy(), c.frame[:, :3].copy(), self._force(data, c))
+
+    def _force(self, data: Any, contact: Any) -> NDArray[np.float64]:
+        """Normal force of every contact: with a pyramidal cone the sum of its edges."""
+        address, dim = contact.efc_address, contact.dim
+        forces = np.concatenate([[0.0], np.cumsum(data.efc_force)])
+        rows = np.where((dim > 1) & (self._model.opt.cone == 0), 2 * (dim - 1), 1)
+        first = np.maximum(address, 0)
+        return np.where(address >= 0, forces[np.minimum(first + rows, len(forces) - 1)] - forces[first], 0.0)
+
+    def finish(self) -> None:
+        omega = self._twist[..., :3]
+        lever = self._pose[..., :3] - self._com[:, self._root]
+        self._velocity[..., :3] = self._twist[..., 3:] + np.cross(omega, lever)
+        self._velocity[..., 3:] = omega
+        state = self._state
+        found = [(env, *parts) for env, parts in enumerate(self._contacts) if parts]
+        total = sum(len(parts[1]) for parts in found)
+        room = state.contact_env.shape[0]
+        if found:
+            env = np.repeat([parts[0] for parts in found], [len(parts[1]) for parts in found])
+            columns = [np.concatenate(column)[:room] for column in zip(*(parts[1:] for parts in found), strict=True)]
+            keep = len(columns[0])
+            state.contact_env.numpy()[:keep] = env[:keep]
+            names = ("geom", "distance", "position", "normal", "force")
+            for name, column in zip(names, columns, strict=True):
+                getattr(state, f"contact_{name}").numpy()[:keep] = column
+        state.contact_count.fill_(total)
+
+
+def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:
+    import copy
+
+    import mujoco
+
+    varied = copy.copy(model)
+    for name, value in values.items():
+        getattr(varied, name)[...] = value
+    # Masses, inertias and the like enter constants that the compiler derived.
+    mujoco.mj_setConst(varied, mujoco.MjData(varied))
+    return varied

@@ -1,0 +1,206 @@
+"""MuJoCo Warp: all environments on one device, read without copies to the host."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import MissingDependencyError, UsageError
+from robotics_bridge._device import pick_device, warp
+from robotics_bridge.physics._fields import check_fields, differing_fields
+from robotics_bridge.physics._state_kernels import mujoco_kernels
+from robotics_bridge.physics.scene import Scene
+from robotics_bridge.physics.state import HandState
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import ArrayLike
+
+_MASSES = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "qpos0", "dof_armature")
+
+
+class MujocoWarpEngine:
+    """MuJoCo Warp that fills a :class:`HandState` on its own device; the sequel of a step is as in ``MujocoEngine``.
+
+    On CUDA the step and the filling of the state are one recorded graph.
+
+    Args:
+        model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only.
+        num_envs: number of environments B.
+        device: ``cuda``, ``cuda:1`` or ``cpu`` (slow; for tests).
+        fields: values per environment [B, ...] of model fields that MuJoCo Warp batches.
+        assignment: variant of environment e is ``assignment[e % len(assignment)]``; each in turn by default.
+        contacts: room for contacts per environment, on average; by default sixteen, and nine per moving link.
+        constraints: room for constraint rows in each environment; by default enough for that many contacts.
+
+    Raises:
+        MissingDependencyError: mujoco-warp is not installed.
+        UsageError: a field cannot differ between environments, or variants differ in it.
+    """
+
+    def __init__(
+        self,
+        model: Any | Sequence[Any],
+        num_envs: int,
+        *,
+        device: str = "cuda",
+        fields: Mapping[str, ArrayLike] | None = None,
+        assignment: Sequence[int] = (),
+        contacts: int | None = None,
+        constraints: int | None = None,
+    ) -> None:
+        self._engine = _mujoco_warp()
+        if num_envs < 1:
+            raise UsageError(f"An engine needs at least one environment; received {num_envs}.")
+        wp = warp()
+        self._device = pick_device(device)
+        models = list(model) if isinstance(model, (list, tuple)) else [model]
+        self.model: Any = models[0]
+        self.num_envs = num_envs
+        self.scene: Scene = Scene.from_mujoco(models[0], models[1:], assignment)
+        order = list(assignment) or list(range(len(models)))
+        varied = differing_fields(models, order, num_envs) if len(models) > 1 else {}
+        varied |= check_fields(self.model, fields or {}, num_envs)
+        with wp.ScopedDevice(self._device):
+            self._m = _put_model(self._engine, self.model, varied, num_envs)
+            contacts = contacts or 16 + 9 * int(np.count_nonzero(self.model.body_weldid))
+            rows = 4 * contacts + 2 * self.model.njnt + 6 * self.model.neq + 2 * self.model.ntendon + self.model.nv
+            room = {"nconmax": contacts, "njmax": constraints or rows}
+            self._d = self._engine.make_data(self.model, nworld=num_envs, **room)
+            if set(varied) & set(_MASSES):
+                self._engine.set_const(self._m, self._d)
+            self._root = wp.array(np.asarray(self.model.body_rootid, dtype=np.int32), dtype=wp.int32)
+        contact = self._d.contact
+        blank = HandState.empty(num_envs, self.model.nbody, contact.worldid.shape[0], self._device)
+        self.state: HandState = blank.aliasing(
+            {
+                "contact_geom": contact.geom,
+                "contact_env": contact.worldid,
+                "contact_distance": contact.dist,
+                "contact_position": contact.pos,
+                "contact_count": self._d.nacon,
+                "time": self._d.time,
+            }
+        )
+        self._graph: Any = None
+        self.forward()
+
+    @property
+    def timestep(self) -> float:
+        """Seconds of one step."""
+        return float(self.model.opt.timestep)
+
+    @property
+    def data(self) -> Any:
+        """The ``mujoco_warp.Data`` behind the state."""
+        return self._d
+
+    @property
+    def qpos(self) -> torch.Tensor:
+        """Positions [B, nq], a view."""
+        return warp().to_torch(self._d.qpos)
+
+    @property
+    def qvel(self) -> torch.Tensor:
+        """Velocities [B, nv], a view."""
+        return warp().to_torch(self._d.qvel)
+
+    @property
+    def ctrl(self) -> torch.Tensor:
+        """Controls [B, nu], a view."""
+        return warp().to_torch(self._d.ctrl)
+
+    def set(self, **values: ArrayLike | torch.Tensor) -> None:
+        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
+        import torch
+
+        for name, value in values.items():
+            view = warp().to_torch(getattr(self._d, name))
+            rows = value if isinstance(value, torch.Tensor) else torch.as_tensor(np.array(value))
+            try:
+                view.copy_(rows.to(view.dtype).expand_as(view))
+            except RuntimeError:
+                raise UsageError(f"{name} has the shape {tuple(view.shape)} here; received {tuple(rows.shape)}.") from None
+
+    def step(self, steps: int = 1) -> None:
+        """Advance every environment and refresh the state."""
+        wp = warp()
+        with wp.ScopedDevice(self._device):
+            for _ in range(steps):
+                if not self._device.is_cuda:
+                    self._step()
+                elif self._graph is None:
+                    # The first step compiles; recording must not.
+                    self._step()
+                    with wp.ScopedCapture() as capture:
+                        self._step()
+                    self._graph = capture.graph
+                else:
+                    wp.capture_launch(self._graph)
+
+    def forward(self) -> None:
+        """Refresh the state at the current positions and velocities, without advancing."""
+        with warp().ScopedDevice(self._device):
+            self._engine.forward(self._m, self._d)
+            self._fill()
+
+    def reset(self, env_ids: Sequence[int] | torch.Tensor | None = None) -> None:
+        """Put environments (all by default) back to the model's start and refresh the state."""
+        wp = warp()
+        with wp.ScopedDevice(self._device):
+            mask = None
+            if env_ids is not None:
+                import torch
+
+                chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=wp.device_to_torch(self._device))
+                chosen[torch.as_tensor(env_ids, device=chosen.device, dtype=torch.long)] = True
+                mask = wp.from_torch(chosen)
+            self._engine.reset_data(self._m, self._d, mask)
+        self.forward()
+
+    def _step(self) -> None:
+        self._engine.step(self._m, self._d)
+        self._fill()
+
+    def _fill(self) -> None:
+        wp, d, state, kernels = warp(), self._d, self.state, mujoco_kernels()
+        poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
+        wp.launch(kernels.links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
+        pyramidal = int(self.model.opt.cone == 0)
+        c = d.contact
+        inputs = [d.nacon, c.worldid, c.frame, c.dim, c.efc_address, d.efc.force, pyramidal]
+        inputs += [state.contact_normal, state.contact_force]
+        wp.launch(kernels.contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
+
+
+def _mujoco_warp() -> Any:
+    warp()
+    try:
+        import mujoco_warp
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Simulation on a GPU needs mujoco-warp; install it with: pip install 'brainbench[gpu]'"
+        ) from error
+    return mujoco_warp
+
+
+def _put_model(engine: Any, model: Any, varied: Mapping[str, np.ndarray], num_envs: int) -> Any:
+    wp = warp()
+    fields = engine.Model.__dataclass_fields__
+    shapes = {name: getattr(field.type, "shape", ()) for name, field in fields.items()}
+    usable = {name: value for name, value in varied.items() if shapes.get(name, ("",))[:1] == ("*",)}
+    # What the compiler derived for collision trees on the host plays no part on the device.
+    fixed = sorted(name for name in varied if name not in usable and name in fields)
+    if fixed:
+        raise UsageError(
+            f"MuJoCo Warp keeps {', '.join(fixed)} equal in all environments; use MujocoEngine, or variants that differ "
+            "in sizes, masses, meshes and other numbers only."
+        )
+    device_model = engine.put_model(model, batch_sizes=dict.fromkeys(usable, num_envs))
+    for name, value in usable.items():
+        target = getattr(device_model, name)
+        rows = np.ascontiguousarray(value).reshape(*target.shape, *getattr(target.dtype, "_shape_", ()))
+        target.assign(wp.array(rows, dtype=target.dtype, device=target.device))
+    return device_model

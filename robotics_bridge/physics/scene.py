@@ -1,0 +1,281 @@
+"""What sensors may touch: links and the geometries fixed to them, which of them may meet, and who differs where.
+
+Letters: G geometry, L link. Lengths in metres; quaternions here are (w, x, y, z), as in MuJoCo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError, unknown_name
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.geometry import Mesh
+
+KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "other")
+"""Kinds of geometries; ``other`` (height fields and the like) collides in the engine, but no sensor can query it."""
+
+_MUJOCO_KINDS = {0: "plane", 2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
+_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0, "other": 0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """A solid that is fixed to a link.
+
+    Raises:
+        UsageError: the kind is unknown, a size or pose is not valid, or a mesh is missing.
+    """
+
+    name: str
+    link: str
+    """The link that carries it."""
+    kind: str
+    """One of :data:`KINDS`. Planes are half-spaces below z = 0, capsules and cylinders lie along z."""
+    size: tuple[float, ...] = ()
+    """Radius (sphere); radius and half length (capsule, cylinder); half axes (ellipsoid); half edges (box) [m]."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of its frame in the link's frame [m]."""
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation in the link's frame (w, x, y, z)."""
+    mesh: Mesh | None = None
+    """Surface of a ``mesh``, in the geometry's frame."""
+    contype: int = 1
+    """Collision bits, as in MuJoCo: two geometries may touch when one's type meets the other's affinity."""
+    affinity: int = 1
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise unknown_name("kind of geometry", self.kind, KINDS)
+        needed = _SIZES[self.kind]
+        if len(self.size) < needed or not all(np.isfinite(s) and s > 0 for s in self.size[:needed]):
+            raise UsageError(
+                f"The {self.kind} {self.name!r} needs {needed} positive size(s) in metres; received {self.size}."
+            )
+        if self.kind == "mesh" and self.mesh is None:
+            raise UsageError(f"The geometry {self.name!r} is of kind 'mesh' and names no mesh; pass mesh=Mesh(...).")
+        norm = float(np.linalg.norm(self.quaternion))
+        if not (np.isfinite([*self.position]).all() and np.isfinite(norm) and norm > 1e-6):
+            raise UsageError(
+                f"The geometry {self.name!r} has the pose {self.position}, {self.quaternion}, which is not valid."
+            )
+        object.__setattr__(self, "quaternion", tuple(float(q) / norm for q in self.quaternion))
+        object.__setattr__(self, "size", tuple(float(s) for s in self.size[:needed]))
+
+    @property
+    def collides(self) -> bool:
+        """Whether it can touch anything at all."""
+        return bool(self.contype or self.affinity)
+
+
+@dataclass(frozen=True)
+class Variants:
+    """Shapes that one geometry takes in different environments."""
+
+    choices: tuple[Geometry, ...]
+    assignment: tuple[int, ...] = ()
+    """Choice of environment e is ``assignment[e % len(assignment)]``; empty means each in turn."""
+
+    def __post_init__(self) -> None:
+        if not self.choices:
+            raise UsageError("Variants of a geometry need at least one choice.")
+        wrong = [index for index in self.assignment if not 0 <= index < len(self.choices)]
+        if wrong:
+            raise UsageError(f"There are {len(self.choices)} variants; the assignment names variant {wrong[0]}.")
+
+    def of(self, env: int) -> Geometry:
+        """Return the shape in one environment."""
+        order = self.assignment or range(len(self.choices))
+        return self.choices[order[env % len(order)]]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Links, their geometries and the pairs that may touch; says nothing about motion.
+
+    Raises:
+        UsageError: a name occurs twice or a geometry names an unknown link.
+    """
+
+    links: tuple[str, ...]
+    geometries: tuple[Geometry, ...] = ()
+    excluded: frozenset[tuple[int, int]] = frozenset()
+    """Pairs of link numbers (low, high) that never collide, such as parent and child."""
+    included: frozenset[tuple[int, int]] = frozenset()
+    """Pairs of geometry numbers (low, high) that collide whatever their bits say."""
+    variants: Mapping[int, Variants] = field(default_factory=dict)
+    """By geometry number: its shapes where environments differ."""
+
+    def __post_init__(self) -> None:
+        for what, names in (("link", self.links), ("geometry", tuple(g.name for g in self.geometries))):
+            repeated = [name for name in names if name and names.count(name) > 1] if len(names) < 512 else []
+            if repeated or (not repeated and len({n for n in names if n}) != len([n for n in names if n])):
+                culprit = repeated[0] if repeated else next(n for n in names if n and names.count(n) > 1)
+                raise UsageError(f"The scene has two of the {what} {culprit!r}; names must differ.")
+        for geometry in self.geometries:
+            if geometry.link not in self._links:
+                raise unknown_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
+
+    @cached_property
+    def _links(self) -> dict[str, int]:
+        return {name: index for index, name in enumerate(self.links)}
+
+    @cached_property
+    def _geometries(self) -> dict[str, int]:
+        return {geometry.name: index for index, geometry in enumerate(self.geometries)}
+
+    @cached_property
+    def link_of(self) -> NDArray[np.int32]:
+        """Link number [G] of every geometry."""
+        return np.array([self._links[geometry.link] for geometry in self.geometries], dtype=np.int32)
+
+    def link_index(self, name: str) -> int:
+        """Return the number of a link; an unknown name raises UsageError."""
+        if name not in self._links:
+            raise unknown_name("link", name, self.links)
+        return self._links[name]
+
+    def geometry_index(self, name: str) -> int:
+        """Return the number of a geometry; an unknown name raises UsageError."""
+        if name not in self._geometries:
+            raise unknown_name("geometry", name, tuple(self._geometries))
+        return self._geometries[name]
+
+    def geometries_of(self, link: str) -> tuple[int, ...]:
+        """Return the numbers of the geometries that a link carries."""
+        return tuple(np.flatnonzero(self.link_of == self.link_index(link)).tolist()) if self.geometries else ()
+
+    def geometry_in(self, env: int, geometry: int) -> Geometry:
+        """Return a geometry as one environment has it."""
+        return self.variants[geometry].of(env) if geometry in self.variants else self.geometries[geometry]
+
+    @cached_property
+    def _bits(self) -> NDArray[np.int64]:
+        return np.array([(g.contype, g.affinity) for g in self.geometries], dtype=np.int64).reshape(-1, 2)
+
+    def candidates(self, link: str) -> tuple[int, ...]:
+        """Return the numbers of all geometries that may come into contact with a link."""
+        here = self.link_index(link)
+        barred = {low + high - here for low, high in self.excluded if here in (low, high)} | {here}
+        free = ~np.isin(self.link_of, list(barred))
+        found: set[int] = set()
+        for own in self.geometries_of(link):
+            kind, affinity = self._bits[own]
+            meets = ((self._bits[:, 0] & affinity) | (self._bits[:, 1] & kind)) != 0
+            found |= set(np.flatnonzero(meets & free).tolist())
+            found |= {low + high - own for low, high in self.included if own in (low, high)}
+        return tuple(sorted(found))
+
+    @classmethod
+    def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> Scene:
+        """Read the scene out of a compiled ``mujoco.MjModel``; link 0 is the world.
+
+        Args:
+            model: the model, or the first of several variants that differ in numbers only.
+            others: the further variants.
+            assignment: variant of each environment, as in :class:`Variants`; empty means each in turn.
+
+        Raises:
+            UsageError: the variants have different links or geometries.
+        """
+        links = tuple(_name(model, 1, index) for index in range(model.nbody))
+        geometries = _geometries(model, links)
+        variants: dict[int, Variants] = {}
+        for other in others:
+            if other.nbody != model.nbody or other.ngeom != model.ngeom:
+                raise UsageError(
+                    f"Variants of a scene need the same links and geometries; one has {other.nbody} links and "
+                    f"{other.ngeom} geometries, the first {model.nbody} and {model.ngeom}."
+                )
+        if others:
+            rows = [geometries, *(_geometries(other, links) for other in others)]
+            for index, column in enumerate(zip(*rows, strict=True)):
+                if any(_differs(column[0], shape) for shape in column[1:]):
+                    variants[index] = Variants(tuple(column), tuple(int(a) for a in assignment))
+        return cls(links, geometries, _never(model), _always(model), variants)
+
+
+def _name(model: Any, what: int, index: int) -> str:
+    import mujoco
+
+    return mujoco.mj_id2name(model, what, index) or f"{'link' if what == 1 else 'geometry'}{index}"
+
+
+def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
+    import mujoco
+
+    found = []
+    meshes: dict[int, Mesh] = {}
+    for index in range(model.ngeom):
+        kind = _MUJOCO_KINDS.get(int(model.geom_type[index]), "other")
+        data = int(model.geom_dataid[index])
+        if kind == "mesh" and data not in meshes:
+            meshes[data] = _mesh(model, data)
+        found.append(
+            Geometry(
+                name=_name(model, int(mujoco.mjtObj.mjOBJ_GEOM), index),
+                link=links[model.geom_bodyid[index]],
+                kind=kind,
+                size=tuple(model.geom_size[index].tolist()),
+                position=tuple(model.geom_pos[index].tolist()),
+                quaternion=tuple(model.geom_quat[index].tolist()),
+                mesh=meshes[data] if kind == "mesh" else None,
+                contype=int(model.geom_contype[index]),
+                affinity=int(model.geom_conaffinity[index]),
+            )
+        )
+    return tuple(found)
+
+
+def _mesh(model: Any, index: int) -> Mesh:
+    from brainbench.geometry import Mesh
+
+    first, count = int(model.mesh_vertadr[index]), int(model.mesh_vertnum[index])
+    face, faces = int(model.mesh_faceadr[index]), int(model.mesh_facenum[index])
+    return Mesh(
+        model.mesh_vert[first : first + count].astype(float), model.mesh_face[face : face + faces], _name(model, 7, index)
+    )
+
+
+def _differs(first: Geometry, second: Geometry) -> bool:
+    same = (first.kind, first.size, first.position, first.quaternion) == (
+        second.kind,
+        second.size,
+        second.position,
+        second.quaternion,
+    )
+    if same and first.mesh is not None and second.mesh is not None:
+        same = first.mesh.content_hash == second.mesh.content_hash
+    return not same
+
+
+def _never(model: Any) -> frozenset[tuple[int, int]]:
+    """Pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
+    import mujoco
+
+    pairs = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in model.exclude_signature}
+    weld, parent = model.body_weldid, model.body_parentid
+    filtering = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    for body in range(model.nbody):
+        above = weld[parent[weld[body]]]
+        for other in np.flatnonzero(weld == weld[body]).tolist():
+            if other != body:
+                pairs.add((min(body, other), max(body, other)))
+        # MuJoCo lets children of the world collide with it.
+        if filtering and weld[body] and above:
+            pairs |= {(min(body, o), max(body, o)) for o in np.flatnonzero(weld == above).tolist()}
+    return frozenset(pairs)  # type: ignore[arg-type]
+
+
+def _always(model: Any) -> frozenset[tuple[int, int]]:
+    return frozenset(
+        (min(int(a), int(b)), max(int(a), int(b)))
+        for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)
+    )

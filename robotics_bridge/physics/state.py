@@ -1,0 +1,191 @@
+"""The one state that engines fill and sensors read: batched link poses, velocities and contact pairs.
+
+Letters: B environment, L link, C contact. Metres, seconds, newtons, world axes; quaternions here are (x, y, z, w).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from robotics_bridge._device import pick_device, warp
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import torch
+    from numpy.typing import ArrayLike
+
+DIVERGED = 1
+"""Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
+CROWDED = 2
+"""Bit of :attr:`HandState.status`: contacts were lost because there was no room for them."""
+
+
+@dataclass(eq=False)
+class HandState:
+    """Buffers with fixed addresses, on one device; engines write them, sensors only read them."""
+
+    pose: Any
+    """Warp array [B, L] of transforms: world pose of every link frame (x, y, z, qx, qy, qz, qw)."""
+    velocity: Any
+    """Warp array [B, L] of spatial vectors: velocity of the link's origin (m/s) and angular velocity (rad/s)."""
+    contact_geom: Any
+    """Warp array [C] of vec2i: geometry numbers of every contact, of all environments mixed."""
+    contact_env: Any
+    """Warp array [C] int32: environment of every contact."""
+    contact_distance: Any
+    """Warp array [C] float32: gap of every contact, negative for overlap (m)."""
+    contact_position: Any
+    """Warp array [C] of vec3 (m)."""
+    contact_normal: Any
+    """Warp array [C] of vec3, from the first geometry to the second."""
+    contact_force: Any
+    """Warp array [C] float32: normal force (N); NaN where the engine does not tell."""
+    contact_count: Any
+    """Warp array [1] int32: contacts found, which may exceed the room C."""
+    time: Any
+    """Warp array [B] float32 (s)."""
+    status: Any
+    """Warp array [B] int32 of :data:`DIVERGED` and :data:`CROWDED`, as of the last :meth:`check`."""
+
+    @classmethod
+    def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
+        """Return a state with every link at the origin, at rest, without contacts.
+
+        Args:
+            num_envs: B.
+            num_links: L.
+            contacts: room C for contacts of all environments together.
+            device: ``cpu`` or ``cuda``.
+        """
+        if num_envs < 1 or num_links < 1 or contacts < 0:
+            raise UsageError(
+                "A state needs at least one environment and one link and no negative room for contacts; received "
+                f"{num_envs}, {num_links} and {contacts}."
+            )
+        wp, device = warp(), pick_device(device)
+        pose = np.zeros((num_envs, num_links, 7), dtype=np.float32)
+        pose[..., 6] = 1
+        room = max(contacts, 1)
+
+        def zeros(dtype: Any) -> Any:
+            return wp.zeros(room, dtype=dtype, device=device)
+
+        return cls(
+            pose=wp.array(pose, dtype=wp.transformf, device=device),
+            velocity=wp.zeros((num_envs, num_links), dtype=wp.spatial_vectorf, device=device),
+            contact_geom=zeros(wp.vec2i),
+            contact_env=zeros(wp.int32),
+            contact_distance=zeros(wp.float32),
+            contact_position=zeros(wp.vec3f),
+            contact_normal=zeros(wp.vec3f),
+            contact_force=wp.full(room, float("nan"), dtype=wp.float32, device=device),
+            contact_count=wp.zeros(1, dtype=wp.int32, device=device),
+            time=wp.zeros(num_envs, dtype=wp.float32, device=device),
+            status=wp.zeros(num_envs, dtype=wp.int32, device=device),
+        )
+
+    @property
+    def device(self) -> Any:
+        """The Warp device of the buffers."""
+        return self.pose.device
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments B."""
+        return self.pose.shape[0]
+
+    @property
+    def num_links(self) -> int:
+        """Number of links L."""
+        return self.pose.shape[1]
+
+    @property
+    def pose_torch(self) -> torch.Tensor:
+        """World poses [B, L, 7] (x, y, z, qx, qy, qz, qw), a view of the same memory."""
+        return warp().to_torch(self.pose)
+
+    @property
+    def velocity_torch(self) -> torch.Tensor:
+        """Velocities [B, L, 6] (linear of the origin, angular), a view of the same memory."""
+        return warp().to_torch(self.velocity)
+
+    @property
+    def time_torch(self) -> torch.Tensor:
+        """Times [B] (s), a view of the same memory."""
+        return warp().to_torch(self.time)
+
+    @property
+    def status_torch(self) -> torch.Tensor:
+        """Status bits [B], a view of the same memory."""
+        return warp().to_torch(self.status)
+
+    def set_pose(self, pose: ArrayLike | torch.Tensor) -> None:
+        """Write poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qx, qy, qz, qw)."""
+        self._write(self.pose_torch, pose, "poses")
+
+    def set_velocity(self, velocity: ArrayLike | torch.Tensor) -> None:
+        """Write velocities [B, L, 6] (or one [L, 6] for all) as (linear of the origin, angular)."""
+        self._write(self.velocity_torch, velocity, "velocities")
+
+    def set_contacts(self, env: ArrayLike, geometries: ArrayLike, **optional: ArrayLike) -> None:
+        """Replace all contacts.
+
+        Args:
+            env: environment [n] of each contact.
+            geometries: pairs [n, 2] of geometry numbers.
+            **optional: ``distance``, ``force`` [n], ``position``, ``normal`` [n, 3].
+
+        Raises:
+            UsageError: there are more contacts than room, or an unknown quantity is given.
+        """
+        wp = warp()
+        environments = np.asarray(env, dtype=np.int32).reshape(-1)
+        pairs = np.asarray(geometries, dtype=np.int32).reshape(-1, 2)
+        count, room = len(environments), self.contact_env.shape[0]
+        if count > room:
+            raise UsageError(f"The state has room for {room} contacts; received {count}. Make it with contacts={count}.")
+        if len(pairs) != count:
+            raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
+        given = {"env": environments, "geom": pairs, **optional}
+        for name, values in given.items():
+            target = getattr(self, f"contact_{name}", None)
+            if target is None or name == "count":
+                raise UsageError(f"A contact has no {name!r}; it has distance, force, position and normal.")
+            view = wp.to_torch(target)
+            rows = np.asarray(values, dtype=np.int32 if view.dtype.is_floating_point is False else np.float32)
+            _copy(view[:count], rows.reshape(tuple(view[:count].shape)))
+        self.contact_count.fill_(count)
+
+    def check(self) -> None:
+        """Refresh :attr:`status`: which environments diverged, and whether contacts were lost."""
+        from robotics_bridge.physics._state_kernels import state_kernels
+
+        kernels = state_kernels()
+        inputs = [self.pose, self.velocity, self.contact_count, self.contact_env.shape[0], self.status]
+        warp().launch(kernels.check, dim=self.num_envs, inputs=inputs, device=self.device)
+
+    def aliasing(self, buffers: Mapping[str, Any]) -> HandState:
+        """Return a state that uses an engine's own arrays for some of the buffers."""
+        from dataclasses import replace
+
+        return replace(self, **buffers)
+
+    def _write(self, view: torch.Tensor, values: Any, what: str) -> None:
+        shape = tuple(view.shape)
+        given = tuple(np.shape(values))
+        if given not in (shape, shape[1:]):
+            raise UsageError(f"The {what} of this state have the shape {shape}; received {given}.")
+        _copy(view, values)
+
+
+def _copy(view: torch.Tensor, values: Any) -> None:
+    import torch
+
+    if not isinstance(values, torch.Tensor):
+        values = torch.from_numpy(np.array(values))
+    view.copy_(values)
