@@ -128,7 +128,18 @@ def find_model(model: Any, *, seed: int = 0) -> Candidate:
     from brainbench.models.registry import describe_model, load_model
 
     known = describe_model(model)
-    card = ModelCard(model, family=known.family, objective="untrained", multiply_adds=known.multiply_adds, seed=seed)
+    architecture = (known.trained or {}).get("architecture", model).partition(".")[0]
+    encoder, _, attender = architecture.replace("-small", "").partition("+")
+    card = ModelCard(
+        model,
+        family=known.family,
+        encoder=encoder,
+        attender=attender or "none",
+        objective="untrained",
+        multiply_adds=known.multiply_adds,
+        seed=seed,
+        citation=known.citation or None,
+    )
     return _with_weights(load_model(model, seed=seed), card if known.trained is None else _trained(card, known.trained))
 
 
@@ -149,7 +160,15 @@ def _trained(card: ModelCard, config: Mapping[str, Any]) -> ModelCard:
         collapsed=found.get("collapsed"),
         twin=config.get("twin"),
         seed=config.get("seed"),
+        training=_training(config),
     )
+
+
+def _training(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What a checkpoint says of its training, without what the card says already."""
+    stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence")}
+    options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
+    return {name: value for name, value in {**options, **stated}.items() if value is not None}
 
 
 def _features(path: Path) -> Candidate:
@@ -210,8 +229,10 @@ def _with_weights(module: torch.nn.Module, card: ModelCard) -> Candidate:
 
     state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
     digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
+    from brainbench.models.diagram import graph_of
+
     count = sum(parameter.numel() for parameter in module.parameters())
-    return Candidate(replace(card, parameters=count, weights=digest), module)
+    return Candidate(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
 
 
 def _features_of(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

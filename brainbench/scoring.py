@@ -8,17 +8,16 @@ both → a noise-corrected comparison with honest statistics.
 from __future__ import annotations
 
 import dataclasses
+import os
 import time as clock
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from brainbench.errors import UsageError
 from brainbench.files import provenance
-from brainbench.types import Progress, ResultRecord, Score
+from brainbench.types import ESTIMATOR_VERSION, Progress, ResultRecord, Score
 
 if TYPE_CHECKING:
-    import os
-
     import xarray as xr
 
     from brainbench.datasets import Selection, Window
@@ -78,6 +77,7 @@ def score_record(
     normalize: bool = True,
     time: TimeRule = "mean",
     seed: int = 0,
+    weights_seed: int | None = None,
     baselines: bool = True,
     explain: bool = False,
     command: str | None = None,
@@ -101,6 +101,8 @@ def score_record(
         time: how the time axis enters an RDM on both sides: ``"mean"`` averages over it,
             ``"concatenate"`` keeps every step as features.
         seed: seed of untrained weights, of split halves and of random features.
+        weights_seed: seed of untrained weights alone, so that twins of other seeds share one brain side;
+            ``seed`` by default.
         baselines: also score the raw input, random features and animal against animal.
         explain: also walk from the published estimator to the default one (``estimator_walk`` in the
             statistics of the provenance); RSA only.
@@ -123,7 +125,7 @@ def score_record(
     metrics.check_metric(chosen)
     if explain and chosen.name != "rsa":
         raise UsageError(f"The published estimator is one of RSA; the metric {chosen.name!r} has none to explain.")
-    candidate = find_model(model, seed=seed)
+    candidate = find_model(model, seed=seed if weights_seed is None else weights_seed)
     brain = brain_side(recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress)
     network = candidate.respond(
         stimuli,
@@ -163,8 +165,16 @@ def score_record(
             "normalize": normalize,
             "layers": layers,
             "estimator": estimator,
+            "estimator_version": ESTIMATOR_VERSION,
             "metric": chosen.name,
             "seed": seed,
+            "weights_seed": seed if weights_seed is None else weights_seed,
+            "model": model if isinstance(model, str) else None,
+            "stimuli": None if stimuli is None else str(stimuli) if isinstance(stimuli, (str, os.PathLike)) else "data",
+            "conditions": conditions,
+            "select": select if select is None or isinstance(select, str) else str(select),
+            "window": window if window is None or isinstance(window, str) else str(window),
+            "bin": bin,
         },
         seconds=round(clock.perf_counter() - started, 2),
     )

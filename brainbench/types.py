@@ -34,8 +34,11 @@ it; ``undefined``: no number exists. The reason stands in words beside it."""
 Progress = Callable[[int, int, str], None]
 """Called with the steps done, the steps in all, and what is being done."""
 
-RECORD_SCHEMA = 1
-"""Version of the result-record JSON layout."""
+RECORD_SCHEMA = 2
+"""Version of the result-record JSON layout; :meth:`ResultRecord.from_json` also reads every earlier one."""
+
+ESTIMATOR_VERSION = 1
+"""Raised whenever the same recordings and activations would get another number from the default estimator."""
 
 SWEEPS_FORMAT = "brainbench-sweeps"
 """Attribute ``format`` of every shard and manifest of a data set of sweeps (``docs/datasets.md``)."""
@@ -89,6 +92,8 @@ class LayerScore:
     """Mean noise-corrected score over the animals whose RDM is reliable."""
     r: float
     status: Status = "ok"
+    interval: Interval | None = None
+    """Of ``value``, over animals."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +154,10 @@ class Score:
             reliability_interval=_optional(Interval, data.get("reliability_interval")),
             interval=_optional(Interval, data.get("interval")),
             ceiling=_optional(Ceiling, data.get("ceiling")),
-            layers=tuple(_build(LayerScore, item) for item in data.get("layers", ())),
+            layers=tuple(
+                _build(LayerScore, item, interval=_optional(Interval, item.get("interval")))
+                for item in data.get("layers", ())
+            ),
             subjects=tuple(_build(SubjectScore, item) for item in data.get("subjects", ())),
         )
 
@@ -184,11 +192,50 @@ class Score:
 
 
 @dataclass(frozen=True)
+class GraphNode:
+    """One part of a model, as a diagram shows it."""
+
+    name: str
+    """Name of the layer in :attr:`Score.layers` where the part is one."""
+    part: str
+    """``input``, ``encoder``, ``attender`` or ``decoder``."""
+    kind: str
+    """What it computes, such as ``convolution 2×2``."""
+    memory: str = ""
+    """Its recurrent cell; empty for none."""
+    shape: tuple[int, ...] = ()
+    """Shape of its output at one time step."""
+    parameters: int | None = None
+
+
+@dataclass(frozen=True)
+class GraphEdge:
+    """A connection between two parts of a model."""
+
+    source: str
+    target: str
+    feedback: bool = False
+    """True for a connection that leads back and therefore acts one step later."""
+
+
+@dataclass(frozen=True)
+class ModelGraph:
+    """Parts of a model and their connections, from input to output."""
+
+    nodes: tuple[GraphNode, ...]
+    edges: tuple[GraphEdge, ...]
+
+
+@dataclass(frozen=True)
 class ModelCard:
     """What a scored model is. Fields that do not apply are None."""
 
     name: str
     family: str = ""
+    encoder: str | None = None
+    """Encoder with its memory, without its size, such as ``zhuang-intersection-ln``."""
+    attender: str | None = None
+    """``gpt``, ``mamba``, or ``none`` for a network known to have none."""
     objective: str | None = None
     augmentation: str | None = None
     parameters: int | None = None
@@ -207,6 +254,11 @@ class ModelCard:
     """Content hash of the weights that were scored."""
     input: str = ""
     """How the stimuli were turned into the model's input (units, normaliser)."""
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """How it was trained: optimiser, epochs, batch, data, as the checkpoint states it. Empty if untrained."""
+    graph: ModelGraph | None = None
+    citation: str | None = None
+    """Papers that the architecture comes from."""
 
 
 @dataclass(frozen=True)
@@ -229,17 +281,12 @@ class ResultRecord:
 
     @classmethod
     def from_json(cls, source: str | Mapping[str, Any]) -> ResultRecord:
-        """Rebuild a record.
+        """Rebuild a record; one of an earlier schema version is brought to this one (:func:`migrate_record`).
 
         Raises:
             DataError: it is not a record of a schema version this package reads.
         """
-        data = _mapping(source, "result record")
-        if data.get("schema") != RECORD_SCHEMA:
-            raise DataError(
-                f"This result record has schema version {data.get('schema')!r}; this brainbench reads version "
-                f"{RECORD_SCHEMA}; score the model again or use the version that wrote it."
-            )
+        data = migrate_record(_mapping(source, "result record"))
         if "score" not in data:
             raise DataError("This result record is incomplete (it has no 'score').")
         card = data.get("card")
@@ -249,25 +296,67 @@ class ResultRecord:
             score=Score.from_json(data["score"]),
             animal_to_animal=_optional_score(data.get("animal_to_animal")),
             baselines={key: Score.from_json(item) for key, item in data.get("baselines", {}).items()},
-            card=card and _build(ModelCard, card, accuracy_interval=_optional(Interval, card.get("accuracy_interval"))),
+            card=card and _card(card),
         )
 
     @property
     def identity(self) -> str:
         """Content hash of the result without time and machine: equal inputs give equal names."""
-        from brainbench.files import content_hash, to_plain
+        from brainbench.files import to_plain
 
-        plain = to_plain(self)
-        for item in (plain["score"], plain["animal_to_animal"], *plain["baselines"].values()):
-            if item is not None:
-                for volatile in ("time", "machine", "python", "packages", "seconds", "command"):
-                    item["provenance"].pop(volatile, None)
-        return content_hash(plain)
+        return record_identity(to_plain(self))
 
     def _repr_html_(self) -> str:
         """Show the score and its baselines in a notebook."""
         parts = [self.score, *([self.animal_to_animal] if self.animal_to_animal else []), *self.baselines.values()]
         return "".join(part._repr_html_() for part in parts)
+
+
+def record_identity(data: Mapping[str, Any]) -> str:
+    """Return the content hash of a record given as the mapping inside its JSON, of any schema version.
+
+    What differs between two runs of one computation does not count: time, machine, packages, command.
+    """
+    from brainbench.files import content_hash
+
+    return content_hash(
+        {
+            **data,
+            "score": _steady(data.get("score")),
+            "animal_to_animal": _steady(data.get("animal_to_animal")),
+            "baselines": {name: _steady(item) for name, item in (data.get("baselines") or {}).items()},
+        }
+    )
+
+
+def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    if score is None:
+        return None
+    volatile = ("time", "machine", "python", "packages", "seconds", "command")
+    kept = {name: value for name, value in (score.get("provenance") or {}).items() if name not in volatile}
+    return {**score, "provenance": kept}
+
+
+def migrate_record(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Bring the mapping inside a record's JSON to :data:`RECORD_SCHEMA`.
+
+    Version 2 added to version 1 the model card's encoder, attender, training, graph and citation and the
+    layers' intervals; all of them may be absent, so nothing but the number changes.
+
+    Raises:
+        DataError: the version is unknown here.
+    """
+    version = data.get("schema")
+    if version == 1 and not isinstance(version, bool):
+        return {**data, "schema": 2}
+    if version == RECORD_SCHEMA:
+        return data
+    newer = isinstance(version, int) and version > RECORD_SCHEMA
+    advice = "update brainbench" if newer else "score the model again or use the version that wrote it"
+    raise DataError(
+        f"This result record has schema version {version!r}; this brainbench reads versions 1 to "
+        f"{RECORD_SCHEMA}; {advice}."
+    )
 
 
 def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
@@ -358,6 +447,14 @@ def _mapping(source: str | Mapping[str, Any], what: str) -> Mapping[str, Any]:
     if not isinstance(source, Mapping):
         raise DataError(f"A {what} is a JSON object; received {type(source).__name__}.")
     return source
+
+
+def _card(data: Mapping[str, Any]) -> ModelCard:
+    graph = data.get("graph")
+    if graph is not None:
+        nodes = tuple(_build(GraphNode, item) for item in graph.get("nodes", ()))
+        graph = ModelGraph(nodes, tuple(_build(GraphEdge, item) for item in graph.get("edges", ())))
+    return _build(ModelCard, data, accuracy_interval=_optional(Interval, data.get("accuracy_interval")), graph=graph)
 
 
 def _optional(kind: type, data: Mapping[str, Any] | None) -> Any:

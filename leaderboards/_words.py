@@ -35,7 +35,11 @@ _CARD_LABELS = {
     "seed": "seed",
     "weights": "weights (hash)",
     "input": "input",
+    "encoder": "encoder",
+    "attender": "attender",
+    "citation": "architecture from",
 }
+"""Card fields that are a line of text; the training and the graph have their own places."""
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -139,7 +143,7 @@ def card_rows(card: ModelCard) -> list[tuple[str, str]]:
     rows = []
     for item in fields(card):
         value = getattr(card, item.name)
-        if item.name == "name" or value is None or value == "":
+        if item.name not in _CARD_LABELS or value is None or value == "":
             continue
         if isinstance(value, Interval):
             value = f"{span(value)} ({level(value)})"

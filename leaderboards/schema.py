@@ -56,7 +56,7 @@ def record_schema() -> dict[str, Any]:
 def first_fault(data: Any) -> str | None:
     """Return where and how parsed JSON departs from the schema, or None when it is a valid record.
 
-    >>> first_fault({"schema": 1, "score": {"name": "net", "value": "high", "status": "ok"}})
+    >>> first_fault({"schema": 2, "score": {"name": "net", "value": "high", "status": "ok"}})
     "score.value is 'high'; expected a number or null"
     """
     schema = record_schema()

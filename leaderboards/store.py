@@ -16,11 +16,11 @@ import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from brainbench.errors import DataError, DataFileNotFoundError
 from brainbench.files import write_text
-from brainbench.types import RECORD_SCHEMA, Interval, ResultRecord, Score
+from brainbench.types import RECORD_SCHEMA, Interval, ResultRecord, Score, migrate_record, record_identity
 from leaderboards.schema import first_fault
 
 
@@ -32,6 +32,8 @@ class StoredRecord:
     record: ResultRecord | None
     problem: str | None = None
     """One sentence; None exactly when ``record`` can be used."""
+    schema: int = RECORD_SCHEMA
+    """Version of the layout on disk; an earlier one was brought to the present one in reading."""
 
 
 def record_name(record: ResultRecord) -> str:
@@ -65,14 +67,18 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
 
 
 def read_record(path: str | os.PathLike[str]) -> ResultRecord:
-    """Read one record.
+    """Read one record; one of an earlier schema version is brought to the present one.
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: the file is not JSON, not a record of this schema version, contradicts itself, or
+        DataError: the file is not JSON, not a record of a known schema version, contradicts itself, or
             its content does not fit the hash in its name (edited by hand, or renamed).
     """
-    path = Path(path)
+    return _read(Path(path))[0]
+
+
+def _read(path: Path) -> tuple[ResultRecord, int]:
+    """Return a record and the schema version of its file."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -80,8 +86,9 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{os.fspath(path)!r} cannot be read as UTF-8 text ({error}).") from error
     try:
-        record = _parse(text, path)
-        identity = record.identity
+        record, data = _parse(text, path)
+        # The hash is that of the layout on disk, which for an earlier version is not the record's own.
+        identity = record.identity if data["schema"] == RECORD_SCHEMA else record_identity(data)
     except RecursionError as error:
         raise DataError(f"{path.name!r} is nested too deeply to be a result record.") from error
     named = path.stem.rpartition("--")[2]
@@ -90,7 +97,7 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
             f"{path.name!r} was edited or renamed: its content has the hash {identity}, its name says "
             f"{named!r}; restore the original file or score the model again."
         )
-    return record
+    return record, data["schema"]
 
 
 def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[StoredRecord]:
@@ -118,33 +125,33 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     stored: dict[str, StoredRecord] = {}
     for path in sorted(set(paths)):
         try:
-            record = read_record(path)
+            record, schema = _read(path)
         except DataError as error:
             stored[os.fspath(path)] = StoredRecord(path, None, str(error))
         else:
-            stored.setdefault(record.identity, StoredRecord(path, record))
+            stored.setdefault(record.identity, StoredRecord(path, record, schema=schema))
     return list(stored.values())
 
 
-def _parse(text: str, path: Path) -> ResultRecord:
+def _parse(text: str, path: Path) -> tuple[ResultRecord, dict[str, Any]]:
     try:
         data = json.loads(text, parse_constant=_refuse_constant)
     except ValueError as error:
         raise DataError(f"{path.name!r} is not valid JSON ({error}).") from error
-    version = data.get("schema") if isinstance(data, dict) else None
-    # The version comes first: an older layout should be called old, not faulty.
-    fault = first_fault(data) if version == RECORD_SCHEMA or not isinstance(version, int) else None
-    if fault:
-        raise DataError(f"{path.name!r} is not a result record: {fault}.")
     try:
-        record = ResultRecord.from_json(data)
+        # The version comes first: another layout should be called old or new, not faulty.
+        current = migrate_record(data) if isinstance(data, dict) and isinstance(data.get("schema"), int) else data
+        fault = first_fault(current)
+        if fault:
+            raise DataError(f"it is not a result record: {fault}.")
+        record = ResultRecord.from_json(current)
     except DataError as error:
         raise DataError(f"{path.name!r}: {error}") from error
     for score in (record.score, record.animal_to_animal, *record.baselines.values()):
         contradiction = _contradiction(score) if score else None
         if score and contradiction:
             raise DataError(f"{path.name!r} contradicts itself: in the score {score.name!r}, {contradiction}.")
-    return record
+    return record, data
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -67,6 +67,9 @@ def score(
         bool, typer.Option(help="Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI.")
     ] = True,
     seed: Annotated[int, typer.Option(help="Seed of untrained weights and of split halves.")] = 0,
+    weights_seed: Annotated[
+        int | None, typer.Option(help="Seed of untrained weights alone; --seed then keeps that of the statistics.")
+    ] = None,
     explain_estimator: Annotated[
         bool,
         typer.Option(
@@ -106,6 +109,7 @@ def score(
             metric=metric,
             normalize=normalize,
             seed=seed,
+            weights_seed=weights_seed,
             explain=explain_estimator,
             command=_command(),
             progress=progress,

@@ -128,7 +128,13 @@ class PatternMetric:
             best_layer=usable[best],
             best_layer_value=float(means[best]),
             layers=tuple(
-                LayerScore(layer, float(means[usable.index(layer)]), float(means[usable.index(layer)]), status)
+                LayerScore(
+                    layer,
+                    float(means[usable.index(layer)]),
+                    float(means[usable.index(layer)]),
+                    status,
+                    t_interval(values[0][usable.index(layer)]),
+                )
                 if layer in usable
                 else LayerScore(layer, math.nan, math.nan, "undefined")
                 for layer in layers

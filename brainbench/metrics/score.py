@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,7 @@ def score_rdms(
     estimator: str = "default",
     compare: str = "pearson",
     seed: int = 0,
+    device: Any = None,
 ) -> Score:
     """Score a model by the RDMs of its layers against animals.
 
@@ -75,12 +76,20 @@ def score_rdms(
         estimator: See :func:`noise_corrected`.
         compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
         seed: Seed of random permutations (more than 8 stimuli).
+        device: Torch device for the permutations, which pays from some hundred stimuli on; numpy by default.
 
     Raises:
         UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
     return score_with_test(
-        layer_rdms, subjects, name=name, stimuli=stimuli, estimator=estimator, compare=compare, seed=seed
+        layer_rdms,
+        subjects,
+        name=name,
+        stimuli=stimuli,
+        estimator=estimator,
+        compare=compare,
+        seed=seed,
+        device=device,
     )[0]
 
 
@@ -93,6 +102,7 @@ def score_with_test(
     estimator: str = "default",
     compare: str = "pearson",
     seed: int = 0,
+    device: Any = None,
 ) -> tuple[Score, PermutationTest | None]:
     """Return what :func:`score_rdms` does, and its permutation test with all statistics."""
     check_comparison(compare)
@@ -101,7 +111,7 @@ def score_with_test(
     defined = np.flatnonzero(~is_flat(rdms)).tolist()
     choice = None
     if animals.scored and defined and len(stimuli) > 2:
-        choice = _choose(rdms[defined], animals, estimator, compare, seed)
+        choice = _choose(rdms[defined], animals, estimator, compare, {"seed": seed, "device": device})
     status, reasons = _verdict(animals, names, defined, len(stimuli), estimator, choice)
     reliability, reliability_interval = mean_reliability(animals)
     layers = _layer_scores(names, rdms, defined, animals, compare)
@@ -205,7 +215,9 @@ def _layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> tupl
     return tuple(map(str, layer_rdms)), np.stack(rdms)
 
 
-def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, seed: int) -> _Choice | None:
+def _choose(
+    rdms: Floats, animals: Animals, estimator: str, comparison: str, test_options: dict[str, Any]
+) -> _Choice | None:
     """Choose layers by the estimator's rule, with a test that repeats the choice."""
     # An animal's factor does not change when labels are permuted, so permutations repeat r alone.
     brain, factors = animals.rdms(animals.scored), animals.factors(animals.scored)
@@ -213,26 +225,28 @@ def _choose(rdms: Floats, animals: Animals, estimator: str, comparison: str, see
     count = len(animals.scored)
     every = np.arange(count)
     if len(rdms) == 1:
-        test = permuted_statistic(rdms, brain, lambda x: x[:, 0] @ factors / count, method=comparison, seed=seed)
+        test = permuted_statistic(rdms, brain, lambda x: x[:, 0] @ factors / count, method=comparison, **test_options)
         return _Choice(r[0], r[0] * factors, (0,) * count, 0, "only layer", test)
     # The published rule; the test takes the same maximum, so its p stays honest where the value is not.
     if estimator != "default":
         best = first_best((r * factors).mean(axis=1))
         test = permuted_statistic(
-            rdms, brain, lambda x: (x * factors).mean(axis=-1).max(axis=-1), method=comparison, seed=seed
+            rdms, brain, lambda x: (x * factors).mean(axis=-1).max(axis=-1), method=comparison, **test_options
         )
         rule = "maximum over layers on the data that are scored (as published; optimistic)"
         return _Choice(r[best], r[best] * factors, (best,) * count, best, rule, test)
     if count == 1:
-        return _choose_on_halves(rdms, animals.subjects[animals.scored[0]], comparison, seed)
+        return _choose_on_halves(rdms, animals.subjects[animals.scored[0]], comparison, test_options)
     chosen = choose_on_others(r)
-    test = permuted_statistic(rdms, brain, lambda x: held_out(x) @ factors / count, method=comparison, seed=seed)
+    test = permuted_statistic(rdms, brain, lambda x: held_out(x) @ factors / count, method=comparison, **test_options)
     rule = "chosen on the other animals, evaluated on the animal held out"
     picked = r[chosen, every]
     return _Choice(picked, picked * factors, tuple(chosen.tolist()), most_chosen(chosen), rule, test)
 
 
-def _choose_on_halves(rdms: Floats, subject: SubjectRDM, comparison: str, seed: int) -> _Choice | None:
+def _choose_on_halves(
+    rdms: Floats, subject: SubjectRDM, comparison: str, test_options: dict[str, Any]
+) -> _Choice | None:
     # A half in which a stimulus met silent units has no RDM; such splits say nothing.
     halves = subject.halves[~is_flat(subject.halves).any(axis=1)]
     splits = len(halves)
@@ -249,7 +263,7 @@ def _choose_on_halves(rdms: Floats, subject: SubjectRDM, comparison: str, seed: 
         pair = x.reshape(*x.shape[:-1], len(some), 2)
         return choose_on_halves(pair[..., 0], pair[..., 1])[1].mean(axis=-1) * factor
 
-    test = permuted_statistic(rdms, some.reshape(2 * len(some), -1), statistic, method=comparison, seed=seed)
+    test = permuted_statistic(rdms, some.reshape(2 * len(some), -1), statistic, method=comparison, **test_options)
     rule = "chosen on one half of the only reliable animal's trials, evaluated on the other half"
     mean, layer = float(held.mean()), most_chosen(chosen)
     return _Choice(np.array([mean]), np.array([mean * factor]), (layer,), layer, rule, test)
@@ -297,11 +311,13 @@ def _layer_scores(
     scores = dict.fromkeys(range(len(names)), nothing)
     if animals.scored and defined and rdms.shape[1] > 1:
         r = compare_all(rdms[defined], animals.rdms(animals.scored), method=comparison)
-        values = (r * animals.factors(animals.scored)).mean(axis=1)
+        values = r * animals.factors(animals.scored)
         status: Status = "ok" if animals.reliable else "unreliable"
         for row, index in enumerate(defined):
-            scores[index] = LayerScore("", float(values[row]), float(r[row].mean()), status)
-    return tuple(LayerScore(names[i], scores[i].value, scores[i].r, scores[i].status) for i in range(len(names)))
+            scores[index] = LayerScore(
+                "", float(values[row].mean()), float(r[row].mean()), status, t_interval(values[row])
+            )
+    return tuple(replace(scores[i], layer=names[i]) for i in range(len(names)))
 
 
 def _subject_scores(

@@ -45,7 +45,7 @@ def test_a_written_record_fits_the_schema(make_record, status):
         (("synthetic",), "no", "synthetic is 'no'; expected true or false"),
         (("baselines", "raw input"), None, "baselines.raw input is None; expected an object"),
         (("score", "colour"), "red", "score has the unknown field 'colour'"),
-        (("schema",), True, "schema is True; expected 1"),
+        (("schema",), True, "schema is True; expected 2"),
         (("score", "p"), float("inf"), "score.p is inf; expected a number or null"),
     ],
 )

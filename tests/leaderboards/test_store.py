@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.errors import DataError, DataFileNotFoundError
-from brainbench.types import ResultRecord, Score
+from brainbench.types import ResultRecord, Score, record_identity
 from leaderboards.store import read_record, read_records, record_name, write_record
 
 
@@ -84,8 +84,11 @@ def test_names_that_share_a_slug_do_not_share_a_file(make_record, tmp_path):
         (lambda text: text[:-40], "is not valid JSON"),
         (lambda text: text.replace("0.0127", "NaN"), "NaN is not JSON"),
         (lambda text: text.replace("0.0127", "1e999"), ".p is inf; expected a number or null"),
-        (lambda text: text.replace('"schema": 1', '"schema": 7'), "schema version 7; this brainbench reads version 1"),
-        (lambda text: text.replace('"schema": 1', '"schema": "x"'), "schema is 'x'; expected 1"),
+        (
+            lambda text: text.replace('"schema": 2', '"schema": 7'),
+            "schema version 7; this brainbench reads versions 1 to 2; update",
+        ),
+        (lambda text: text.replace('"schema": 2', '"schema": "x"'), "schema is 'x'; expected 2"),
         (lambda text: text.replace('"status": "ok"', '"status": "fine"'), "expected one of 'ok'"),
         (lambda text: "[" * 100_000, "is nested too deeply"),
         (lambda text: text.replace('"numpy": "2.3.1"', '"numpy":' + "[" * 400 + "]" * 400), "is nested too deeply"),
@@ -182,3 +185,27 @@ def test_the_examples_in_the_docstrings_hold(module):
     result = doctest.testmod(importlib.import_module(f"leaderboards.{module}"))
     assert result.attempted > 0
     assert result.failed == 0
+
+
+def _as_version_1(record: ResultRecord) -> dict[str, object]:
+    """The layout of version 1, which had no graph, training, encoder, attender, citation or intervals of layers."""
+    data = json.loads(record.to_json())
+    for name in ("graph", "training", "encoder", "attender", "citation"):
+        del data["card"][name]
+    scores = [data["score"], data["animal_to_animal"], *data["baselines"].values()]
+    for layer in (layer for score in scores for layer in score["layers"]):
+        del layer["interval"]
+    return {**data, "schema": 1}
+
+
+def test_a_record_of_the_first_schema_is_read_by_its_own_hash_and_known_as_old(make_record, tmp_path):
+    record = make_record()
+    data = _as_version_1(record)
+    path = tmp_path / f"zhuang--{record_identity(data)}.json"
+    path.write_text(json.dumps(data))
+    (stored,) = read_records(path)
+    assert stored.schema == 1
+    assert stored.record == record
+    path.write_text(json.dumps({**data, "synthetic": False}))
+    with pytest.raises(DataError, match="was edited or renamed"):
+        read_record(path)
