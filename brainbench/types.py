@@ -232,10 +232,6 @@ class ModelCard:
 
     name: str
     family: str = ""
-    encoder: str | None = None
-    """Encoder with its memory, without its size, such as ``zhuang-intersection-ln``."""
-    attender: str | None = None
-    """``gpt``, ``mamba``, or ``none`` for a network known to have none."""
     objective: str | None = None
     augmentation: str | None = None
     parameters: int | None = None
@@ -254,6 +250,10 @@ class ModelCard:
     """Content hash of the weights that were scored."""
     input: str = ""
     """How the stimuli were turned into the model's input (units, normaliser)."""
+    encoder: str | None = None
+    """Encoder with its memory, without its size, such as ``zhuang-intersection-ln``."""
+    attender: str | None = None
+    """``gpt``, ``mamba``, or ``none`` for a network known to have none."""
     training: Mapping[str, Any] = field(default_factory=dict)
     """How it was trained: optimiser, epochs, batch, data, as the checkpoint states it. Empty if untrained."""
     graph: ModelGraph | None = None
