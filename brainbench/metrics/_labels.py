@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.errors import DataError, UsageError, listing
+from brainbench.metrics._arrays import Array, is_tensor, library, place, slices
 from brainbench.metrics._pairs import Floats, Ints
 
 _SLICE_ELEMENTS = 1 << 20
@@ -48,18 +50,21 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
     return codes, tuple(str(code) for code in range(total))
 
 
-def response_matrix(responses: ArrayLike, rows: str) -> NDArray:
-    """Return responses as a floating array [rows, U], keeping float32.
+def response_matrix(responses: ArrayLike, rows: str) -> Any:
+    """Return responses as a floating array [rows, U], keeping float32 and tensors where they lie.
 
     Raises:
         UsageError: not a two-dimensional array of real numbers with at least one unit.
     """
-    array = np.asarray(responses)
-    if array.ndim != 2 or array.dtype.kind not in "fiub" or array.shape[1] == 0:
+    array: Any = responses if is_tensor(responses) else np.asarray(responses)
+    real = not array.dtype.is_complex if is_tensor(array) else array.dtype.kind in "fiub"
+    if array.ndim != 2 or not real or array.shape[1] == 0:
         raise UsageError(
             f"Responses must be real numbers [{rows}, units] with at least one unit; "
-            f"received {array.dtype} of shape {array.shape}; flatten time and space into units first."
+            f"received {array.dtype} of shape {tuple(array.shape)}; flatten time and space into units first."
         )
+    if is_tensor(array):
+        return array.detach() if array.dtype.is_floating_point else array.double()
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
@@ -107,6 +112,28 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
         means[:, columns] = found
     means[numbers[:, 0] == 0] = np.nan
     return means
+
+
+def tensor_means(responses: Any, codes: Ints, count: int, device: Any) -> Array:
+    """Return what :func:`stimulus_means` does as a tensor on ``device``, by products with the trials' membership.
+
+    Raises:
+        DataError: a response is infinite.
+    """
+    member = np.zeros((count, len(codes)))
+    member[codes, np.arange(len(codes))] = 1.0
+    member = place(member, device)
+    xp, found = library(member), []
+    for _, part in slices(responses, _SLICE_ELEMENTS, device):
+        present = xp.isfinite(part)
+        if xp.isinf(part).any():
+            check_finite(xp.cat([part for _, part in slices(responses, _SLICE_ELEMENTS, device)], -1).cpu().numpy())
+        seen = xp.where(present, xp.ones_like(part), 0.0)
+        # Sums about a value from within the data keep the digits that a large offset would cost.
+        shift = xp.where(present, part, 0.0).sum(0) / seen.sum(0).clip(1.0)
+        totals, numbers = member @ xp.where(present, part - shift, 0.0), member @ seen
+        found.append(xp.where(numbers > 0, totals / numbers.clip(1.0), np.nan) + shift)
+    return xp.cat(found, -1)
 
 
 def check_finite(responses: NDArray) -> None:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.errors import UsageError
+from brainbench.metrics._arrays import is_tensor, library
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,9 +35,13 @@ def stimulus_count(pairs: int) -> int:
     return count
 
 
-def upper(matrix: Floats) -> Floats:
-    """Return the upper triangle [..., P] of square matrices [..., K, K]."""
-    rows, cols = np.triu_indices(matrix.shape[-1], k=1)
+def upper(matrix: Any) -> Any:
+    """Return the upper triangle [..., P] of square matrices [..., K, K], numpy arrays or tensors."""
+    count = matrix.shape[-1]
+    if is_tensor(matrix):
+        rows, cols = library(matrix).triu_indices(count, count, offset=1, device=matrix.device)
+    else:
+        rows, cols = np.triu_indices(count, k=1)
     return matrix[..., rows, cols]
 
 

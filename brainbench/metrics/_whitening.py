@@ -15,8 +15,9 @@ import numpy as np
 from brainbench.errors import DataError, unknown_name
 from brainbench.metrics._halves import Session
 from brainbench.metrics._labels import stimulus_means
+from brainbench.metrics._noise_model import NOISE_METHODS, NoiseModel
 from brainbench.metrics._pairs import Floats, Ints
-from brainbench.metrics.precision import NOISE_METHODS, noise_precision
+from brainbench.metrics.precision import estimate_noise
 
 _FOLDS = 10
 
@@ -58,7 +59,7 @@ def whitened(session: Session, count: int, noise: str) -> tuple[Session | None, 
         inflation = float(np.mean(freedom / np.maximum(freedom - 2, 1)))
         return Session(scaled, session.codes, session.hashes, inflation), told
     try:
-        precision = noise_precision(responses, session.codes, method=noise)
+        precision = estimate_noise(responses, session.codes, count, noise).precision()
     except DataError as error:
         return None, str(error).rstrip(".")
     inflation = _inflation(responses, session.codes, noise, count)
@@ -80,15 +81,16 @@ def _inflation(responses: Floats, codes: Ints, noise: str, count: int) -> float:
     for fold in range(_FOLDS):
         rest, held = residuals[place != fold], residuals[place == fold]
         try:
-            precision = noise_precision(rest, np.zeros(len(rest), dtype=np.int64), method=noise)
+            model = estimate_noise(rest, np.zeros(len(rest), dtype=np.int64), 1, noise)
+            ratio = _mean_square(held, model, len(held)) / _mean_square(rest, model, len(rest) - 1)
         except DataError:
             return 1.0
-        ratio = _mean_square(held, precision, len(held)) / _mean_square(rest, precision, len(rest) - 1)
         found.append(ratio)
     # An estimate from nine tenths errs by ten ninths of what one from all trials does.
     return 1 + (float(np.mean(found)) - 1) * (1 - 1 / _FOLDS)
 
 
-def _mean_square(residuals: Floats, precision: Floats, freedom: int) -> float:
+def _mean_square(residuals: Floats, model: NoiseModel, freedom: int) -> float:
     """Return tr(P̂ S) for the covariance S of residuals."""
-    return float(np.einsum("ru,uv,rv->", residuals, precision, residuals, optimize=True)) / freedom
+    left, right = model.sides(residuals, residuals)
+    return float((left * right).sum()) / freedom

@@ -9,13 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.errors import UsageError
+from brainbench.metrics._arrays import find_device
 from brainbench.metrics._pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
-from brainbench.metrics.compare import check_comparison, compare_all
+from brainbench.metrics._relabelling import relabelled_comparisons
+from brainbench.metrics.compare import check_comparison
 from brainbench.types import Status
 
 EXACT_STIMULI = 8
@@ -68,7 +71,7 @@ class PermutationTest:
 
 
 def permutation_test(
-    model_rdm: ArrayLike, brain_rdms: ArrayLike, *, method: str = "pearson", seed: int = 0
+    model_rdm: ArrayLike, brain_rdms: ArrayLike, *, method: str = "pearson", seed: int = 0, device: Any = None
 ) -> PermutationTest:
     """Test whether the model's RDM compares better with the animals' than relabelled ones do.
 
@@ -80,9 +83,10 @@ def permutation_test(
         brain_rdms: [A, P] or [P].
         method: Comparison, see :func:`brainbench.metrics.compare`.
         seed: Seed of the random orders; unused when all are taken.
+        device: Torch device for the products, which pays from some hundred stimuli on; numpy by default.
 
     Raises:
-        UsageError: unknown method, or RDMs of different numbers of stimuli.
+        UsageError: unknown method or device, or RDMs of different numbers of stimuli.
 
     >>> test = permutation_test([1, 2, 3, 4, 5, 7], [[1, 2, 3, 4, 5, 6], [2, 3, 3, 4, 6, 7]])
     >>> test.count, round(test.p, 4), test.p == test.smallest
@@ -96,11 +100,19 @@ def permutation_test(
             f"A permutation test takes one model RDM [P] and brain RDMs [A, P] of the same stimuli; received shapes "
             f"{model.shape} and {brain.shape}."
         )
-    return permuted_statistic(model[None], brain, lambda r: r[:, 0].mean(axis=-1), method=method, seed=seed)
+    return permuted_statistic(
+        model[None], brain, lambda r: r[:, 0].mean(axis=-1), method=method, seed=seed, device=device
+    )
 
 
 def permuted_statistic(
-    layers: Floats, brain: Floats, statistic: Callable[[Floats], Floats], *, method: str = "pearson", seed: int = 0
+    layers: Floats,
+    brain: Floats,
+    statistic: Callable[[Floats], Floats],
+    *,
+    method: str = "pearson",
+    seed: int = 0,
+    device: Any = None,
 ) -> PermutationTest:
     """Test any statistic of the comparisons of layers with brain RDMs.
 
@@ -111,6 +123,7 @@ def permuted_statistic(
             data (a layer) must be chosen inside, or p is too small.
         method: Comparison.
         seed: Seed of the random orders.
+        device: Torch device for the products, or None for numpy.
     """
     stimuli = stimulus_count(layers.shape[-1])
     exact = stimuli <= EXACT_STIMULI
@@ -123,7 +136,7 @@ def permuted_statistic(
         reason = "an RDM has missing pairs, so its stimuli cannot be permuted"
     if reason:
         return PermutationTest(math.nan, smallest, exact, count, math.nan, np.empty(0), reason)
-    null = permuted_values(layers, brain, statistic, method=method, seed=seed)
+    null = permuted_values(layers, brain, statistic, method=method, seed=seed, device=device)
     if not np.isfinite(null[0]):
         return PermutationTest(
             math.nan, smallest, exact, count, math.nan, null, "the comparison is undefined (a constant RDM)"
@@ -134,7 +147,13 @@ def permuted_statistic(
 
 
 def permuted_values(
-    layers: Floats, brain: Floats, statistic: Callable[[Floats], Floats], *, method: str = "pearson", seed: int = 0
+    layers: Floats,
+    brain: Floats,
+    statistic: Callable[[Floats], Floats],
+    *,
+    method: str = "pearson",
+    seed: int = 0,
+    device: Any = None,
 ) -> Floats:
     """Return a statistic [N, ...] of comparisons [N, L, A] under every order of the stimuli, the given one first.
 
@@ -142,12 +161,9 @@ def permuted_values(
     """
     layers, brain = _canonical(layers, brain)
     step = max(1, _CHUNK_ELEMENTS // layers.size)
-    parts = []
-    for orders in label_orders(stimulus_count(layers.shape[-1]), step, seed):
-        relabelled = layers[:, permuted_pairs(orders)].swapaxes(0, 1).reshape(-1, layers.shape[-1])
-        r = compare_all(relabelled, brain, method=method)
-        parts.append(statistic(r.reshape(len(orders), len(layers), len(brain))))
-    return np.concatenate(parts)
+    chunks = label_orders(stimulus_count(layers.shape[-1]), step, seed)
+    found = relabelled_comparisons(layers, brain, chunks, method, device=find_device(device))
+    return np.concatenate([statistic(r) for r in found])
 
 
 def smallest_p(stimuli: int) -> float:

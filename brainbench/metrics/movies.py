@@ -27,7 +27,7 @@ def rdm_movie(
         labels: Stimulus of each trial, as in :func:`brainbench.metrics.rdm`.
         width: Bins per window.
         step: Bins from one window to the next.
-        **options: ``method``, ``folds`` and ``precision`` of :func:`brainbench.metrics.rdm`.
+        **options: ``method``, ``folds``, ``precision`` and ``device`` of :func:`brainbench.metrics.rdm`.
 
     Raises:
         UsageError: not three-dimensional, or a window that does not fit; else as :func:`brainbench.metrics.rdm`.

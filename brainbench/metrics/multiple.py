@@ -14,6 +14,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,6 +82,7 @@ def compare_models(
     compare: str = "pearson",
     correction: str = "holm",
     seed: int = 0,
+    device: Any = None,
 ) -> ModelComparison:
     """Score several models, correct their p for their number and compare them pairwise.
 
@@ -91,6 +93,7 @@ def compare_models(
         compare: Comparison of RDMs.
         correction: ``holm``, ``fdr`` or ``none``, for the pairwise tests.
         seed: Seed of random permutations and sign flips.
+        device: Torch device for the permutations; numpy by default.
 
     Raises:
         UsageError: no models or animals, RDMs that do not fit, unknown names.
@@ -99,7 +102,7 @@ def compare_models(
     if not models:
         raise UsageError("There are no models to compare; give the layers' RDMs of at least one.")
     found = {
-        name: score_with_test(layers, subjects, name=name, stimuli=stimuli, compare=compare, seed=seed)
+        name: score_with_test(layers, subjects, name=name, stimuli=stimuli, compare=compare, seed=seed, device=device)
         for name, layers in models.items()
     }
     tested = {name: test.null for name, (_, test) in found.items() if test is not None and math.isfinite(test.p)}
@@ -137,6 +140,7 @@ def layer_tests(
     *,
     compare: str = "pearson",
     seed: int = 0,
+    device: Any = None,
 ) -> tuple[LayerTest, ...]:
     """Test every layer, corrected for their number by the maximum statistic (Nichols & Holmes 2002).
 
@@ -162,6 +166,7 @@ def layer_tests(
         lambda r: (r * factors).mean(axis=-1),
         method=compare,
         seed=seed,
+        device=device,
     )
     largest = values.max(axis=1)
     for row, index in enumerate(usable.tolist()):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.metrics.animal_to_animal import score_animals
@@ -62,7 +61,7 @@ class RSA:
         seed: int = 0,
     ) -> Score:
         """Score the RDMs of the layers' features [K, F]; see :func:`score_rdms`."""
-        rdms = {layer: rdm(np.asarray(values), method=self.model_method) for layer, values in features.items()}
+        rdms = {layer: rdm(values, method=self.model_method) for layer, values in features.items()}
         return score_rdms(
             rdms, animals, name=name, stimuli=stimuli, estimator=estimator, compare=self.comparison, seed=seed
         )

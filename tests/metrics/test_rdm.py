@@ -122,10 +122,13 @@ def test_a_pair_uses_the_units_recorded_in_both_stimuli():
     np.testing.assert_allclose(rdm(means, [0, 1, 2], method="sqeuclidean"), squared, rtol=1e-12)
 
 
-def test_a_complete_pattern_with_a_nan_activation_is_broken_not_missing():
-    patterns = np.random.default_rng(4).normal(size=(4, 9))
-    patterns[1, 3] = np.nan
-    result = square(rdm(patterns))
+@pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "mahalanobis", "poisson"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_complete_pattern_with_a_broken_activation_is_broken_not_missing(value, method):
+    patterns = np.random.default_rng(4).gamma(2.0, size=(4, 9))
+    patterns[1, 3] = value
+    precision = np.eye(9) + 0.1 if method == "mahalanobis" else None
+    result = square(rdm(patterns, method=method, precision=precision))
     assert np.isnan(result[1, [0, 2, 3]]).all()
     assert np.isfinite(result[np.ix_([0, 2, 3], [0, 2, 3])]).all()
     assert rdm_problem(patterns) == "activations that are not finite for stimulus '1'"
