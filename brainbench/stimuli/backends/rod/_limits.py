@@ -1,7 +1,13 @@
 """Limits of the ``rod`` solver: what it looks at, how long it tries, and when it gives up. mm, ms, rad."""
 
-CONTACTS = 4
+CONTACTS = 8
 """Contacts of one whisker that are solved together; the tightest are kept when there are more."""
+SEEN = 12
+"""Places of possible contact that are watched within a step; the nearest are kept when there are more."""
+ROUNDS = 4
+"""Times that contacts are added to a step because the others press the whisker onto them."""
+CLOSED = 1e-3
+"""Overlap (mm) at the end of a step from which a place counts as pressed upon."""
 SWEEPS = 20
 """Most Gauss-Seidel sweeps over the contacts of one step."""
 LARGEST_BEND = 1.5

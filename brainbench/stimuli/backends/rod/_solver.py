@@ -16,6 +16,7 @@ from brainbench.stimuli.backends.rod._limits import (
     BENT,
     CONTACTS,
     CREVICE,
+    CLOSED,
     FAR,
     FINEST,
     FOLD,
@@ -25,6 +26,8 @@ from brainbench.stimuli.backends.rod._limits import (
     NEAR,
     NOTHING,
     REST,
+    ROUNDS,
+    SEEN,
     STOP,
     SWEEPS,
     TRAVEL,
@@ -431,14 +434,25 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         inverse = wp.zeros(wp.static(capacity), dtype=vec3)
         clear = wp.zeros(wp.static(capacity), dtype=real)
         close = wp.zeros(wp.static(capacity), dtype=wp.int32)
-        # Contacts of one step.
+        lift = wp.zeros(wp.static(capacity), dtype=vec2)
+        mend = wp.zeros(wp.static(capacity), dtype=vec2)
+        # Where contact is possible within one step.
+        k_link = wp.zeros(wp.static(SEEN), dtype=wp.int32)
+        k_arc = wp.zeros(wp.static(SEEN), dtype=real)
+        k_ahead = wp.zeros(wp.static(SEEN), dtype=real)
+        k_gap = wp.zeros(wp.static(SEEN), dtype=real)
+        k_mu = wp.zeros(wp.static(SEEN), dtype=real)
+        k_at = wp.zeros(wp.static(SEEN), dtype=vec3)
+        k_move = wp.zeros(wp.static(SEEN), dtype=vec3)
+        k_normal = wp.zeros(wp.static(SEEN), dtype=vec3)
+        k_free = wp.zeros(wp.static(SEEN), dtype=vec3)
+        k_taken = wp.zeros(wp.static(SEEN), dtype=wp.int32)
+        # Contacts whose forces are solved for.
         c_link = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
         c_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
-        c_ahead = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_gap = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_mu = wp.zeros(wp.static(CONTACTS), dtype=real)
         c_at = wp.zeros(wp.static(CONTACTS), dtype=vec3)
-        c_move = wp.zeros(wp.static(CONTACTS), dtype=vec3)
         axis = wp.zeros(wp.static(rows), dtype=vec3)
         fw = wp.zeros(wp.static(rows), dtype=vec3)
         fv = wp.zeros(wp.static(rows), dtype=vec3)
@@ -462,6 +476,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         slip_tries = int(8) + wp.min(0, lane)
         guess_tries = int(3 * wp.static(CONTACTS)) + wp.min(0, lane)
         look_near = real(wp.static(NEAR))
+        rounds_most = int(wp.static(ROUNDS)) + wp.min(0, lane)
         object_speed = zero
         for s in range(shapes_from, shapes_to):
             object_speed = wp.max(object_speed, bodies.speed[s])
@@ -476,7 +491,6 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         before = opt.start
         resting = may_rest
         idle = opt.start
-        closing = int(0)
         # A reading takes the wrench of the step that begins at its time, so one more step follows the last.
         pending = int(-1)
         for reading in range(readings.shape[0] + 1):
@@ -592,7 +606,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                 quickest = wp.sqrt(fastest)
                 # Contacts that may close within this step.
                 contacts = int(0)
-                closing = int(0)
+                seen = int(0)
                 travel = h * (quickest + object_speed)
                 margin = wp.min(real(1.5) * travel + h * jump + real(0.001), real(wp.static(WIDEST)))
                 near = int(0)
@@ -668,48 +682,37 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                         approach = wp.dot(normal, cvv + wp.cross(cvw, point) - carried)
                                         # Where the gap will be: tells apart what only passes by.
                                         ahead = gap + real(1.5) * h * wp.min(approach, zero)
-                                        if ahead < h * jump + real(0.001):
-                                            slot = contacts
-                                            # The same contact seen from two links, or from both ends of a short gap.
-                                            for c in range(contacts):
-                                                apart = wp.length_sq(c_at[c] - point)
-                                                same = wp.dot(axis[3 * c], normal) > real(0.85)
-                                                if same and apart < real(0.0625) * wp.length_sq(node[i + 1] - node[i]):
-                                                    slot = c
-                                            if slot < contacts:
-                                                if c_ahead[slot] <= ahead:
-                                                    slot = int(-1)
-                                            elif contacts < wp.static(CONTACTS):
-                                                contacts = contacts + 1
-                                            else:
-                                                slot = int(0)
-                                                for c in range(1, wp.static(CONTACTS)):
-                                                    if c_ahead[c] > c_ahead[slot]:
-                                                        slot = c
-                                                if wp.max(gap, c_gap[slot]) < zero:
-                                                    crowded = crowded + 1
-                                                if c_ahead[slot] <= ahead:
-                                                    slot = int(-1)
-                                            if slot >= 0:
-                                                mu = bodies.friction[s]
-                                                if mu < zero:
-                                                    mu = ch.friction[who]
-                                                c_link[slot] = i
-                                                c_gap[slot] = gap
-                                                c_ahead[slot] = ahead
-                                                c_mu[slot] = mu
-                                                c_at[slot] = point
-                                                c_arc[slot] = taper[2] + taper[3] * share
-                                                c_move[slot] = carried
-                                                # One tangent along the whisker, where it tends to slide.
-                                                along = node[i + 1] - node[i]
-                                                tangent = along - normal * wp.dot(along, normal)
-                                                if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
-                                                    tangent = e2[i] - normal * wp.dot(e2[i], normal)
-                                                tangent = wp.normalize(tangent)
-                                                axis[3 * slot] = normal
-                                                axis[3 * slot + 1] = tangent
-                                                axis[3 * slot + 2] = wp.cross(normal, tangent)
+                                        slot = seen
+                                        # The same contact seen from two links, or from both ends of a short gap.
+                                        for j in range(seen):
+                                            apart = wp.length_sq(k_at[j] - point)
+                                            same = wp.dot(k_normal[j], normal) > real(0.85)
+                                            if same and apart < real(0.0625) * wp.length_sq(node[i + 1] - node[i]):
+                                                slot = j
+                                        if slot < seen:
+                                            if k_ahead[slot] <= ahead:
+                                                slot = int(-1)
+                                        elif seen < wp.static(SEEN):
+                                            seen = seen + 1
+                                        else:
+                                            slot = int(0)
+                                            for j in range(1, wp.static(SEEN)):
+                                                if k_ahead[j] > k_ahead[slot]:
+                                                    slot = j
+                                            if k_ahead[slot] <= ahead:
+                                                slot = int(-1)
+                                        if slot >= 0:
+                                            mu = bodies.friction[s]
+                                            if mu < zero:
+                                                mu = ch.friction[who]
+                                            k_link[slot] = i
+                                            k_gap[slot] = gap
+                                            k_ahead[slot] = ahead
+                                            k_mu[slot] = mu
+                                            k_at[slot] = point
+                                            k_arc[slot] = taper[2] + taper[3] * share
+                                            k_move[slot] = carried
+                                            k_normal[slot] = normal
                             clear[i] = closest
 
                 # Up the chain: articulated inertia, bias and what each joint does with them.
@@ -796,7 +799,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                     k2w[i] = g2w
                     k2v[i] = g2v
                     push[i] = vec2(f1, f2)
-                    if contacts > 0:
+                    if seen > 0:
                         inverse[i] = vec3(i11, i12, i22)
                     # Velocity-product acceleration of the joint.
                     jw = s1 * rate[0] + s2 * rate[1]
@@ -838,7 +841,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                     a2 = f[1] - wp.dot(k2w[i], aw) - wp.dot(k2v[i], av)
                     aw = aw + s1 * a1 + s2 * a2
                     av = av + m1 * a1 + m2 * a2
-                    if contacts > 0:
+                    if seen > 0:
                         push[i] = vec2(a1, a2)
                     else:
                         rate = rate + vec2(a1, a2) * h
@@ -854,27 +857,55 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                     status = wp.static(LOST)
                                 failed = now + h
                         worst = wp.max(worst, wp.max(bend, wp.max(wp.abs(rate[0]), wp.abs(rate[1]))))
-                    for c in range(contacts):
-                        if c_link[c] == i:
-                            point = c_at[c]
+                    for j in range(seen):
+                        if k_link[j] == i:
                             # Gravity was added to the base's acceleration; it moves nothing by itself.
-                            moved = vv + av * h + opt.gravity * h + wp.cross(vw + aw * h, point) - c_move[c]
-                            for d in range(3):
-                                free[3 * c + d] = wp.dot(axis[3 * c + d], moved)
+                            k_free[j] = vv + av * h + opt.gravity * h + wp.cross(vw + aw * h, k_at[j]) - k_move[j]
                 tip_push = av + wp.cross(aw, node[links])
 
-                if contacts > 0:
-                    # Contacts that would open anyway cost nothing more.
-                    top = int(0)
-                    for c in range(contacts):
-                        goal = -c_gap[c] / h
-                        if goal > real(wp.static(CREVICE)) / h:
-                            goal = real(wp.static(CREVICE)) / h
-                        c_gap[c] = goal
-                        if free[3 * c] < goal:
-                            closing = 1
-                        top = wp.max(top, c_link[c])
-                    if closing == 1:
+                # Contact where the whisker would close a gap if it moved freely, or was held in the last step; then
+                # wherever these contacts press it onto something else.
+                more = int(0)
+                for j in range(seen):
+                    k_taken[j] = int(0)
+                    k_ahead[j] = k_gap[j] + h * wp.dot(k_normal[j], k_free[j])
+                    if k_ahead[j] < zero:
+                        more = int(1)
+                for round_ in range(rounds_most):
+                    if more == 1:
+                        for _ in range(wp.static(CONTACTS)):
+                            if contacts < wp.static(CONTACTS):
+                                slot = int(-1)
+                                lowest = zero
+                                for j in range(seen):
+                                    if k_taken[j] == 0 and k_ahead[j] < lowest:
+                                        lowest = k_ahead[j]
+                                        slot = j
+                                if slot >= 0:
+                                    k_taken[slot] = int(1)
+                                    i = k_link[slot]
+                                    normal = k_normal[slot]
+                                    # One tangent along the whisker, where it tends to slide.
+                                    along = node[i + 1] - node[i]
+                                    tangent = along - normal * wp.dot(along, normal)
+                                    if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
+                                        tangent = e2[i] - normal * wp.dot(e2[i], normal)
+                                    tangent = wp.normalize(tangent)
+                                    c_link[contacts] = i
+                                    c_arc[contacts] = k_arc[slot]
+                                    c_at[contacts] = k_at[slot]
+                                    c_mu[contacts] = k_mu[slot]
+                                    # A deep overlap is undone over several steps.
+                                    c_gap[contacts] = wp.min(-k_gap[slot], real(wp.static(CREVICE))) / h
+                                    axis[3 * contacts] = normal
+                                    axis[3 * contacts + 1] = tangent
+                                    axis[3 * contacts + 2] = wp.cross(normal, tangent)
+                                    for d in range(3):
+                                        free[3 * contacts + d] = wp.dot(axis[3 * contacts + d], k_free[slot])
+                                    contacts = contacts + 1
+                        top = int(0)
+                        for c in range(contacts):
+                            top = wp.max(top, c_link[c])
                         rows_used = 3 * contacts
                         # The forces of the last step are a good first guess.
                         for c in range(contacts):
@@ -886,7 +917,6 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                             force[3 * c] = wp.max(zero, wp.dot(guess, axis[3 * c]))
                             force[3 * c + 1] = wp.dot(guess, axis[3 * c + 1])
                             force[3 * c + 2] = wp.dot(guess, axis[3 * c + 2])
-                        held_count = int(0)
                         for r in range(rows_used):
                             for e in range(rows_used):
                                 comply[r * wp.static(rows) + e] = zero
@@ -1104,16 +1134,6 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                                     force[3 * c + 1] = f1 * (c_mu[c] * fn / size)
                                                     force[3 * c + 2] = f2 * (c_mu[c] * fn / size)
                                             force[3 * c] = fn
-                        if settled == 0 and change > real(1e-2):
-                            unsolved = unsolved + 1
-                        held_count = contacts
-                        for c in range(contacts):
-                            held_arc[c] = c_arc[c]
-                            held_force[c] = (
-                                axis[3 * c] * force[3 * c]
-                                + axis[3 * c + 1] * force[3 * c + 1]
-                                + axis[3 * c + 2] * force[3 * c + 2]
-                            )
                         # Apply them: forces up the chain, then the change of acceleration down.
                         tw = none
                         tv = none
@@ -1135,29 +1155,52 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                             tw = tw - k1w[i] * u1 - k2w[i] * u2
                             tv = tv - k1v[i] * u1 - k2v[i] * u2
                             inv = inverse[i]
-                            inverse[i] = vec3(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2, zero)
-                        reaction_w = reaction_w - tw
-                        reaction_v = reaction_v - tv
+                            lift[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
                         aw = none
                         av = none
+                        more = int(0)
                         for i in range(links):
-                            extra = vec3(zero, zero, zero)
+                            extra = vec2(zero, zero)
                             if i <= top:
-                                extra = inverse[i]
+                                extra = lift[i]
                             a1 = extra[0] - wp.dot(k1w[i], aw) - wp.dot(k1v[i], av)
                             a2 = extra[1] - wp.dot(k2w[i], aw) - wp.dot(k2v[i], av)
                             s1 = first_axis(e2[i], node[i + 1] - node[i], q[i][1])
                             s2 = e2[i]
                             aw = aw + s1 * a1 + s2 * a2
                             av = av + wp.cross(node[i], s1) * a1 + wp.cross(node[i], s2) * a2
-                            push[i] = push[i] + vec2(a1, a2)
-                        tip_push = tip_push + av + wp.cross(aw, node[links])
+                            mend[i] = vec2(a1, a2)
+                            for j in range(seen):
+                                if k_link[j] == i and k_taken[j] == 0:
+                                    moved = k_free[j] + (av + wp.cross(aw, k_at[j])) * h
+                                    k_ahead[j] = k_gap[j] + h * wp.dot(k_normal[j], moved)
+                                    if k_ahead[j] < real(-wp.static(CLOSED)):
+                                        more = int(1)
+                        if more == 1 and (contacts == wp.static(CONTACTS) or round_ == wp.static(ROUNDS - 1)):
+                            more = int(0)
+                            crowded = crowded + 1
+                        if more == 0:
+                            if settled == 0 and change > real(1e-2):
+                                unsolved = unsolved + 1
+                            reaction_w = reaction_w - tw
+                            reaction_v = reaction_v - tv
+                            tip_push = tip_push + av + wp.cross(aw, node[links])
+                            for i in range(links):
+                                push[i] = push[i] + mend[i]
+                held_count = contacts
+                for c in range(contacts):
+                    held_arc[c] = c_arc[c]
+                    held_force[c] = (
+                        axis[3 * c] * force[3 * c]
+                        + axis[3 * c + 1] * force[3 * c + 1]
+                        + axis[3 * c + 2] * force[3 * c + 2]
+                    )
 
                 jump = wp.max(h * wp.length(tip_push), real(0.5) * jump)
                 touched = int(0)
                 arc_sum = zero
                 force_sum = zero
-                if contacts > 0 and closing == 1:
+                if contacts > 0:
                     for c in range(contacts):
                         if force[3 * c] > zero:
                             touched = 1
@@ -1179,7 +1222,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                 steps = steps + 1
                 busy = touched
                 moved_links = int(0)
-                if contacts > 0:
+                if seen > 0:
                     moved_links = links
                 for i in range(moved_links):
                     rate = qd[i] + push[i] * h
