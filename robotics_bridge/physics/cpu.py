@@ -60,7 +60,9 @@ class MujocoEngine:
         varied = check_fields(models[0], fields or {}, num_envs)
         self._models = [models[order[env % len(order)]] for env in range(num_envs)]
         if varied:
-            self._models = [_with_fields(m, {k: v[env] for k, v in varied.items()}) for env, m in enumerate(self._models)]
+            self._models = [
+                _with_fields(m, {k: v[env] for k, v in varied.items()}) for env, m in enumerate(self._models)
+            ]
         self._data = [mujoco.MjData(m) for m in self._models]
         self.state: HandState = HandState.empty(num_envs, self.model.nbody, contacts * num_envs, "cpu")
         """Refreshed by :meth:`step`, :meth:`forward` and :meth:`reset`."""
@@ -167,7 +169,13 @@ class _Gatherer:
         self._contacts[env] = ()
         if data.ncon:
             c = data.contact
-            self._contacts[env] = (c.geom.copy(), c.dist.copy(), c.pos.copy(), c.frame[:, :3].copy(), self._force(data, c))
+            self._contacts[env] = (
+                c.geom.copy(),
+                c.dist.copy(),
+                c.pos.copy(),
+                c.frame[:, :3].copy(),
+                self._force(data, c),
+            )
 
     def _force(self, data: Any, contact: Any) -> NDArray[np.float64]:
         """Normal force of every contact: with a pyramidal cone the sum of its edges."""

@@ -122,7 +122,9 @@ class MujocoWarpEngine:
             try:
                 view.copy_(rows.to(view.dtype).expand_as(view))
             except RuntimeError:
-                raise UsageError(f"{name} has the shape {tuple(view.shape)} here; received {tuple(rows.shape)}.") from None
+                raise UsageError(
+                    f"{name} has the shape {tuple(view.shape)} here; received {tuple(rows.shape)}."
+                ) from None
 
     def step(self, steps: int = 1) -> None:
         """Advance every environment and refresh the state."""
@@ -195,8 +197,8 @@ def _put_model(engine: Any, model: Any, varied: Mapping[str, np.ndarray], num_en
     fixed = sorted(name for name in varied if name not in usable and name in fields)
     if fixed:
         raise UsageError(
-            f"MuJoCo Warp keeps {', '.join(fixed)} equal in all environments; use MujocoEngine, or variants that differ "
-            "in sizes, masses, meshes and other numbers only."
+            f"MuJoCo Warp keeps {', '.join(fixed)} equal in all environments; use MujocoEngine, or variants that "
+            "differ in sizes, masses, meshes and other numbers only."
         )
     device_model = engine.put_model(model, batch_sizes=dict.fromkeys(usable, num_envs))
     for name, value in usable.items():

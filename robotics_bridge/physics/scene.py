@@ -121,7 +121,9 @@ class Scene:
                 raise UsageError(f"The scene has two of the {what} {culprit!r}; names must differ.")
         for geometry in self.geometries:
             if geometry.link not in self._links:
-                raise unknown_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
+                raise unknown_name(
+                    "link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it."
+                )
 
     @cached_property
     def _links(self) -> dict[str, int]:
@@ -240,7 +242,9 @@ def _mesh(model: Any, index: int) -> Mesh:
     first, count = int(model.mesh_vertadr[index]), int(model.mesh_vertnum[index])
     face, faces = int(model.mesh_faceadr[index]), int(model.mesh_facenum[index])
     return Mesh(
-        model.mesh_vert[first : first + count].astype(float), model.mesh_face[face : face + faces], _name(model, 7, index)
+        model.mesh_vert[first : first + count].astype(float),
+        model.mesh_face[face : face + faces],
+        _name(model, 7, index),
     )
 
 
@@ -276,6 +280,5 @@ def _never(model: Any) -> frozenset[tuple[int, int]]:
 
 def _always(model: Any) -> frozenset[tuple[int, int]]:
     return frozenset(
-        (min(int(a), int(b)), max(int(a), int(b)))
-        for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)
+        (min(int(a), int(b)), max(int(a), int(b))) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)
     )

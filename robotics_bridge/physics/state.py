@@ -148,7 +148,9 @@ class HandState:
         pairs = np.asarray(geometries, dtype=np.int32).reshape(-1, 2)
         count, room = len(environments), self.contact_env.shape[0]
         if count > room:
-            raise UsageError(f"The state has room for {room} contacts; received {count}. Make it with contacts={count}.")
+            raise UsageError(
+                f"The state has room for {room} contacts; received {count}. Make it with contacts={count}."
+            )
         if len(pairs) != count:
             raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
         given = {"env": environments, "geom": pairs, **optional}

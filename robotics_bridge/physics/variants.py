@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from brainbench.errors import UsageError
+from brainbench.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import Geometry
@@ -44,9 +44,7 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
                 )
         target = next((g for g in copy.geoms if g.name == geometry), None)
         if target is None:
-            raise UsageError(
-                f"The model has no geometry {geometry!r}; it has {', '.join(g.name or '(unnamed)' for g in copy.geoms)}."
-            )
+            raise unknown_name("geometry", geometry, [g.name for g in copy.geoms if g.name])
         target.type = mujoco.mjtGeom(kinds[shape.kind])
         target.size = [*shape.size, 0.0, 0.0, 0.0][:3]
         target.density = density

@@ -1,0 +1,266 @@
+"""How far a point lies from a solid, as Warp functions: closed forms, sampled distance fields and triangles.
+
+All in the frame of the geometry, in metres: distances are negative inside, normals point out of the solid.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, OTHER = range(8)
+"""Numbers of the kinds, in the order of :data:`robotics_bridge.physics.scene.KINDS`."""
+
+FAR = 1.0e6
+"""Distance that stands for "out of reach" (m)."""
+
+
+@cache
+def query_structs() -> SimpleNamespace:
+    """Return the structure ``Solids``: the geometries of a scene on a device. R variant row (1 or B), G geometry."""
+    import warp as wp
+
+    @wp.struct
+    class Solids:
+        kind: wp.array2d(dtype=wp.int32)
+        size: wp.array2d(dtype=wp.vec3f)
+        frame: wp.array2d(dtype=wp.transformf)
+        bound: wp.array2d(dtype=wp.vec4f)
+        link: wp.array(dtype=wp.int32)
+        field: wp.array2d(dtype=wp.int32)
+        mesh: wp.array2d(dtype=wp.uint64)
+        first: wp.array(dtype=wp.int32)
+        counts: wp.array(dtype=wp.vec3i)
+        origin: wp.array(dtype=wp.vec3f)
+        spacing: wp.array(dtype=wp.float32)
+        values: wp.array(dtype=wp.float32)
+
+    return SimpleNamespace(Solids=Solids)
+
+
+@cache
+def primitive_functions() -> SimpleNamespace:
+    """Return ``name(size, x) -> (normal, distance)`` of every primitive, as vec4."""
+    import warp as wp
+
+    @wp.func
+    def plane(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+        return wp.vec4f(0.0, 0.0, 1.0, x[2])
+
+    @wp.func
+    def sphere(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+        far = wp.length(x)
+        n = wp.vec3f(0.0, 0.0, 1.0)
+        if far > 1.0e-12:
+            n = x / far
+        return wp.vec4f(n[0], n[1], n[2], far - size[0])
+
+    @wp.func
+    def capsule(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+        return sphere(size, wp.vec3f(x[0], x[1], x[2] - wp.clamp(x[2], -size[1], size[1])))
+
+    @wp.func
+    def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+        radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+        side = radial - size[0]
+        end = wp.abs(x[2]) - size[1]
+        ux = float(1.0)
+        uy = float(0.0)
+        if radial > 1.0e-12:
+            ux = x[0] / radial
+            uy = x[1] / radial
+        uz = wp.where(x[2] < 0.0, -1.0, 1.0)
+        if side > 0.0 and end > 0.0:
+            far = wp.sqrt(side * side + end * end)
+            return wp.vec4f(ux * side / far, uy * side / far, uz * end / far, far)
+        if side > end:
+            return wp.vec4f(ux, uy, 0.0, side)
+        return wp.vec4f(0.0, 0.0, uz, end)
+
+    @wp.func
+    def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+        ox = wp.abs(x[0]) - size[0]
+        oy = wp.abs(x[1]) - size[1]
+        oz = wp.abs(x[2]) - size[2]
+        sx = wp.where(x[0] < 0.0, -1.0, 1.0)
+        sy = wp.where(x[1] < 0.0, -1.0, 1.0)
+        sz = wp.where(x[2] < 0.0, -1.0, 1.0)
+        if ox > 0.0 or oy > 0.0 or oz > 0.0:
+            bx = wp.max(ox, 0.0)
+            by = wp.max(oy, 0.0)
+            bz = wp.max(oz, 0.0)
+            far = wp.sqrt(bx * bx + by * by + bz * bz)
+            inverse = 1.0 / far
+            return wp.vec4f(sx * bx * inverse, sy * by * inverse, sz * bz * inverse, far)
+        if ox >= oy and ox >= oz:
+            return wp.vec4f(sx, 0.0, 0.0, ox)
+        if oy >= oz:
+            return wp.vec4f(0.0, sy, 0.0, oy)
+        return wp.vec4f(0.0, 0.0, sz, oz)
+
+    @wp.func
+    def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+        """Nearest point e² x / (e² + t) with t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
+        # Coordinates of exactly zero hide the root at the short axis.
+        shift = 1.0e-6 * wp.min(size)
+        y = wp.vec3f(wp.max(wp.abs(x[0]), shift), wp.max(wp.abs(x[1]), shift), wp.max(wp.abs(x[2]), shift))
+        short = wp.min(size)
+        squares = wp.cw_mul(size, size)
+        scaled = wp.cw_mul(size, y)
+        low = -short * short
+        high = wp.length(scaled)
+        for _ in range(40):
+            t = 0.5 * (low + high)
+            a = scaled[0] / (squares[0] + t)
+            b = scaled[1] / (squares[1] + t)
+            c = scaled[2] / (squares[2] + t)
+            if a * a + b * b + c * c > 1.0:
+                low = t
+            else:
+                high = t
+        t = 0.5 * (low + high)
+        near = wp.vec3f(
+            squares[0] * y[0] / (squares[0] + t),
+            squares[1] * y[1] / (squares[1] + t),
+            squares[2] * y[2] / (squares[2] + t),
+        )
+        n = wp.normalize(wp.cw_div(near, squares))
+        distance = wp.dot(y - near, n)
+        sx = wp.where(x[0] < 0.0, -1.0, 1.0)
+        sy = wp.where(x[1] < 0.0, -1.0, 1.0)
+        sz = wp.where(x[2] < 0.0, -1.0, 1.0)
+        return wp.vec4f(sx * n[0], sy * n[1], sz * n[2], distance)
+
+    return SimpleNamespace(plane=plane, sphere=sphere, capsule=capsule, ellipsoid=ellipsoid, cylinder=cylinder, box=box)
+
+
+@cache
+def field_function() -> Any:
+    """Return ``field(solids, number, x) -> (normal, distance)``: a sampled field, linear within its cells.
+
+    Beyond the samples the distance is that to the surface point which the nearest border sample points at.
+    """
+    import warp as wp
+
+    solids_type = query_structs().Solids
+
+    @wp.func
+    def field(solids: solids_type, number: int, x: wp.vec3f) -> wp.vec4f:
+        spacing = solids.spacing[number]
+        n = solids.counts[number]
+        u = (x - solids.origin[number]) / spacing
+        limit = wp.vec3f(float(n[0] - 1), float(n[1] - 1), float(n[2] - 1))
+        c = wp.vec3f(wp.clamp(u[0], 0.0, limit[0]), wp.clamp(u[1], 0.0, limit[1]), wp.clamp(u[2], 0.0, limit[2]))
+        i = wp.min(int(c[0]), n[0] - 2)
+        j = wp.min(int(c[1]), n[1] - 2)
+        k = wp.min(int(c[2]), n[2] - 2)
+        fx = c[0] - float(i)
+        fy = c[1] - float(j)
+        fz = c[2] - float(k)
+        at = solids.first[number] + (i * n[1] + j) * n[2] + k
+        row = n[2]
+        sheet = n[1] * n[2]
+        v000 = solids.values[at]
+        v001 = solids.values[at + 1]
+        v010 = solids.values[at + row]
+        v011 = solids.values[at + row + 1]
+        v100 = solids.values[at + sheet]
+        v101 = solids.values[at + sheet + 1]
+        v110 = solids.values[at + sheet + row]
+        v111 = solids.values[at + sheet + row + 1]
+        v00 = v000 + fz * (v001 - v000)
+        v01 = v010 + fz * (v011 - v010)
+        v10 = v100 + fz * (v101 - v100)
+        v11 = v110 + fz * (v111 - v110)
+        v0 = v00 + fy * (v01 - v00)
+        v1 = v10 + fy * (v11 - v10)
+        gy = (1.0 - fx) * (v01 - v00) + fx * (v11 - v10)
+        gz0 = (1.0 - fy) * (v001 - v000) + fy * (v011 - v010)
+        gz1 = (1.0 - fy) * (v101 - v100) + fy * (v111 - v110)
+        gradient = wp.vec3f(v1 - v0, gy, (1.0 - fx) * gz0 + fx * gz1)
+        far = wp.length(gradient)
+        normal = wp.vec3f(0.0, 0.0, 1.0)
+        if far > 1.0e-12:
+            normal = gradient / far
+        distance = v0 + fx * (v1 - v0)
+        out = (u - c) * spacing
+        if wp.dot(out, out) > 0.0:
+            away = out + normal * distance
+            distance = wp.length(away)
+            normal = away / wp.max(distance, 1.0e-12)
+        return wp.vec4f(normal[0], normal[1], normal[2], distance)
+
+    return field
+
+
+@cache
+def triangle_function() -> Any:
+    """Return ``triangles(mesh, x, reach) -> (normal, distance)``: the nearest triangle of a closed mesh, by its tree."""
+    import warp as wp
+
+    @wp.func
+    def triangles(mesh: wp.uint64, x: wp.vec3f, reach: float) -> wp.vec4f:
+        found = wp.mesh_query_point_sign_normal(mesh, x, reach)
+        if not found.result:
+            return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
+        away = x - wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+        far = wp.length(away)
+        normal = wp.mesh_eval_face_normal(mesh, found.face)
+        if far > 1.0e-9:
+            normal = away * (found.sign / far)
+        return wp.vec4f(normal[0], normal[1], normal[2], found.sign * far)
+
+    return triangles
+
+
+@cache
+def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
+    """Return ``distance(solids, row, geometry, x, reach) -> (normal, distance)`` for the kinds a scene has.
+
+    Args:
+        kinds: only their code is compiled.
+        raycast: ask triangles instead of closed forms and fields; planes stay planes.
+    """
+    import warp as wp
+
+    solids_type = query_structs().Solids
+    p = primitive_functions()
+    plane, sphere, capsule, ellipsoid, cylinder, box = p.plane, p.sphere, p.capsule, p.ellipsoid, p.cylinder, p.box
+    curved = not raycast
+    has_plane = PLANE in kinds
+    has_sphere, has_capsule = curved and SPHERE in kinds, curved and CAPSULE in kinds
+    has_ellipsoid, has_cylinder = curved and ELLIPSOID in kinds, curved and CYLINDER in kinds
+    has_box = curved and BOX in kinds
+    has_field = curved and MESH in kinds
+    has_triangles = raycast and bool(kinds - {PLANE})
+    field = field_function() if has_field else None
+    triangles = triangle_function() if has_triangles else None
+
+    @wp.func
+    def distance(solids: solids_type, row: int, geometry: int, x: wp.vec3f, reach: float) -> wp.vec4f:
+        kind = solids.kind[row, geometry]
+        if wp.static(has_plane):
+            if kind == wp.static(PLANE):
+                return plane(solids.size[row, geometry], x)
+        if wp.static(has_triangles):
+            return triangles(solids.mesh[row, geometry], x, reach)
+        if wp.static(has_box):
+            if kind == wp.static(BOX):
+                return box(solids.size[row, geometry], x)
+        if wp.static(has_sphere):
+            if kind == wp.static(SPHERE):
+                return sphere(solids.size[row, geometry], x)
+        if wp.static(has_capsule):
+            if kind == wp.static(CAPSULE):
+                return capsule(solids.size[row, geometry], x)
+        if wp.static(has_cylinder):
+            if kind == wp.static(CYLINDER):
+                return cylinder(solids.size[row, geometry], x)
+        if wp.static(has_ellipsoid):
+            if kind == wp.static(ELLIPSOID):
+                return ellipsoid(solids.size[row, geometry], x)
+        if wp.static(has_field):
+            if kind == wp.static(MESH):
+                return field(solids, solids.field[row, geometry], x)
+        return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
+
+    return distance

@@ -1,0 +1,97 @@
+"""KinematicTaxel: force and torque per taxel from depth, normal and relative velocity (thesis 4.4–4.10)."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Self
+
+from brainbench.errors import UsageError, unknown_name
+from robotics_bridge._device import warp
+from robotics_bridge.sensors._base import Convention, ProbeRuntime, QuerySensor
+from robotics_bridge.sensors.noise import GRID_KNOBS
+
+if TYPE_CHECKING:
+    from robotics_bridge.physics.state import HandState
+    from robotics_bridge.sensors._base import Context
+
+CONVENTIONS = ("physical", "thesis")
+
+
+def check_convention(value: str) -> None:
+    """Refuse an unknown force convention with UsageError."""
+    if value not in CONVENTIONS:
+        raise unknown_name("force convention", value, CONVENTIONS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KinematicTaxel(QuerySensor):
+    """Force (N) and torque (N·m) on the sensor [N, 6], in the link frame, torques about the link's origin.
+
+    With depth d, outward normal m of what is touched and relative velocity v (split into normal and tangential)::
+
+        f = k_n d^α m + c_n d^α v_n ± k_t v_t,    τ = x × f ± k_ω (ω·m) m
+
+    ``physical`` takes plus signs (friction drags the sensor along) and never pulls; ``thesis`` takes the published
+    minus signs. Defaults are the published parameters (4.10).
+    """
+
+    stiffness: float = 500.0
+    """k_n, N/m^α."""
+    damping: float = 1.0
+    """c_n, N·s/m^(1+α)."""
+    exponent: float = 1.2
+    """α."""
+    shear: float = 2.0
+    """k_t, N·s/m."""
+    twist: float = 2.0
+    """k_ω, N·m·s."""
+    convention: Convention = "physical"
+
+    channels: ClassVar[int] = 6
+    units: ClassVar[str] = "N, N m"
+    knobs: ClassVar[frozenset[str]] = GRID_KNOBS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_convention(self.convention)
+        if not self.exponent > 0:
+            raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
+
+    def group(self) -> Hashable:
+        """Sensors of one class and equal group share one runtime and its kernels."""
+        return (self.query, self.convention)
+
+    @classmethod
+    def build(cls, sensors: Mapping[str, Self], context: Context) -> KinematicRuntime:
+        """Return the runtime that serves these sensors together."""
+        return KinematicRuntime(sensors, context)
+
+
+class KinematicRuntime(ProbeRuntime):
+    """Serves kinematic taxels."""
+
+    def __init__(self, sensors: Mapping[str, KinematicTaxel], context: Context) -> None:
+        from robotics_bridge.sensors._probe_kernels import kinematic_functions
+
+        super().__init__(sensors, 6, context)
+        first = next(iter(sensors.values()))
+        self._options = (first.query == "raycast", first.convention == "physical")
+        kind = kinematic_functions(self._options[1]).KinematicParams
+        laws = []
+        for sensor in sensors.values():
+            law = kind()
+            for name in ("stiffness", "damping", "exponent", "shear", "twist"):
+                setattr(law, name, getattr(sensor, name))
+            laws.append(law)
+        self._laws = warp().array(laws, dtype=kind, device=context.device)
+
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state."""
+        from robotics_bridge.sensors._probe_kernels import kinematic_kernel
+
+        self.begin(state, dt)
+        kernel = kinematic_kernel(self.kinds, *self._options, self.mode, *self.stores)
+        c = self.context
+        self.launch(kernel, self.probes, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._laws)
+        self.finish(dt)

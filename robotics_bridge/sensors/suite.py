@@ -1,0 +1,249 @@
+"""SensorSuite: all sensors of a hand behind one interface. Letters: B environment, N probe, T reading of the past."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError, unknown_name
+from robotics_bridge._device import pick_device, warp
+from robotics_bridge.physics.state import DIVERGED, HandState
+from robotics_bridge.sensors._base import Clock, Context, History, Place, Runtime, Sensor
+from robotics_bridge.sensors._pair_kernels import begin_kernel
+from robotics_bridge.sensors._pairs import PairTable
+from robotics_bridge.sensors._solids import Solids
+from robotics_bridge.sensors.probes import DistanceRuntime
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.physics.scene import Scene
+
+
+class SensorSuite:
+    """Tactile sensors on the links of a scene.
+
+    Sensors of one class share one launch, whatever their number. Only what they ask for is built: distance fields
+    of the meshes they track, triangle trees, and kernels for the kinds of geometries they meet. On CUDA an update is
+    recorded once and replayed.
+
+    Readings of environments that the state reports as diverged are NaN; the others do not notice.
+
+    Args:
+        scene: what there is to touch (``engine.scene``, or made by hand).
+        sensors: configurations by name.
+        num_envs: B.
+        device: ``cpu`` or ``cuda``.
+        seed: of the noise, together with each sensor's name.
+        env_offset: number of environment 0 in the whole experiment, so that shards draw different noise.
+        resolution: cells of distance fields along a mesh's longest edge.
+
+    Raises:
+        UsageError: a sensor is no sensor, or names a link that the scene does not have.
+
+    Example::
+
+        suite = SensorSuite(engine.scene, {"tip": ContactProbe(link="tip", probes=probes)}, num_envs=engine.num_envs)
+        engine.step()
+        suite.update(engine.state)
+        suite.read("tip")                    # torch [B, N]
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensors: Mapping[str, Sensor],
+        *,
+        num_envs: int,
+        device: Any = "cpu",
+        seed: int = 0,
+        env_offset: int = 0,
+        resolution: int = 64,
+    ) -> None:
+        wp = warp()
+        if num_envs < 1:
+            raise UsageError(f"A suite serves at least one environment; received {num_envs}.")
+        self.scene, self.sensors = scene, dict(sensors)
+        self.num_envs, self.device = num_envs, pick_device(device)
+        groups: dict[Any, dict[str, Sensor]] = {}
+        for name, sensor in self.sensors.items():
+            if not isinstance(sensor, Sensor):
+                raise UsageError(
+                    f"{name!r} must be a sensor such as ContactProbe(...); received {type(sensor).__name__}."
+                )
+            scene.link_index(sensor.link)
+            groups.setdefault((type(sensor), sensor.group()), {})[name] = sensor
+        asks = [sensor.asks(scene) for sensor in self.sensors.values()]
+        fields = frozenset().union(*(ask.fields for ask in asks))
+        trees = frozenset().union(*(ask.trees for ask in asks))
+        with wp.ScopedDevice(self.device):
+            age = wp.full(num_envs, -1, dtype=wp.int32, device=self.device)
+            self.clock = Clock(age, wp.zeros(num_envs, dtype=wp.int32, device=self.device), env_offset)
+            self.solids = Solids(scene, num_envs, self.device, fields=fields, trees=trees, resolution=resolution)
+            self.pairs = PairTable(self.solids, num_envs, self.device)
+            context = Context(scene, num_envs, self.device, seed, self.clock, self.solids, self.pairs)
+            self.runtimes: list[Runtime] = [kind.build(members, context) for (kind, _group), members in groups.items()]
+            self._owner = {name: runtime for runtime in self.runtimes for name in runtime.places}
+            self.pairs.freeze()
+            self._updates = 0
+            self._counter = wp.zeros(1, dtype=wp.int32, device=self.device)
+            self._histories = {
+                name: History(self._place(name), max(sensor.channels, 1), sensor.history, context)
+                for name, sensor in self.sensors.items()
+                if sensor.history
+            }
+        self._graph: tuple[Any, HandState, float] | None = None
+        self._status: Any = None
+
+    def update(self, state: HandState, dt: float = 0.01) -> None:
+        """Read the state with every sensor.
+
+        Args:
+            state: of ``num_envs`` environments on the suite's device.
+            dt: seconds since the last update.
+
+        Raises:
+            UsageError: the state does not fit the suite, or dt is not a positive time.
+        """
+        if self._status is None or state.status is not self._status:
+            self._check(state)
+        if not (np.isfinite(dt) and dt > 0):
+            raise UsageError(f"dt is the positive time since the last update (s); received {dt!r}.")
+        wp = warp()
+        if not self.device.is_cuda:
+            self._launch(state, dt)
+        elif self._graph and self._graph[1] is state and self._graph[2] == dt:
+            wp.capture_launch(self._graph[0])
+        else:
+            # The first update of a state compiles and allocates; the next ones replay what it does.
+            known = self._status is state.status and self._updates > 0 and self._graph is None
+            if known:
+                with wp.ScopedDevice(self.device), wp.ScopedCapture() as capture:
+                    self._launch(state, dt)
+                self._graph = (capture.graph, state, dt)
+                wp.capture_launch(capture.graph)
+            else:
+                with wp.ScopedDevice(self.device):
+                    self._launch(state, dt)
+                self._graph = None
+        self._status = state.status
+        self._updates += 1
+
+    def read(self, name: str) -> torch.Tensor:
+        """Return the measured reading of a sensor, [B, N] or [B, rows, columns], and channels last; a view."""
+        return self._view(name, self._runtime(name).measured())
+
+    def read_ground_truth(self, name: str) -> torch.Tensor:
+        """Return the reading without noise, in the shape of :meth:`read`; a view."""
+        return self._view(name, self._runtime(name).truth())
+
+    def read_history(self, name: str) -> torch.Tensor:
+        """Return the last measured readings [B, T, N(, C)], oldest first; zeros before the reset. A view.
+
+        Raises:
+            UsageError: the sensor keeps no history.
+        """
+        self._runtime(name)
+        if name not in self._histories:
+            raise UsageError(f"The sensor {name!r} keeps no history; configure it with history=<readings>.")
+        kept = self._histories[name]
+        first = self._updates % kept.length
+        window = warp().to_torch(kept.ring)[first : first + kept.length]
+        tensor = window.permute(2, 0, 3, 1).unflatten(2, kept.place.layout)
+        return tensor.squeeze(-1) if kept.place.scalar else tensor
+
+    def read_nearest(self, name: str) -> torch.Tensor:
+        """Return the nearest surface points [B, N, 3] of a SurfaceDistanceProbe (m, link frame); a view.
+
+        Raises:
+            UsageError: the sensor keeps no nearest points.
+        """
+        runtime = self._runtime(name)
+        if not (isinstance(runtime, DistanceRuntime) and getattr(self.sensors[name], "nearest", False)):
+            raise UsageError(f"{name!r} keeps no nearest points; it needs SurfaceDistanceProbe(..., nearest=True).")
+        place = runtime.places[name]
+        points = warp().to_torch(runtime.points)[:, :, place.start : place.start + place.count]
+        return points.permute(1, 2, 0).unflatten(1, place.layout)
+
+    def reset(self, env_ids: Sequence[int] | np.ndarray | torch.Tensor | None = None) -> None:
+        """Start a new episode in some environments (all by default): memories are cleared, new errors drawn.
+
+        Raises:
+            UsageError: an environment does not exist.
+        """
+        import torch
+
+        wp = warp()
+        where = wp.device_to_torch(self.device)
+        chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=where)
+        if env_ids is None:
+            chosen[:] = True
+        else:
+            numbers = torch.as_tensor(env_ids, device=where)
+            if numbers.dtype == torch.bool:
+                chosen |= numbers
+            elif numbers.numel():
+                numbers = numbers.long()
+                # On a GPU the range is not looked at, which would wait for the device.
+                if not self.device.is_cuda and bool(((numbers < 0) | (numbers >= self.num_envs)).any()):
+                    raise UsageError(f"Environments are 0 to {self.num_envs - 1}; received {numbers.tolist()}.")
+                chosen[numbers] = True
+        inputs = [wp.from_torch(chosen), self.clock.age, self.clock.episode]
+        wp.launch(begin_kernel().reset, dim=self.num_envs, inputs=inputs, device=self.device)
+
+    @property
+    def diverged(self) -> torch.Tensor:
+        """Which environments [B] held numbers that are not finite at the last update; their readings are NaN."""
+        if self._status is None:
+            raise UsageError("Nothing was read yet; call update(state) first.")
+        return (warp().to_torch(self._status) & DIVERGED) != 0
+
+    @property
+    def crowded(self) -> torch.Tensor:
+        """Which environments [B] ever had more geometries in contact with one sensor link than are looked at."""
+        return warp().to_torch(self.pairs.crowded) != 0
+
+    @property
+    def state_bytes(self) -> dict[str, int]:
+        """Memory per environment [bytes]: ``sensors``, ``shared`` lists of contacts, and ``rings`` users asked for."""
+        rings = sum(runtime.ring_bytes for runtime in self.runtimes) + sum(h.bytes for h in self._histories.values())
+        sensors = sum(runtime.state_bytes for runtime in self.runtimes)
+        return {"sensors": sensors, "shared": 8 + self.pairs.state_bytes, "rings": rings}
+
+    def _launch(self, state: HandState, dt: float) -> None:
+        wp = warp()
+        wp.launch(begin_kernel().begin, dim=self.num_envs, inputs=[self.clock.age], device=self.device)
+        state.check()
+        self.pairs.update(state)
+        for runtime in self.runtimes:
+            runtime.update(state, dt)
+        for name, history in self._histories.items():
+            history.launch(self._owner[name].measured(), self._counter)
+        if self._histories:
+            wp.launch(begin_kernel().begin, dim=1, inputs=[self._counter], device=self.device)
+
+    def _check(self, state: HandState) -> None:
+        wanted = (self.num_envs, len(self.scene.links))
+        if (state.num_envs, state.num_links) != wanted:
+            raise UsageError(
+                f"The suite serves {wanted[0]} environments with {wanted[1]} links; the state has "
+                f"{state.num_envs} with {state.num_links}."
+            )
+        if str(state.device) != str(self.device):
+            raise UsageError(f"The state lies on {state.device}, the suite on {self.device}; build both on one device.")
+
+    def _runtime(self, name: str) -> Runtime:
+        if name not in self._owner:
+            raise unknown_name("sensor", name, tuple(self._owner))
+        return self._owner[name]
+
+    def _place(self, name: str) -> Place:
+        return self._owner[name].places[name]
+
+    def _view(self, name: str, planes: Any) -> torch.Tensor:
+        place = self._place(name)
+        tensor = warp().to_torch(planes)[:, :, place.start : place.start + place.count]
+        tensor = tensor.permute(1, 2, 0).unflatten(1, place.layout)
+        return tensor.squeeze(-1) if place.scalar else tensor
