@@ -1,7 +1,7 @@
 """Where a score comes from: the parts of ``Score.provenance`` that boards and pages rely on.
 
 ``recordings`` {``source``, ``content_hash``}, ``stimuli`` {``description``, ``content_hash``} (absent
-when the features were computed elsewhere), ``settings`` {``time``}, ``command`` and ``version``.
+when the features were computed elsewhere), ``settings``, ``command``, ``time`` and ``version``.
 Everything else in the provenance is shown as it is. Wrong kinds count as absent: a record is data
 that anyone may have written.
 """
@@ -44,6 +44,27 @@ def stimuli_hash(score: Score) -> str | None:
 def time_rule(score: Score) -> str:
     """Return how the time axis entered the RDMs, ``mean`` or ``concatenate``; empty if not stated."""
     return _text(_part(score, "settings", "time")) or ""
+
+
+def settings(score: Score) -> Mapping[str, Any]:
+    """Return the settings of the scoring run; empty if not stated."""
+    found = score.provenance.get("settings")
+    return found if isinstance(found, Mapping) else {}
+
+
+def version(score: Score) -> str:
+    """Return the version of the package that made the score; empty if not stated."""
+    return _text(score.provenance.get("version")) or ""
+
+
+def made_at(score: Score) -> str:
+    """Return the time of the scoring run in ISO format; empty if not stated."""
+    return _text(score.provenance.get("time")) or ""
+
+
+def recordings_part(score: Score, name: str) -> Any:
+    """Return one statement on the recordings, such as ``window``; None if not stated."""
+    return _part(score, "recordings", name)
 
 
 def command(score: Score) -> str:

@@ -9,10 +9,7 @@ import typer
 
 from brainbench.cli._shared import JsonOption, emit
 
-app = typer.Typer(no_args_is_help=True, help="Build leaderboards from result records.")
 
-
-@app.command("build")
 def build(
     records: Annotated[
         list[Path] | None, typer.Argument(help="Record files or folders of them; ./brainbench-results by default.")

@@ -1,0 +1,148 @@
+"""``brainbench leaderboard add``: take in records, or score models into a folder of records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, progress_bar
+
+if TYPE_CHECKING:
+    from brainbench.cli.leaderboard._scoring import Job
+    from brainbench.types import ResultRecord
+
+
+def add(
+    records: Annotated[list[Path] | None, typer.Argument(help="Record files or folders of them to take in.")] = None,
+    to: Annotated[Path, typer.Option("--to", "-o", help="Folder of the leaderboard's records.")] = Path(
+        "brainbench-results"
+    ),
+    model: Annotated[
+        list[str] | None, typer.Option("--model", "-m", help="A model to score, or a pattern such as '*-small'.")
+    ] = None,
+    seeds: Annotated[str, typer.Option("--seed", "--seeds", help="Seeds of untrained weights: 0, 0-4 or 0,3.")] = "0",
+    batch: Annotated[Path | None, typer.Option(help="TOML file that names many models and their seeds.")] = None,
+    recordings: Annotated[str | None, typer.Option("--recordings", "-r", help="As in brainbench score.")] = None,
+    conditions: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    select: SelectOption = None,
+    window: WindowOption = None,
+    stimuli: Annotated[str | None, typer.Option("--stimuli", "-s", help="As in brainbench score.")] = None,
+    fidelity: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    whiskers: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    metric: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    estimator: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    time: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    keep_both: Annotated[
+        bool, typer.Option("--keep-both", help="Take in a record although one there states other numbers.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Add records to a folder: files that somebody sends, or scores computed now.
+
+    A file is checked (layout, content hash, contradictions) and refused if it was edited, or if a record there
+    states other numbers for the same computation. Scores that are there already are not computed again, so an
+    interrupted batch goes on where it stopped, and a stale one is renewed.
+    """
+    from brainbench.cli.leaderboard._scoring import Job, find_models, parse_seeds, read_batch
+    from brainbench.errors import UsageError
+
+    given = {"recordings": recordings, "stimuli": stimuli, "fidelity": fidelity, "whiskers": whiskers}
+    given |= {"conditions": conditions, "select": select, "window": window}
+    given |= {"metric": metric, "estimator": estimator, "time": time}
+    options = {name: value for name, value in given.items() if value is not None}
+    jobs: list[Job] = []
+    if model:
+        names, counts = find_models(model), parse_seeds(seeds)
+        # Trained weights do not depend on a seed.
+        jobs = [Job(name, seed, options) for name in names for seed in (counts if "." not in name else counts[:1])]
+        if not jobs:
+            raise UsageError(f"No model matches {', '.join(map(repr, model))}; see them with: brainbench models list")
+    if batch is not None:
+        if options:
+            raise UsageError("Options of the scores stand in the batch file itself, under [options].")
+        jobs += read_batch(batch)
+    if not records and not model and batch is None:
+        raise UsageError("Name record files to take in, or models to score with --model or --batch.")
+    done = [_take_in(path, to, keep_both=keep_both) for path in _files(records or [])]
+    done += _score(jobs, to)
+    states = [item["state"] for item in done]
+    summary = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states)) or "nothing to do"
+    lines = [f"{item['state']:9} {item['record'] or item['model']}{item['note']}" for item in done]
+    emit({"folder": to, "results": done}, "\n".join([*lines, f"{to}: {summary}"]), as_json=as_json)
+    if "refused" in states:
+        raise typer.Exit(1)
+
+
+def _files(sources: list[Path]) -> list[Path]:
+    from brainbench.errors import DataFileNotFoundError
+
+    found: list[Path] = []
+    for source in sources:
+        if not source.exists():
+            raise DataFileNotFoundError(f"There is no record file or folder {str(source)!r}.")
+        inside = (path for path in source.rglob("*.json") if not path.name.startswith("."))
+        found += sorted(inside) if source.is_dir() else [source]
+    return found
+
+
+def _take_in(path: Path, to: Path, *, keep_both: bool) -> dict[str, Any]:
+    from brainbench.errors import DataError
+    from leaderboards.audit import conflicting, remarks
+    from leaderboards.store import read_records, write_record
+
+    result: dict[str, Any] = {"state": "refused", "record": path.name, "model": None, "note": ""}
+    try:
+        (stored,) = read_records(path)
+        if stored.record is None:
+            return result | {"note": f": {stored.problem}"}
+        others = [item.record for item in _present(to) if item.record.identity != stored.record.identity]
+        rivals = conflicting(stored.record, others)
+        if rivals and not keep_both:
+            return result | {
+                "model": stored.record.score.name,
+                "note": f": the same computation gave {rivals[0].score.value:.4f} in a record that is there "
+                f"({rivals[0].identity}) and {stored.record.score.value:.4f} here; see which holds with: "
+                f"brainbench leaderboard verify {path}",
+            }
+        there = any(item.record.identity == stored.record.identity for item in _present(to))
+        written = write_record(stored.record, to)
+    except DataError as error:
+        return result | {"note": f": {error}"}
+    doubts = remarks([stored]).get(stored.record.identity, ())
+    note = "".join(f"\n          {doubt}" for doubt in doubts)
+    state = "known" if there else "added"
+    return {"state": state, "record": written.name, "model": stored.record.score.name, "note": note}
+
+
+def _present(to: Path) -> list[Any]:
+    from leaderboards.store import read_records
+
+    if not to.is_dir() or not any(to.rglob("*.json")):
+        return []
+    return [item for item in read_records(to) if item.record is not None]
+
+
+def _score(jobs: list[Job], to: Path) -> list[dict[str, Any]]:
+    from brainbench.cli.leaderboard._scoring import missing
+    from brainbench.scoring import score_record
+    from leaderboards.store import write_record
+
+    if not jobs:
+        return []
+    done: list[dict[str, Any]] = []
+    with progress_bar() as progress:
+        present: list[ResultRecord] = [item.record for item in _present(to)]
+        open_jobs = missing(jobs, present, options=jobs[0].options)
+        done += [
+            {"state": "known", "record": None, "model": f"{job.model} seed {job.weights_seed}", "note": ""}
+            for job in jobs
+            if job not in open_jobs
+        ]
+        for index, job in enumerate(open_jobs):
+            progress(index, len(open_jobs), "models scored")
+            record = score_record(job.model, weights_seed=job.weights_seed, command=job.command, **job.options)
+            path = write_record(record, to)
+            done.append({"state": "scored", "record": path.name, "model": job.model, "note": ""})
+    return done

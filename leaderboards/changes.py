@@ -1,0 +1,201 @@
+"""What differs: between a record and its repetition, and between two builds of a leaderboard."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+import zipfile
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from brainbench.errors import DataError
+from brainbench.files import to_plain
+from brainbench.types import ResultRecord, Score
+from leaderboards import _origin
+from leaderboards.audit import TOLERANCE
+from leaderboards.ranking import rank
+from leaderboards.store import StoredRecord, read_records
+
+RECORDS_ZIP = Path("data", "records.zip")
+"""Where a built site keeps the records it was made from."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One statement of two records that is not the same."""
+
+    what: str
+    """Place in the record, such as ``score.value``."""
+    before: Any
+    after: Any
+
+    def __str__(self) -> str:
+        return f"{self.what}: {_short(self.before)} → {_short(self.after)}"
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of one model between two builds."""
+
+    kind: Literal["added", "removed", "changed", "moved"]
+    """``moved``: the record is the same, its rank is not, because of others."""
+    board: str
+    name: str
+    before: str
+    """Value and rank before; empty for an added one."""
+    after: str
+    causes: tuple[str, ...] = ()
+    """What else differs between the records, such as the package's version or the stimuli."""
+
+
+def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float = TOLERANCE) -> list[Difference]:
+    """Return what a repetition of a record's computation found otherwise, the inputs first.
+
+    Compared are the hashes of recordings, stimuli and weights, and every number, layer, animal, baseline and
+    status of the scores. Numbers count as equal within ``tolerance``. What only says when, where and with which
+    packages is not compared, nor the content hash of simulated stimuli whose configuration is the same.
+    """
+    found = []
+    for what, of in (
+        ("recordings", _origin.recordings_hash),
+        ("stimuli", _origin.stimuli_hash),
+        ("brainbench version", _origin.version),
+    ):
+        before, after = of(record.score), of(again.score)
+        if before != after:
+            found.append(Difference(what, before, after))
+    if record.card and again.card:
+        for name in ("weights", "parameters"):
+            before, after = getattr(record.card, name), getattr(again.card, name)
+            if before != after:
+                found.append(Difference(f"card.{name}", before, after))
+    before, after = dict(_statements(record)), dict(_statements(again))
+    for name in dict.fromkeys([*before, *after]):
+        one, other = before.get(name), after.get(name)
+        if not _equal(one, other, tolerance):
+            found.append(Difference(name, one, other))
+    return found
+
+
+def open_build(source: str | os.PathLike[str]) -> list[StoredRecord]:
+    """Read the records of a folder, a file, or a built site (which holds those it was made from).
+
+    Raises:
+        DataFileNotFoundError: there is nothing there.
+        DataError: the site's archive is damaged.
+    """
+    archive = Path(source) / RECORDS_ZIP
+    if not archive.is_file():
+        return read_records(source)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            with zipfile.ZipFile(archive) as stored:
+                for entry in stored.infolist():
+                    # Whatever path an archive states, the file lands in the folder itself.
+                    (Path(folder) / Path(entry.filename).name).write_bytes(stored.read(entry))
+        except (zipfile.BadZipFile, OSError) as error:
+            raise DataError(f"{os.fspath(archive)!r} cannot be read ({error}).") from error
+        return read_records(folder)
+
+
+def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]) -> list[Change]:
+    """Return what changed between two sets of records: added, removed, changed, and ranks moved by others.
+
+    A model is the same when its name, weights seed, recordings' name, metric, estimator and time rule are.
+    """
+    old, new = _by_model(before), _by_model(after)
+    changes = []
+    for key in dict.fromkeys([*new, *old]):
+        ones, others = dict(old.get(key, {})), dict(new.get(key, {}))
+        same = sorted(ones.keys() & others.keys())
+        for identity in same:
+            one, other = ones.pop(identity), others.pop(identity)
+            if one.rank != other.rank:
+                changes.append(Change("moved", one.board, one.name, one.text, other.text))
+        pairs = zip(list(ones.values()), list(others.values()), strict=False)
+        for one, other in pairs:
+            ones.pop(one.record.identity)
+            others.pop(other.record.identity)
+            causes = tuple(
+                str(item) for item in differences(one.record, other.record, tolerance=0.0) if _is_cause(item)
+            )
+            changes.append(Change("changed", other.board, other.name, one.text, other.text, causes))
+        changes += [Change("removed", one.board, one.name, one.text, "") for one in ones.values()]
+        changes += [Change("added", other.board, other.name, "", other.text) for other in others.values()]
+    order = ("added", "removed", "changed", "moved")
+    return sorted(changes, key=lambda change: (order.index(change.kind), change.board, change.name, change.before))
+
+
+@dataclass(frozen=True)
+class _Placed:
+    record: ResultRecord
+    board: str
+    name: str
+    rank: str
+
+    @property
+    def text(self) -> str:
+        value = self.record.score.value
+        shown = self.record.score.status if math.isnan(value) else f"{value:.3f}"
+        return f"{shown}, rank {self.rank}"
+
+
+def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str, _Placed]]:
+    found: dict[tuple[Any, ...], dict[str, _Placed]] = defaultdict(dict)
+    for board in rank(item.record for item in stored if item.record is not None):
+        label = f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}"
+        for row in board.rows:
+            seed = row.record.card.seed if row.record.card else None
+            name = row.record.score.name
+            shown = f"{name} (seed {seed})" if seed is not None else name
+            key = (name, seed, board.recordings, board.metric, board.estimator, board.time)
+            found[key][row.identity] = _Placed(row.record, label, shown, row.rank)
+    return found
+
+
+def _is_cause(item: Difference) -> bool:
+    return item.what in ("recordings", "stimuli", "brainbench version", "card.weights", "score.layer")
+
+
+def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
+    yield from _score_statements("score", record.score)
+    if record.animal_to_animal is not None:
+        yield from _score_statements("animal_to_animal", record.animal_to_animal)
+    for name, score in record.baselines.items():
+        yield from _score_statements(f"baselines.{name}", score)
+
+
+def _score_statements(where: str, score: Score) -> Iterator[tuple[str, Any]]:
+    for name, value in to_plain(score).items():
+        if name in ("provenance", "reasons", "p_method", "name"):
+            continue
+        yield from _leaves(f"{where}.{name}", value)
+
+
+def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        named = value.get("layer") if where.endswith("]") and "layer" in value and "subject" not in value else None
+        for name, item in value.items():
+            if name == "method":
+                continue
+            yield from _leaves(f"{where}.{name}" if named is None else f"{where}({named}).{name}", item)
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _leaves(f"{where}[{index}]", item)
+    else:
+        yield where, value
+
+
+def _equal(one: Any, other: Any, tolerance: float) -> bool:
+    numbers = all(isinstance(item, (int, float)) and not isinstance(item, bool) for item in (one, other))
+    return abs(one - other) <= tolerance if numbers else one == other
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "none"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

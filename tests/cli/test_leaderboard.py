@@ -1,0 +1,145 @@
+"""Records are taken in, refused, verified and compared from the command line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from brainbench.cli.leaderboard._scoring import find_models, parse_seeds, read_batch
+from brainbench.errors import DataError, UsageError
+from brainbench.types import ResultRecord
+from leaderboards.store import read_record, record_name
+from tests.cli.test_commands import files  # noqa: F401 - a fixture
+
+PARTS = ("--conditions", "trials:texture")
+
+
+@pytest.fixture
+def scored(run, files) -> tuple[Path, str]:  # noqa: F811
+    """A record of a user's module on two animals, and where the recordings are."""
+    where = files["recordings"]
+    result = run(
+        "score",
+        files["model"],
+        "--stimuli",
+        files["arrays"],
+        "--recordings",
+        where,
+        *PARTS,
+        "--out",
+        files["out"],
+        "--json",
+    )
+    assert result.status == 0, result.err
+    return Path(json.loads(result.out)["record_path"]), where
+
+
+def test_a_record_is_added_known_and_confirmed_by_scoring_again(run, scored, tmp_path):
+    path, where = scored
+    board = tmp_path / "board"
+    first = json.loads(run("leaderboard", "add", str(path), "--to", str(board), "--json").out)
+    assert [item["state"] for item in first["results"]] == ["added"]
+    again = json.loads(run("leaderboard", "add", str(path), "--to", str(board), "--json").out)
+    assert [item["state"] for item in again["results"]] == ["known"]
+    result = run("leaderboard", "verify", str(board), "--recordings", where)
+    assert result.status == 0, result.err
+    assert "confirmed: scored again with the same result" in result.out
+
+
+def _forge(path: Path) -> Path:
+    """Raise the value and give the file the name that fits it, as a careful cheat would."""
+    data = json.loads(path.read_text())
+    data["score"]["value"] += 0.2
+    forged = path.parent / "forged" / record_name(ResultRecord.from_json(data))
+    forged.parent.mkdir(exist_ok=True)
+    forged.write_text(json.dumps(data))
+    assert read_record(forged)
+    return forged
+
+
+def test_an_edited_record_is_refused_and_a_renamed_forgery_does_not_repeat(run, scored, tmp_path):
+    path, where = scored
+    board = tmp_path / "board"
+    run("leaderboard", "add", str(path), "--to", str(board))
+    forged = _forge(path)
+    refused = run("leaderboard", "add", str(forged), "--to", str(board))
+    assert refused.status == 1
+    assert "the same computation gave" in refused.out
+    assert len(list(board.iterdir())) == 1
+    checked = run("leaderboard", "verify", str(forged), "--recordings", where)
+    assert checked.status == 1
+    assert "differs: scored again with another result" in checked.out
+    assert "score.value" in checked.out
+    edited = shutil.copy(forged, tmp_path / path.name)
+    refused = run("leaderboard", "add", str(edited), "--to", str(board))
+    assert refused.status == 1
+    assert "was edited or renamed" in refused.out
+    assert run("leaderboard", "add", str(forged), "--to", str(board), "--keep-both").status == 0
+    assert "conflict:" in run("leaderboard", "verify", str(board), "--no-score").out
+
+
+def test_recordings_elsewhere_must_be_given_to_repeat_a_score(run, scored):
+    path, _ = scored
+    result = run("leaderboard", "verify", str(path))
+    assert result.status == 1
+    assert "give them with --recordings PATH" in result.out
+
+
+def test_diff_names_what_changed(run, scored, tmp_path):
+    path, _ = scored
+    for name in ("old", "new"):
+        (tmp_path / name).mkdir()
+    shutil.copy(path, tmp_path / "old")
+    shutil.copy(_forge(path), tmp_path / "new")
+    old, new = str(tmp_path / "old"), str(tmp_path / "new")
+    changes = json.loads(run("leaderboard", "diff", old, new, "--json").out)["changes"]
+    assert [change["kind"] for change in changes] == ["changed"]
+    assert "No difference." in run("leaderboard", "diff", old, old).out
+
+
+def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, files, tmp_path):  # noqa: F811
+    batch = tmp_path / "batch.toml"
+    options = f'recordings = "{files["recordings"]}"\nstimuli = "{files["arrays"]}"\nconditions = "trials:texture"\n'
+    batch.write_text(f'[options]\n{options}\n[[entries]]\nmodels = ["{files["model"]}"]\nseeds = [0, 1]\n')
+    to = tmp_path / "board"
+    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--json")
+    assert result.status == 0, result.err
+    states = [item["state"] for item in json.loads(result.out)["results"]]
+    assert states == ["scored", "scored"]
+    next(to.glob("*.json")).unlink()
+    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--json")
+    assert sorted(item["state"] for item in json.loads(result.out)["results"]) == ["known", "scored"]
+    assert len(list(to.glob("*.json"))) == 2
+
+
+def test_nothing_to_add_is_an_error(run):
+    result = run("leaderboard", "add")
+    assert result.status == 2
+    assert "Name record files to take in" in result.err
+
+
+def test_patterns_mean_architectures_unless_they_have_a_dot():
+    found = find_models(["*-small", "zhuang"])
+    assert "zhuang-intersection-ln-small" in found
+    assert found[-1] == "zhuang"
+    assert not [name for name in found if "." in name]
+    with pytest.raises(UsageError, match="did you mean 'zhuang'"):
+        find_models(["zhuan"])
+
+
+def test_seeds_and_batches_are_read_or_refused(tmp_path):
+    assert parse_seeds("0-2,7") == (0, 1, 2, 7)
+    with pytest.raises(UsageError, match="such as 0-4"):
+        parse_seeds("a")
+    batch = tmp_path / "b.toml"
+    batch.write_text('[[entries]]\nmodels = ["s4-small"]\nseeds = [0, 1]\n')
+    assert [(job.model, job.weights_seed) for job in read_batch(batch)] == [("s4-small", 0), ("s4-small", 1)]
+    assert read_batch(batch)[1].command == "brainbench score s4-small --weights-seed 1"
+    batch.write_text("[options]\ncolour = 1\n")
+    with pytest.raises(UsageError, match="Unknown option of a batch 'colour'"):
+        read_batch(batch)
+    with pytest.raises(DataError, match="not a readable batch"):
+        read_batch(tmp_path / "none.toml")

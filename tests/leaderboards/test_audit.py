@@ -1,0 +1,72 @@
+"""Stale and conflicting records are found, and nothing else is."""
+
+from __future__ import annotations
+
+import doctest
+from dataclasses import replace
+
+import pytest
+
+from leaderboards import audit
+from leaderboards.audit import conflicting, remarks
+from leaderboards.store import StoredRecord
+
+
+def _stored(record, path, schema=2):
+    return StoredRecord(path / "x.json", record, schema=schema)
+
+
+def _with(record, **provenance):
+    return replace(record, score=replace(record.score, provenance={**record.score.provenance, **provenance}))
+
+
+def test_a_current_record_is_left_alone(make_record, tmp_path):
+    assert remarks([_stored(make_record(), tmp_path)]) == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "schema", "sentence"),
+    [
+        ({}, 1, "stale: the file has the layout of version 1, now 2"),
+        ({"version": "0.0.9"}, 2, "stale: made by brainbench 0.0.9, this is"),
+        ({"settings": {"estimator_version": 0}}, 2, "stale: version 0 of the default estimator, now 1"),
+    ],
+)
+def test_what_an_older_toolkit_made_is_stale(make_record, tmp_path, change, schema, sentence):
+    record = _with(make_record(), **change)
+    ((found,),) = remarks([_stored(record, tmp_path, schema)]).values()
+    assert found.startswith(sentence)
+
+
+def test_stimuli_of_an_earlier_definition_of_a_fidelity_are_stale(make_record, tmp_path):
+    settings = {"fidelity": "balanced", "whiskers": "all"}
+    described = {"description": "rodgers, mouse"}
+    old = _with(make_record("a"), settings=settings, time="2026-01", stimuli={**described, "content_hash": "1"})
+    new = _with(make_record("b"), settings=settings, time="2026-02", stimuli={**described, "content_hash": "2"})
+    coarse = _with(
+        make_record("c"),
+        settings={**settings, "fidelity": "fast"},
+        time="2026-03",
+        stimuli={**described, "content_hash": "3"},
+    )
+    found = remarks([_stored(record, tmp_path) for record in (old, new, coarse)])
+    assert list(found) == [old.identity]
+    assert "earlier definition of fidelity 'balanced'" in found[old.identity][0]
+
+
+def test_the_same_computation_with_other_numbers_is_a_conflict_on_both_sides(make_record, tmp_path):
+    one, other, unrelated = make_record("a", 0.5), make_record("a", 0.6), make_record("b", 0.7)
+    found = remarks([_stored(record, tmp_path) for record in (one, other, unrelated)])
+    assert set(found) == {one.identity, other.identity}
+    assert f"0.5000 here and 0.6000 in the record {other.identity}" in found[one.identity][0]
+    assert conflicting(one, [one, other, unrelated]) == [other]
+
+
+def test_last_digits_and_other_seeds_are_no_conflict(make_record, tmp_path):
+    one, near = make_record("a", 0.5), make_record("a", 0.5 + 1e-6)
+    elsewhere = _with(make_record("a", 0.6), settings={"time": "mean", "seed": 1})
+    assert remarks([_stored(record, tmp_path) for record in (one, near, elsewhere)]) == {}
+
+
+def test_the_examples_hold():
+    assert doctest.testmod(audit).failed == 0
