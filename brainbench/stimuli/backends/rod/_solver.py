@@ -14,9 +14,9 @@ from typing import Any
 
 from brainbench.stimuli.backends.rod._limits import (
     BENT,
+    CLOSED,
     CONTACTS,
     CREVICE,
-    CLOSED,
     FAR,
     FINEST,
     FOLD,
