@@ -1,0 +1,170 @@
+"""Probe layouts: which links carry how many probes, at three resolutions and four placements (thesis, table 4.11)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import DataError, UsageError, unknown_name
+from brainbench.files import read_json, write_json
+from robotics_bridge.hands.spec import Box, Capsule, Grid, Link
+from robotics_bridge.sensors.placement import Probes
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+RESOLUTIONS = ("low", "med", "high")
+PLACEMENTS = ("hand", "tips", "fingers", "palm")
+"""``fingers`` includes the tips; ``hand`` is fingers and palm."""
+Layout = dict[str, Probes]
+"""Link → its probes, in the link's frame."""
+
+
+def pad_probes(link: Link, grid: Grid) -> Probes:
+    """Lay a grid on the pad of a link.
+
+    Raises:
+        UsageError: the link has no pad.
+    """
+    if link.pad is None or not link.solids:
+        raise UsageError(f"Link {link.name!r} has no sensing pad.")
+    solid = link.solids[0]
+    if isinstance(solid, Capsule):
+        position, normal = _on_capsule(solid, link.pad.facing, link.pad.along, link.pad.around, grid)
+    elif isinstance(solid, Box):
+        position, normal = _on_box(solid, link.pad.facing, link.pad.along, grid)
+    else:
+        raise UsageError(f"The pad of link {link.name!r} lies on a sphere; use a capsule or a box.")
+    keep = np.ones(grid.rows * grid.columns, dtype=bool)
+    if grid.active is not None:
+        keep[fillers(grid.rows, grid.columns, grid.rows * grid.columns - grid.active)] = False
+    return Probes(position, normal, np.where(keep, grid.radius, 0.0), (grid.rows, grid.columns))
+
+
+def fillers(rows: int, columns: int, count: int) -> NDArray[np.int64]:
+    """Return the cells [count] of a grid that stay empty: those at its far corners (last columns) first.
+
+    >>> fillers(3, 3, 2).tolist()
+    [2, 8]
+    """
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    off = np.abs(row - (rows - 1) / 2) / max(rows - 1, 1) + column / max(columns - 1, 1)
+    return np.sort(np.lexsort((row, -off))[:count])
+
+
+def _centred(count: int, half: float) -> NDArray[np.float64]:
+    return np.linspace(-half, half, count) if count > 1 else np.zeros(1)
+
+
+def _on_capsule(solid: Capsule, facing: Any, along: tuple[float, float], around: float, grid: Grid) -> tuple[Any, Any]:
+    start, end = np.array(solid.start), np.array(solid.end)
+    length = np.linalg.norm(end - start)
+    axis = (end - start) / length
+    up = np.array(facing, dtype=float) - axis * np.dot(facing, axis)
+    up /= np.linalg.norm(up)
+    side = np.cross(axis, up)
+    angle, arc = (
+        item.ravel()
+        for item in np.meshgrid(_centred(grid.rows, around), np.linspace(*along, grid.columns), indexing="ij")
+    )
+    # Beyond the end of the axis the meridian runs over the round end.
+    tilt = np.maximum(arc - length, 0) / solid.radius
+    across = np.cos(angle)[:, None] * up + np.sin(angle)[:, None] * side
+    normal = np.cos(tilt)[:, None] * across + np.sin(tilt)[:, None] * axis
+    return start + np.minimum(arc, length)[:, None] * axis + solid.radius * normal, normal
+
+
+def _on_box(solid: Box, facing: Any, extent: tuple[float, float], grid: Grid) -> tuple[Any, Any]:
+    normal = np.array(facing, dtype=float)
+    face = int(np.argmax(np.abs(normal)))
+    # Columns run along z where the face has one, rows across.
+    rows_axis, columns_axis = {0: (1, 2), 1: (0, 2), 2: (0, 1)}[face]
+    y, x = (
+        item.ravel()
+        for item in np.meshgrid(_centred(grid.rows, extent[0]), _centred(grid.columns, extent[1]), indexing="ij")
+    )
+    position = np.tile(np.array(solid.center), (len(y), 1))
+    position[:, face] += normal[face] * solid.half[face]
+    position[:, rows_axis] += y
+    position[:, columns_axis] += x
+    return position, np.tile(normal, (len(y), 1))
+
+
+def select(layout: Mapping[str, Probes], links: tuple[str, ...]) -> Layout:
+    """Return the part of a layout on some links, in the layout's order."""
+    return {link: probes for link, probes in layout.items() if link in links}
+
+
+def active_count(layout: Mapping[str, Probes]) -> int:
+    """Return the number of probes that sense."""
+    return int(sum(np.count_nonzero(probes.active) for probes in layout.values()))
+
+
+def check_names(resolution: str, placement: str) -> None:
+    """Raise UsageError for an unknown resolution or placement."""
+    if resolution not in RESOLUTIONS:
+        raise unknown_name("resolution", resolution, RESOLUTIONS)
+    if placement not in PLACEMENTS:
+        raise unknown_name("placement", placement, PLACEMENTS)
+
+
+def read_probes(path: str | os.PathLike[str]) -> Layout:
+    """Read probes in the published JSON form: a list of links with a grid of {radius, pos, normal}.
+
+    Raises:
+        DataError: the file is missing or has another form.
+    """
+    document = read_json(path)
+    name = Path(path).name
+    if not isinstance(document, list):
+        raise DataError(f"{name} is no probe file: a list of links is expected, each with 'link_name' and 'probes'.")
+    layout: Layout = {}
+    for entry in document:
+        try:
+            rows = entry["probes"]
+            cells = [cell for row in rows for cell in row]
+            shape = (len(rows), len(rows[0]))
+            if any(len(row) != shape[1] for row in rows):
+                raise DataError(f"{name}: the rows of link {entry['link_name']!r} differ in length.")
+            position, normal, radius = ([cell[key] for cell in cells] for key in ("pos", "normal", "radius"))
+            probes = Probes(np.array(position), np.array(normal), np.array(radius), shape)
+        except (KeyError, TypeError, IndexError, UsageError) as error:
+            raise DataError(f"{name} is no probe file (link {len(layout) + 1}: {error}).") from error
+        if entry["link_name"] in layout:
+            raise DataError(f"{name}: link {entry['link_name']!r} appears twice.")
+        layout[entry["link_name"]] = probes
+    return layout
+
+
+def write_probes(path: str | os.PathLike[str], layout: Mapping[str, Probes]) -> None:
+    """Write probes in the published JSON form."""
+    document = []
+    for link, probes in layout.items():
+        rows, columns = probes.shape if len(probes.shape) == 2 else (1, len(probes))
+        cells = [
+            {"radius": float(r), "pos": p.tolist(), "normal": n.tolist()}
+            for r, p, n in zip(probes.radius, probes.position, probes.normal, strict=True)
+        ]
+        grid = [cells[row * columns : (row + 1) * columns] for row in range(rows)]
+        document.append({"link_name": link, "kind": "grid", "probes": grid})
+    write_json(path, document)
+
+
+def palm_side(axis: Any, reach: Any, limits: tuple[float, float]) -> NDArray[np.float64]:
+    """Return the direction [3] in which a link moves when its joint flexes: its palmar side.
+
+    Args:
+        axis: [3] of the joint.
+        reach: [3] from the joint to the far end of the link.
+        limits: Of the joint [rad]; the longer side is flexion.
+    """
+    sign = 1.0 if abs(limits[1]) >= abs(limits[0]) else -1.0
+    direction = sign * np.cross(axis, reach)
+    length = float(np.linalg.norm(direction))
+    return direction / length if length > 1e-9 * max(math.dist(reach, (0, 0, 0)), 1e-9) else np.zeros(3)

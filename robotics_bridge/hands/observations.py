@@ -1,0 +1,126 @@
+"""What a policy gets from the sensors of a hand: the tactile observation types of the thesis (tables 4.3, 4.6).
+
+Readings are those of one sensor per link, in the layout's order. Letters: B environment, N probe of a link, L link.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from brainbench.errors import UsageError, unknown_name
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.hands.layouts import Layout
+
+PATCH_FORCE_SCALE = 1e4
+"""From summed depth (m) to the reading of the real finger tip (4.29)."""
+TAXELS_IN_CONTACT = 2
+"""More taxels than this must touch for a link to count as touching (table 4.6)."""
+
+
+@dataclass(frozen=True)
+class ObservationType:
+    """One row of table 4.3."""
+
+    name: str
+    sensor: str | None
+    """Name of the sensor class, None for ``none``."""
+    per_link: bool
+    """One value or vector per link instead of per taxel."""
+    channels: int
+    """Per taxel or link."""
+    text: str
+
+
+OBSERVATIONS: dict[str, ObservationType] = {
+    item.name: item
+    for item in (
+        ObservationType("none", None, True, 0, "no touch: joints alone"),
+        ObservationType("bool", "ContactProbe", False, 1, "contact of each taxel"),
+        ObservationType("agg_bool", "ContactProbe", True, 1, "contact of each link: more than two taxels touch"),
+        ObservationType("depth", "ContactDepthProbe", False, 1, "contact depth of each taxel (m)"),
+        ObservationType("agg_force", "ContactDepthProbe", True, 3, "force of each link from summed depths"),
+        ObservationType("force", "KinematicTaxel", False, 3, "force of each taxel (N)"),
+        ObservationType("force_torque", "KinematicTaxel", False, 6, "force and torque of each taxel (N, N·m)"),
+        ObservationType("elastomer", "ElastomerTaxel", False, 3, "displacement of each marker (m)"),
+        ObservationType("proximity", "ProximityTaxel", False, 6, "force and torque from nearby surface"),
+    )
+}
+
+
+def observation_type(name: str) -> ObservationType:
+    """Return an observation type by name.
+
+    Raises:
+        UsageError: there is none of this name.
+    """
+    if name not in OBSERVATIONS:
+        raise unknown_name("observation type", name, OBSERVATIONS)
+    return OBSERVATIONS[name]
+
+
+def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> torch.Tensor:
+    """Turn the readings of a hand's sensors into one observation [B, F] (equations 4.29, 4.30).
+
+    Fillers are left out, so that F counts active taxels only.
+
+    Args:
+        name: One of :data:`OBSERVATIONS`.
+        readings: Link → reading [B, N], [B, N, C], [B, ny, nx] or [B, ny, nx, C] of its sensor.
+        layout: Link → probes; fixes the order.
+
+    Raises:
+        UsageError: the type is unknown, or a link's reading is missing or has another shape.
+    """
+    import torch
+
+    kind = observation_type(name)
+    if kind.sensor is None:
+        batch = next((reading.shape[0] for reading in readings.values()), 0)
+        return torch.zeros(batch, 0)
+    parts = []
+    for link, probes in layout.items():
+        if link not in readings:
+            raise unknown_name("link among the readings", link, readings)
+        values = _by_taxel(readings[link], len(probes), link)
+        parts.append(_part(name, values, probes))
+    return torch.cat(parts, dim=1)
+
+
+def _by_taxel(reading: torch.Tensor, count: int, link: str) -> torch.Tensor:
+    """Return a reading as [B, N, C]."""
+    size = reading[0].numel()
+    if count and size % count:
+        shape = tuple(reading.shape)
+        raise UsageError(f"The reading of link {link!r} has shape {shape}, but the link has {count} probes.")
+    return reading.reshape(reading.shape[0], count, size // count)
+
+
+def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
+    """Return the observation [B, F] of one link."""
+    import torch
+
+    active = torch.as_tensor(probes.active.copy(), device=values.device)
+    values = values[:, active].float()
+    if name == "agg_bool":
+        return (values[..., 0].sum(dim=1, keepdim=True) > TAXELS_IN_CONTACT).float()
+    if name == "agg_force":
+        normal = torch.as_tensor(probes.normal[probes.active].copy(), dtype=values.dtype, device=values.device)
+        return PATCH_FORCE_SCALE * (values[..., :1] * normal).sum(dim=1).flip(-1)
+    if name == "force":
+        values = values[..., :3]
+    return values.flatten(1)
+
+
+def real_contact(pressure: torch.Tensor, threshold: float) -> torch.Tensor:
+    """Return ``agg_bool`` [B, L] of a real hand's summed finger-tip forces [B, L, 3] (4.31)."""
+    return (pressure.norm(dim=-1) > threshold).float()
+
+
+def repeat_slots(reading: torch.Tensor, slots: int) -> torch.Tensor:
+    """Fill the history slots [B, L·slots·C] of a policy with a real hand's one value per link [B, L, C]."""
+    return reading[:, :, None].expand(-1, -1, slots, -1).flatten(1)

@@ -1,0 +1,242 @@
+"""A hand as data: links, joints, sensing pads. Our own hands are such data, with geometry of primitives only.
+
+Metres, kilograms, radians, newtons. Vectors of a link are given in its frame, whose origin is its joint.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from robotics_bridge.hands._mujoco import engine
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A cylinder with round ends."""
+
+    start: Vector
+    """Centre of the round end near the joint [m]."""
+    end: Vector
+    """Centre of the other round end [m]."""
+    radius: float
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes of its link."""
+
+    center: Vector
+    half: Vector
+    """Half edges [m]."""
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball."""
+
+    center: Vector
+    radius: float
+
+
+Solid = Capsule | Box | Sphere
+
+
+@dataclass(frozen=True)
+class Pad:
+    """The sensing surface of a link, on its first solid.
+
+    On a capsule, columns run along the axis and on over the round end, rows around it. On a box, they fill one face.
+    """
+
+    facing: Vector
+    """Out of the middle of the surface: along an axis of a box, across the axis of a capsule."""
+    along: tuple[float, float]
+    """Capsule: from, to on the meridian, counted from the start of the axis [m]. Box: half extent of rows and
+    columns [m]."""
+    around: float = 0.9
+    """Capsule: half angle that the rows cover [rad]."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How many probes a pad carries at one resolution."""
+
+    rows: int
+    columns: int
+    radius: float
+    """Sensing radius [m]."""
+    active: int | None = None
+    """Probes that sense; the rest are fillers in the far corners. None: all."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid body of the hand."""
+
+    name: str
+    mass: float
+    solids: tuple[Solid, ...] = ()
+    pad: Pad | None = None
+    grids: Mapping[str, Grid] = field(default_factory=dict)
+    """Resolution → grid."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A hinge with a position servo."""
+
+    name: str
+    parent: str
+    child: str
+    position: Vector
+    """Of the child's frame in the parent's [m]."""
+    rpy: Vector
+    """Rotation of the child's frame about the parent's fixed x, y, z axes [rad], as in URDF."""
+    axis: Vector
+    """In the child's frame."""
+    limits: tuple[float, float]
+    """[rad]."""
+    effort: float
+    """Largest torque [N·m]."""
+    velocity: float
+    """Largest speed of the real joint [rad/s]."""
+    stiffness: float
+    """Gain on the position error [N·m/rad]."""
+    damping: float
+    """Gain on the velocity [N·m·s/rad]."""
+    armature: float
+    """Inertia of the drive as seen at the joint [kg·m²]."""
+
+
+@dataclass(frozen=True)
+class HandSpec:
+    """A complete hand.
+
+    Raises:
+        UsageError: a joint or finger names a link that does not exist.
+    """
+
+    name: str
+    palm: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+    """In the order of the actuators; parents may come later."""
+    fingers: Mapping[str, tuple[str, ...]]
+    """Finger → its links from palm to tip."""
+    apart: tuple[tuple[str, str], ...] = ()
+    """Pairs of links that overlap at rest and must not collide, besides neighbours."""
+    source: str = ""
+    """Where the facts come from."""
+
+    def __post_init__(self) -> None:
+        names = [link.name for link in self.links]
+        if len(set(names)) != len(names):
+            raise UsageError(f"Hand {self.name!r} has two links of one name.")
+        used = {self.palm, *(item for joint in self.joints for item in (joint.parent, joint.child))}
+        used |= {name for chain in self.fingers.values() for name in chain}
+        if missing := sorted(used - set(names)):
+            raise UsageError(f"Hand {self.name!r} has no link {missing[0]!r}, which a joint or finger names.")
+
+    def link(self, name: str) -> Link:
+        """Return a link by name."""
+        return next(link for link in self.links if link.name == name)
+
+
+def quaternion(rpy: Vector) -> tuple[float, float, float, float]:
+    """Return the quaternion (w, x, y, z) of rotations about the fixed x, y, z axes [rad].
+
+    >>> [round(value, 3) for value in quaternion((0.0, 0.0, math.pi))]
+    [0.0, 0.0, 0.0, 1.0]
+    """
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in rpy)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def build(hand: HandSpec) -> Any:
+    """Return the ``mujoco.MjSpec`` of a hand whose palm is fixed to the world.
+
+    Every joint carries a position servo with the joint's name; solids are named ``<link>_<number>``.
+    """
+    mujoco = engine()
+
+    spec = mujoco.MjSpec()
+    spec.modelname = hand.name
+    spec.compiler.degree = False
+    # Virtual links between two crossed joints have next to no mass of their own.
+    spec.compiler.boundmass, spec.compiler.boundinertia = 1e-4, 1e-8
+    palm = spec.worldbody.add_body(name=hand.palm)
+    bodies = {hand.palm: palm}
+    _add_solids(palm, hand.link(hand.palm))
+    waiting = list(hand.joints)
+    while waiting:
+        ready = [joint for joint in waiting if joint.parent in bodies]
+        if not ready:
+            raise UsageError(f"The links of hand {hand.name!r} form no tree: {waiting[0].parent!r} hangs on nothing.")
+        for joint in ready:
+            body = bodies[joint.parent].add_body(name=joint.child, pos=joint.position, quat=quaternion(joint.rpy))
+            body.add_joint(
+                name=joint.name, axis=joint.axis, range=joint.limits, limited=True, armature=joint.armature,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+            )  # fmt: skip
+            _add_solids(body, hand.link(joint.child))
+            bodies[joint.child] = body
+        waiting = [joint for joint in waiting if joint not in ready]
+    for joint in hand.joints:
+        spec.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            gainprm=[joint.stiffness] + [0.0] * 9, biasprm=[0.0, -joint.stiffness, -joint.damping] + [0.0] * 7,
+            ctrllimited=True, ctrlrange=joint.limits, forcelimited=True, forcerange=(-joint.effort, joint.effort),
+        )  # fmt: skip
+    # MuJoCo lets a body collide with one that is fixed to the world, even with its parent.
+    neighbours = [(hand.palm, joint.child) for joint in hand.joints if joint.parent == hand.palm]
+    for first, second in (*neighbours, *hand.apart):
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+    return spec
+
+
+def _add_solids(body: Any, link: Link) -> None:
+    """Attach the solids; each gets its share of the link's mass by volume."""
+    mujoco = engine()
+
+    volumes = np.array([_volume(solid) for solid in link.solids])
+    if not link.solids:
+        body.explicitinertial = True
+        body.mass, body.inertia = link.mass, (1e-8, 1e-8, 1e-8)
+    for index, solid in enumerate(link.solids):
+        common = {"name": f"{link.name}_{index}", "mass": float(link.mass * volumes[index] / volumes.sum())}
+        if isinstance(solid, Capsule):
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                fromto=(*solid.start, *solid.end),
+                size=(solid.radius, 0, 0),
+                **common,
+            )
+        elif isinstance(solid, Box):
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=solid.center, size=solid.half, **common)
+        else:
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=solid.center, size=(solid.radius, 0, 0), **common)
+
+
+def _volume(solid: Solid) -> float:
+    if isinstance(solid, Box):
+        return 8 * math.prod(solid.half)
+    ball = 4 / 3 * math.pi * solid.radius**3
+    if isinstance(solid, Sphere):
+        return ball
+    return ball + math.pi * solid.radius**2 * math.dist(solid.start, solid.end)

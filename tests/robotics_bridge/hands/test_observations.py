@@ -1,0 +1,67 @@
+"""Observation types of table 4.3 with equations 4.29–4.31."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench.errors import UsageError
+from robotics_bridge import hands
+from robotics_bridge.hands.observations import OBSERVATIONS, observe, real_contact, repeat_slots
+from robotics_bridge.sensors.placement import Probes
+
+
+def _layout() -> dict[str, Probes]:
+    normal = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 1]], float)
+    return {
+        "a": Probes(np.zeros((6, 3)), normal, np.array([1, 1, 1, 1, 1, 0.0]), (2, 3)),
+        "b": Probes(np.zeros((3, 3)), normal[:3], np.ones(3)),
+    }
+
+
+def test_patch_force_sums_depths_along_normals_in_the_order_z_y_x():
+    depth = {"a": torch.tensor([[1e-4, 2e-4, 3e-4, 0, 0, 9.0]]).reshape(1, 2, 3), "b": torch.zeros(1, 3)}
+    assert observe("agg_force", depth, _layout()) == pytest.approx(torch.tensor([[1.0, 2.0, 3.0, 0, 0, 0]]))
+
+
+def test_a_link_touches_when_more_than_two_taxels_do():
+    for touching, expected in ((2, 0.0), (3, 1.0)):
+        bits = torch.zeros(1, 6)
+        bits[0, :touching] = 1
+        assert observe("agg_bool", {"a": bits.reshape(1, 2, 3), "b": torch.ones(1, 3)}, _layout())[0, 0] == expected
+
+
+@pytest.mark.parametrize(("name", "channels"), [("force", 3), ("force_torque", 6), ("proximity", 6), ("elastomer", 3)])
+def test_taxel_types_flatten_active_taxels_in_order(name, channels):
+    raw = 3 if name == "elastomer" else 6
+    readings = {"a": torch.rand(4, 2, 3, raw), "b": torch.rand(4, 3, raw)}
+    seen = observe(name, readings, _layout())
+    assert seen.shape == (4, 8 * channels)
+    assert seen[:, :channels] == pytest.approx(readings["a"][:, 0, 0, :channels])
+    assert seen[:, -channels:] == pytest.approx(readings["b"][:, -1, :channels])
+
+
+def test_sizes_of_a_hand_follow_from_counts_of_taxels_and_links():
+    layout = hands.load("xhand1").layout("med", "tips")
+    scalar = {link: torch.zeros(2, *probes.shape) for link, probes in layout.items()}
+    assert observe("depth", scalar, layout).shape == (2, 100)
+    assert observe("agg_force", scalar, layout).shape == (2, 15)
+    assert observe("agg_bool", scalar, layout).shape == (2, 5)
+    assert observe("none", scalar, layout).shape == (2, 0)
+    assert len(OBSERVATIONS) == 9
+
+
+def test_a_real_hand_gives_the_same_layout():
+    pressure = torch.tensor([[[0.0, 0, 0.4], [0, 0.3, 0.4]]])
+    assert real_contact(pressure, 0.45).tolist() == [[0.0, 1.0]]
+    assert repeat_slots(torch.tensor([[[1.0], [2.0]]]), 3).tolist() == [[1, 1, 1, 2, 2, 2]]
+
+
+def test_wrong_names_and_shapes_are_explained():
+    with pytest.raises(UsageError, match="Unknown observation type 'forces'; did you mean 'force'"):
+        observe("forces", {}, _layout())
+    with pytest.raises(UsageError, match="Unknown link among the readings 'a'"):
+        observe("depth", {"b": torch.zeros(1, 3)}, _layout())
+    with pytest.raises(UsageError, match="has shape \\(1, 5\\), but the link has 6 probes"):
+        observe("depth", {"a": torch.zeros(1, 5), "b": torch.zeros(1, 3)}, _layout())
