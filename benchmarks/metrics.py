@@ -1,8 +1,10 @@
 """Speed and memory of the metrics beside rsatoolbox 0.3.2, same definitions, one run.
 
     PYTHONPATH=. python benchmarks/metrics.py [--large] [--write]
+    PYTHONPATH=. python benchmarks/metrics.py --device cuda [--write]
 
-``--large`` adds the RDM of 2,000 stimuli and 100,000 units; ``--write`` puts the tables into RESULTS.md.
+``--large`` adds the RDM of 2,000 stimuli and 100,000 units; ``--device`` times instead what a torch device
+computes beside numpy, with the largest difference; ``--write`` puts the tables into RESULTS.md.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -23,6 +26,7 @@ from brainbench.metrics import (
     bootstrap_comparisons,
     compare_models,
     noise_precision,
+    permutation_test,
     rdm,
     score_animals,
     score_rdms,
@@ -95,7 +99,7 @@ def rsatoolbox_rows() -> list[list[str]]:
     for count in (2, 5, 10):
         folds = np.tile(np.arange(count), 600 // count)
         data = Dataset(responses, obs_descriptors={"stimulus": labels, "fold": folds})
-        for name, weight in (("", None), (", with noise precision", precision)):
+        for name, weight in (("", None), (", full precision given", precision)):
 
             def theirs_crossnobis(data: Dataset = data, weight: object = weight) -> np.ndarray:
                 found = calc_rdm(data, method="crossnobis", descriptor="stimulus", cv_descriptor="fold", noise=weight)
@@ -106,7 +110,23 @@ def rsatoolbox_rows() -> list[list[str]]:
 
             error = np.abs(theirs_crossnobis() - ours_crossnobis()).max()
             what = f"crossnobis, 999 units × 600 trials, {count} folds{name}"
-            add(what, theirs_crossnobis, ours_crossnobis, "20×", f"{error:.0e}")
+            add(what, theirs_crossnobis, ours_crossnobis, "20×" if weight is None else "", f"{error:.0e}")
+    # A full covariance needs more trials than units, whoever inverts it.
+    for units, method in ((999, "diag"), (999, "shrinkage_diag"), (999, "shrinkage_eye"), (300, "full")):
+        part, folds = responses[:, :units], np.tile(np.arange(5), 120)
+        data = Dataset(part, obs_descriptors={"stimulus": labels, "fold": folds})
+
+        def theirs_from_trials(data: Dataset = data, method: str = method) -> np.ndarray:
+            noise = prec_from_unbalanced(data, "stimulus", method=method)
+            found = calc_rdm(data, method="crossnobis", descriptor="stimulus", cv_descriptor="fold", noise=noise)
+            return found.dissimilarities[0]
+
+        def ours_from_trials(part: np.ndarray = part, folds: np.ndarray = folds, method: str = method) -> np.ndarray:
+            return rdm(part, labels, method="crossnobis", folds=folds, precision=method)
+
+        error = np.abs(theirs_from_trials() - ours_from_trials()).max()
+        what = f"crossnobis with {method} noise of its trials, {units} units × 600 trials, 5 folds"
+        add(what, theirs_from_trials, ours_from_trials, "20×" if units == 999 else "", f"{error:.0e}")
     data = Dataset(responses, obs_descriptors={"stimulus": labels})
     error = np.abs(prec_from_unbalanced(data, "stimulus", method="shrinkage_diag") - precision).max()
     add(
@@ -178,11 +198,68 @@ def large_row() -> list[str]:
     return ["RDM of 2,000 stimuli × 100,000 units, float32", f"{seconds:.1f}", f"{extra:.2f} GiB above the input (2)"]
 
 
+def device_rows(device: str) -> list[list[str]]:
+    """Time numpy and a torch device on the same numbers; the second time is with responses already there."""
+    import torch
+
+    rng = np.random.default_rng(4)
+    wide = rng.normal(size=(2000, 20_000)).astype(np.float32)
+    trials, labels, folds = rng.normal(size=(600, 999)), np.repeat(np.arange(6), 100), np.tile(np.arange(5), 120)
+    bins = rng.normal(size=(600, 22_000)).astype(np.float32)
+    brain = np.stack([rdm(rng.normal(size=(500, 40))) for _ in range(11)])
+    model = brain.mean(axis=0) + rdm(rng.normal(size=(500, 40)))
+    crossnobis = {"method": "crossnobis", "folds": folds}
+    jobs: list[tuple[str, Callable[..., np.ndarray], np.ndarray]] = [
+        ("correlation, 2,000 × 20,000 float32", rdm, wide),
+        ("sqeuclidean, 2,000 × 20,000 float32", partial(rdm, method="sqeuclidean"), wide),
+        ("poisson, 2,000 × 20,000 float32", partial(rdm, method="poisson"), np.abs(wide)),
+        ("crossnobis, 600 trials × 999", partial(rdm, labels=labels, **crossnobis), trials),
+        (
+            "crossnobis, shrinkage_diag, 600 trials × 999",
+            partial(rdm, labels=labels, precision="shrinkage_diag", **crossnobis),
+            trials,
+        ),
+        (
+            "crossnobis, shrinkage_diag, 600 trials × 22,000",
+            partial(rdm, labels=labels, precision="shrinkage_diag", **crossnobis),
+            bins,
+        ),
+        ("noise precision, 600 trials × 999", partial(noise_precision, labels=labels), trials),
+    ]
+    rows = []
+
+    def add(what: str, plain: Callable[[], np.ndarray], *moved: Callable[[], np.ndarray]) -> None:
+        error = max(np.abs(plain() - job()).max() for job in moved)
+        slow = median_seconds(plain, 1)
+        times = [median_seconds(job, 5) for job in moved]
+        cells = [f"{slow * 1e3:.3g}", *(f"{t * 1e3:.3g}" for t in times), *["–"] * (2 - len(times))]
+        rows.append([what, *cells, f"{slow / min(times):.0f}×", f"{error:.0e}"])
+
+    for what, job, given in jobs:
+        there = torch.from_numpy(given).to(device)
+        add(what, partial(job, given), partial(job, given, device=device), partial(job, there))
+
+    def permuted(device: str | None) -> np.ndarray:
+        return permutation_test(model, brain, device=device).null
+
+    add("10,000 permutations of 500 stimuli, 11 animals", partial(permuted, None), partial(permuted, device))
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--large", action="store_true")
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--device")
     options = parser.parse_args()
+    if options.device:
+        columns = ["job", "numpy ms", f"{options.device} ms", "already there ms", "ratio", "largest difference"]
+        body = table(columns, device_rows(options.device))
+        print(body)
+        if options.write:
+            command = f"PYTHONPATH=. python benchmarks/metrics.py --device {options.device} --write"
+            write_section(f"Metrics on a torch device ({options.device})", command, body)
+        return
     large = [large_row()] if options.large else []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
