@@ -26,6 +26,7 @@ REQUIRED = (
 OPTIONAL = {
     "pynwb": ("nwb", "checking NWB files against the schema"),
     "nwbinspector": ("nwb", "best-practice checks of NWB files"),
+    "dandi": ("dandi", "brainbench recordings fetch: public data from the DANDI archive"),
     "pybullet": ("bullet", "the whisker engine of WHISKiT as a second backend (Python < 3.12)"),
     "coacd": ("mesh", "convex decomposition of concave objects"),
     "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),

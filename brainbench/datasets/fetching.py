@@ -35,8 +35,9 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
     client = shutil.which("dandi")
     if client is None:
         raise MissingDependencyError(
-            f"Downloading from the DANDI archive needs its client, which is not installed: pip install dandi. Or get "
-            f"DANDI:{number} elsewhere: every other command works on files, without a network."
+            "Downloading from the DANDI archive needs its client, which is not installed: "
+            f"pip install 'brainbench[dandi]'. Or get DANDI:{number} elsewhere: every other command works on files, "
+            "without a network."
         )
     pattern = assets or pattern
     source = f"dandi://dandi/{number}/{pattern}" if pattern else f"DANDI:{number}"

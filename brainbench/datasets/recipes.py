@@ -1,7 +1,12 @@
-"""The registry of recipes: named ways to read a data set."""
+"""The registry of recipes: named ways to read a data set.
+
+Other packages add theirs through the entry point group ``brainbench.recordings``: an entry point names a
+:class:`~brainbench.datasets.Recipe`, or a module whose import runs :func:`register_recipe`.
+"""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from brainbench.datasets import area2_bump, hires, rodgers, yu
@@ -9,6 +14,10 @@ from brainbench.datasets._recipe import Recipe
 from brainbench.datasets.selection import DEFAULT, EVERYTHING, Selection
 from brainbench.datasets.sessions import Session
 from brainbench.errors import UsageError, unknown_name
+
+_log = logging.getLogger(__name__)
+
+ENTRY_POINTS = "brainbench.recordings"
 
 _RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
@@ -22,6 +31,8 @@ _RECIPES: dict[str, Recipe] = {
     )
 }
 _SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
+_loaded: list[str] = []
+"""Groups of entry points that were loaded: once, on first use."""
 
 
 def register_recipe(recipe: Recipe) -> Recipe:
@@ -50,19 +61,19 @@ def get_recipe(name: str) -> Recipe:
     Raises:
         UsageError: there is no such recipe (the nearest is named).
     """
-    if name not in _RECIPES:
+    if name not in _known():
         raise unknown_name("recordings recipe", name, _RECIPES)
     return _RECIPES[name]
 
 
 def list_recipes() -> list[str]:
     """Names of the recipes."""
-    return sorted(_RECIPES)
+    return sorted(_known())
 
 
 def detect_recipe(session: Session) -> Recipe | None:
     """Return the recipe whose layout a session has, if any; of several the most specific one."""
-    found = [recipe for recipe in _RECIPES.values() if recipe.matches(session)]
+    found = [recipe for recipe in _known().values() if recipe.matches(session)]
     return max(found, key=lambda recipe: len(recipe.layout), default=None)
 
 
@@ -76,7 +87,7 @@ def resolve_selection(select: Selection | str) -> Selection:
         return select
     if select in _SELECTIONS:
         return _SELECTIONS[select]
-    if select in _RECIPES:
+    if select in _known():
         return _RECIPES[select].selection
     if "=" not in select:
         names = [*_SELECTIONS, *list_recipes()]
@@ -124,6 +135,26 @@ def load_recipe(path: str) -> Recipe:
             f"The recipe file {path!r} defines no RECIPE = brainbench.datasets.Recipe(…); docs/recordings.md shows one."
         )
     return register_recipe(found)
+
+
+def _known() -> dict[str, Recipe]:
+    """Return the registry with the recipes of other packages."""
+    if ENTRY_POINTS not in _loaded:
+        _loaded.append(ENTRY_POINTS)
+        _load_entry_points()
+    return _RECIPES
+
+
+def _load_entry_points() -> None:
+    from importlib.metadata import entry_points
+
+    for entry in entry_points(group=ENTRY_POINTS):
+        try:
+            found = entry.load()
+            if isinstance(found, Recipe):
+                register_recipe(found)
+        except Exception as error:  # noqa: BLE001 - another package's fault must not take our recipes away
+            _log.warning("The recipe of entry point %r (%s) could not be loaded: %s", entry.name, entry.value, error)
 
 
 def _is_name(word: str) -> bool:

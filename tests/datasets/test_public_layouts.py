@@ -1,3 +1,4 @@
+import logging
 import sys
 
 import numpy as np
@@ -206,12 +207,38 @@ def test_an_unusable_recipe_file_is_refused_in_words(registry, tmp_path, content
         open_recordings(f"{tmp_path / 'my.py'}:a.h5")
 
 
+def test_installed_packages_add_recipes_and_one_that_fails_takes_nothing_away(registry, monkeypatch, tmp_path, caplog):
+    (tmp_path / "their_recordings.py").write_text(
+        "from dataclasses import replace\n"
+        "from brainbench.datasets import Conditions, Recipe, Selection, Window, register_recipe\n"
+        "ONE = Recipe('their-one', 'theirs', 'Them (2026)', Conditions('trials', ('texture',)), {}, Selection(), "
+        "Window('start', length=0.5), ('texture', 'their_mark'))\n"
+        "register_recipe(replace(ONE, name='their-two', layout=()))\n"
+    )
+    (tmp_path / "broken_recordings.py").write_text("raise RuntimeError('out of order')\n")
+    info = tmp_path / "theirs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[brainbench.recordings]\nmine = their_recordings:ONE\nbroken = broken_recordings\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("brainbench.datasets.recipes._loaded", [])
+    with caplog.at_level(logging.WARNING):
+        names = list_recipes()
+    assert {"their-one", "their-two", "rodgers"} <= set(names)
+    assert get_recipe("their-one").citation == "Them (2026)"
+    assert "entry point 'broken' (broken_recordings) could not be loaded: out of order" in caplog.text
+
+
 # Fetching
 
 
 def test_without_the_client_nothing_is_tried(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(MissingDependencyError, match=r"pip install dandi\. Or get DANDI:000231 elsewhere"):
+    with pytest.raises(
+        MissingDependencyError, match=r"pip install 'brainbench\[dandi\]'\. Or get DANDI:000231 elsewhere"
+    ):
         fetch("rodgers", tmp_path / "data")
     assert not (tmp_path / "data").exists()
     with pytest.raises(UsageError, match="Unknown data set 'rogers'; did you mean 'rodgers'"):
