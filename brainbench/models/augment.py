@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch.nn import functional
@@ -59,7 +60,8 @@ class Augmentation:
 
         Args:
             x: Sweeps in SI; unchanged.
-            generator: Generator on the CPU; equal states give equal results on every device.
+            generator: On the CPU, equal states give equal results on every device. On the device of ``x`` nothing is
+                moved, and the whole can be part of a CUDA graph.
             part: (rank, number) when ``x`` holds every number-th sweep of a larger batch, from rank on; each sweep is
                 then treated as it would be in the whole batch.
         """
@@ -78,11 +80,18 @@ class Draw:
 
     def uniform(self, count: int, *shape: int) -> torch.Tensor:
         """Return numbers in [0, 1) [count, *shape]."""
-        return torch.rand(count * self.parts, *shape, generator=self.generator)[self.rank :: self.parts]
+        return self._every(torch.rand, count * self.parts, *shape)[self.rank :: self.parts]
 
     def normal(self, count: int, *shape: int) -> torch.Tensor:
         """Return standard normal numbers [count, *shape]."""
-        return torch.randn(count * self.parts, *shape, generator=self.generator)[self.rank :: self.parts]
+        return self._every(torch.randn, count * self.parts, *shape)[self.rank :: self.parts]
+
+    def for_all(self, count: int, device: torch.device) -> torch.Tensor:
+        """Return numbers in [0, 1) [count] that are the same for the whole batch."""
+        return self._every(torch.rand, count).to(device)
+
+    def _every(self, draw: Callable[..., torch.Tensor], *shape: int) -> torch.Tensor:
+        return draw(*shape, generator=self.generator, device=self.generator.device)
 
     def coins(self, x: torch.Tensor, probability: float = 0.5) -> torch.Tensor:
         """Return one truth value per sweep of ``x``, shaped to broadcast against it."""
@@ -104,10 +113,10 @@ def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
         )
     # A mirror turns the normal part of a polar vector (force) and the tangential part of an axial one (moment).
     normal = _MIRRORED[direction]
-    signs = [-1.0 if (name[1] == normal) == (name[0] == "F") else 1.0 for name in CHANNELS]
-    turned = torch.tensor(signs * (x.shape[2] // len(CHANNELS)), dtype=x.dtype, device=x.device)
-    places = torch.tensor(_places(direction), device=x.device)
-    return (x.flatten(3)[..., places] * turned[:, None]).unflatten(3, GRID_SHAPE)
+    signs = tuple(-1.0 if (name[1] == normal) == (name[0] == "F") else 1.0 for name in CHANNELS)
+    turned = _constant(signs * (x.shape[2] // len(CHANNELS)), x.device).to(x.dtype)
+    places = _constant(_places(direction), x.device)
+    return (x.flatten(3).index_select(3, places) * turned[:, None]).unflatten(3, GRID_SHAPE)
 
 
 def reverse_time(x: torch.Tensor) -> torch.Tensor:
@@ -125,7 +134,14 @@ def mask_steps(x: torch.Tensor, share: float, draw: Draw) -> torch.Tensor:
     return x * kept.view(batch, steps, *(1,) * (x.ndim - 2))
 
 
-def _places(direction: str) -> list[int]:
+@cache
+def _constant(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
+    """Return numbers on a device, where a step that is replayed as a CUDA graph must find them."""
+    with torch.inference_mode(False):
+        return torch.tensor(values, device=device)
+
+
+def _places(direction: str) -> tuple[int, ...]:
     """Return for every cell of the grid the cell whose whisker comes to it: the order of a row or column reversed."""
     rows, columns = GRID_SHAPE
     lines = (
@@ -139,7 +155,7 @@ def _places(direction: str) -> list[int]:
     for line in lines:
         for cell, source in zip(line, reversed(line), strict=True):
             places[cell] = source
-    return places
+    return tuple(places)
 
 
 def _physical(x: torch.Tensor, draw: Draw) -> torch.Tensor:
@@ -150,21 +166,36 @@ def _physical(x: torch.Tensor, draw: Draw) -> torch.Tensor:
 
 
 def _thesis(x: torch.Tensor, draw: Draw) -> torch.Tensor:
-    chosen = torch.rand(3, generator=draw.generator) < 0.5
-    turns = int(torch.randint(4, (1,), generator=draw.generator))
-    dims = [axis for axis, drawn in zip((3, 4, 1), chosen, strict=True) if drawn]
-    x = x.flip(dims) if dims else x
-    turned = torch.rot90(x, turns, (3, 4))
-    if turns % 2:
-        rows, columns = x.shape[3:]
-        margin = (columns - rows) // 2
-        turned = functional.pad(turned[:, :, :, margin : margin + rows], (margin, margin))
-    return turned
+    drawn = draw.for_all(4, x.device)
+    rows, columns = x.shape[3:]
+    # Nothing is read back from the device: every outcome is a table, and the one drawn is looked up.
+    vertical, horizontal = (drawn[:2] < 0.5).long()
+    which = (vertical * 2 + horizontal) * 4 + (drawn[3] * 4).long()
+    tables = _constant(_turned_places(rows, columns), x.device).view(16, -1)
+    places = tables.index_select(0, which.view(1))[0]
+    x = torch.where(drawn[2] < 0.5, x.flip(1), x).flatten(3)
+    return (x.index_select(3, places.clamp_min(0)) * (places >= 0)).unflatten(3, (rows, columns))
+
+
+@cache
+def _turned_places(rows: int, columns: int) -> tuple[int, ...]:
+    """Return for both flips and four turns (2 × 2 × 4 outcomes) each cell's source, −1 where the turn lost it."""
+    margin = (columns - rows) // 2
+    found: list[int] = []
+    for dims in ((), (1,), (0,), (0, 1)):
+        grid = torch.arange(rows * columns).view(rows, columns).flip(dims)
+        for turns in range(4):
+            turned = torch.rot90(grid, turns, (0, 1))
+            if turns % 2:
+                turned = functional.pad(turned[margin : margin + rows], (margin, margin), value=-1)
+            found += turned.flatten().tolist()
+    return tuple(found)
 
 
 def _image(x: torch.Tensor, draw: Draw) -> torch.Tensor:
     # Pictures have one unit per pixel: work in the units the networks see.
-    scale = Normaliser.physical(x.shape[2] // len(CHANNELS)).scale.to(device=x.device, dtype=x.dtype)
+    units = tuple(Normaliser.physical(x.shape[2] // len(CHANNELS)).scale.flatten().tolist())
+    scale = _constant(units, x.device).to(x.dtype).view(-1, 1, 1)
     y = x / scale
 
     def drawn(*shape: int) -> torch.Tensor:
@@ -175,7 +206,7 @@ def _image(x: torch.Tensor, draw: Draw) -> torch.Tensor:
     offset, gain = drawn(1, x.shape[2], 1, 1), drawn(1, x.shape[2], 1, 1)
     y = torch.where(draw.coins(x, 0.8), y * (0.6 + 0.8 * gain) + 0.4 * spread * (2 * offset - 1), y)
     y = torch.where(draw.coins(x, 0.2), y.mean(2, keepdim=True).expand_as(y), y)
-    kernel = torch.tensor([1.0, 2.0, 1.0], dtype=x.dtype, device=x.device)
+    kernel = _constant((1.0, 2.0, 1.0), x.device).to(x.dtype)
     kernel = (kernel[:, None] * kernel / 16.0).expand(x.shape[2], 1, 3, 3)
     blurred = functional.conv2d(y.flatten(0, 1), kernel, padding=1, groups=x.shape[2]).unflatten(0, x.shape[:2])
     y = torch.where(draw.coins(x), blurred, y)

@@ -32,7 +32,9 @@ def nt_xent(first: torch.Tensor, second: torch.Tensor, *, temperature: float = T
     every = every.flatten(0, 1)
     row = torch.arange(len(own), device=own.device)
     itself = row + 2 * start
-    similarity = own @ every.T / temperature
+    # Mixed precision would round cosines to three digits before they are divided by the temperature.
+    with torch.autocast(own.device.type, enabled=False):
+        similarity = own @ every.T / temperature
     similarity = similarity.index_put((row, itself), torch.full((), -torch.inf, device=own.device).expand(len(own)))
     return functional.cross_entropy(similarity, itself ^ 1)
 

@@ -1,0 +1,115 @@
+"""What ``train_zoo.py`` trains: a list of jobs, most valuable first."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from brainbench.models.training.config import TrainingConfig
+
+SMALL = (
+    "zhuang-intersection-ln-small",
+    "zhuang-small",
+    "resnet18-small",
+    "s4-small+gpt",
+    "zhuang-small+mamba",
+    "resnet18-small+gpt",
+)
+"""Six combinations of encoder and attender: memory of three kinds and none; GPT, Mamba and no attender."""
+VARIED = ("zhuang-intersection-ln-small", "resnet18-small")
+"""Where augmentations and masking are compared: a network with memory and one without."""
+FULL = (
+    ("zhuang-intersection-ln", "supervised"),
+    ("zhuang-intersection-ln", "simclr"),
+    ("zhuang-intersection-ln+gpt", "supervised"),
+    ("resnet18", "supervised"),
+    ("s4", "supervised"),
+)
+SEEDS = 3
+FULL_EPOCHS = 20
+SMALL_SLOTS, FULL_SLOTS = 1, 4
+"""How much of a GPU's places a job takes."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One network to train, or an untrained twin to evaluate (``objective`` = ``untrained``)."""
+
+    model: str
+    objective: str
+    seed: int = 0
+    augmentation: str = "physical"
+    masking: float = 0.0
+    epochs: int = 100
+    """At most so many; fewer where the first epoch shows that time would not allow them."""
+    ship: bool = False
+    """Its weights come back."""
+
+    @property
+    def full(self) -> bool:
+        """Whether the network has its published size."""
+        return "-small" not in self.model
+
+    @property
+    def slots(self) -> int:
+        """How many places it takes."""
+        return FULL_SLOTS if self.full else SMALL_SLOTS
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        variant = "" if self.augmentation == "physical" else f".{self.augmentation}"
+        variant += f".masked{self.masking * 100:.0f}" if self.masking else ""
+        return f"{self.model}.{self.objective}{variant}.seed{self.seed}"
+
+    def config(self, epochs: int) -> TrainingConfig:
+        """Return the configuration that ``brainbench train`` would train it with.
+
+        The published recipes are for 100 epochs: a tenth of the rate every 30 of them means nothing to a shorter run,
+        so all anneal by a cosine after a tenth of warm-up. Rates are points of the published search spaces.
+        """
+        chosen = TrainingConfig.published(
+            self.model,
+            self.objective,
+            epochs=epochs,
+            optimizer="adamw",
+            schedule="cosine",
+            learning_rate=1e-3 if not self.full or self.model in ("resnet18", "s4") else 3e-4,
+            warmup_epochs=max(1, round(0.1 * epochs)),
+            decoder="linear",
+            augmentation=self.augmentation,
+            masking=self.masking,
+            seed=self.seed,
+            batch_size=256,
+            weights_dtype="float16",
+        )
+        return dataclasses.replace(chosen, compile="off")
+
+
+def all_jobs() -> list[Job]:
+    """Return every job, so ordered that a cut leaves whole results."""
+    return list(dict.fromkeys(_jobs()))
+
+
+def _jobs() -> Iterator[Job]:
+    for model in SMALL:
+        for objective in ("supervised", "simclr"):
+            yield Job(model, objective, ship=True)
+    for model in SMALL:
+        yield Job(model, "untrained")
+    for model, objective in FULL[:3]:
+        yield Job(model, objective, epochs=FULL_EPOCHS)
+        yield Job(model, "untrained")
+    for model in VARIED:
+        for objective in ("simclr", "supervised"):
+            for augmentation in ("none", "thesis", "image"):
+                yield Job(model, objective, augmentation=augmentation)
+            yield Job(model, objective, masking=0.75)
+    for seed in range(1, SEEDS):
+        for model in SMALL:
+            for objective in ("supervised", "simclr", "untrained"):
+                yield Job(model, objective, seed=seed)
+    for model, objective in FULL[3:]:
+        yield Job(model, objective, epochs=FULL_EPOCHS)
+        yield Job(model, "untrained")

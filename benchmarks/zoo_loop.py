@@ -1,0 +1,463 @@
+"""Train one network of ``train_zoo.py`` on sweeps that lie in the device's memory, whole steps as CUDA graphs.
+
+Epochs, order, rates and losses are tensors on the device; a step is one launch. What is trained is what ``brainbench
+train`` trains (same learners, augmentations, optimisers, evaluation and checkpoints); the loop is not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+import time
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import torch
+from zoo_jobs import Job
+
+from brainbench.datasets import WhiskingDataset
+from brainbench.files import read_json, write_json
+from brainbench.models._seeding import seeded
+from brainbench.models.augment import Augmentation
+from brainbench.models.checkpoints import WEIGHTS, load_weights, save_checkpoint
+from brainbench.models.evaluation import evaluate
+from brainbench.models.normaliser import Normaliser
+from brainbench.models.objectives import make_learner
+from brainbench.models.optimizers import make_optimizer, rate_factor
+from brainbench.models.registry import load_model
+from brainbench.models.training.captured import captured, copy_state, make_capturable, reset_optimizer
+from brainbench.models.training.card import checkpoint_info, model_card
+from brainbench.models.training.probe import fit_probe
+from brainbench.models.training.state import load_state, save_state
+
+STATE, BEST, RESULT, LOG = "state.safetensors", "best", "result.json", "log.jsonl"
+EVALUATED = 512
+_log = logging.getLogger("train_zoo")
+
+
+class Split:
+    """Sweeps of one split in device memory, normalised and in half precision: [N, T, S·C, H, W]."""
+
+    def __init__(self, folder: Path, split: str, device: torch.device) -> None:
+        data = WhiskingDataset(folder, split=split, batch_size=1024, shuffle=False, device=device)
+        self.scale = Normaliser.physical().scale.to(device)
+        parts, labels = [], []
+        for batch in data:
+            part = batch.input / self.scale
+            good = (part.abs().flatten(1).amax(1) < 6e4).nonzero()[:, 0]  # what half precision cannot hold
+            parts.append(part[good].half())
+            labels.append(batch.label[good].clone())
+        self.sweeps, self.labels = torch.cat(parts), torch.cat(labels)
+        self.left_out = data.sweeps + data.skipped - len(self.labels)
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def take(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return chosen sweeps in SI, single precision."""
+        return self.sweeps.index_select(0, rows).float() * self.scale
+
+    def batches(self, size: int = 1024) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Yield all sweeps in SI, with their labels."""
+        for rows in torch.arange(len(self), device=self.labels.device).split(size):
+            yield self.take(rows), self.labels[rows]
+
+
+class Resident:
+    """A data set in device memory."""
+
+    def __init__(self, folder: Path, device: torch.device) -> None:
+        manifest = read_json(folder / "manifest.json")
+        self.classes = tuple(str(name) for name in manifest["classes"])
+        self.hash = str(manifest["content_hash"])
+        self.train, self.validation, self.test = (
+            Split(folder, name, device) for name in ("train", "validation", "test")
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return what a table says of it."""
+        splits = {name: len(getattr(self, name)) for name in ("train", "validation", "test")}
+        left_out = sum(getattr(self, name).left_out for name in splits)
+        return {"hash": self.hash, "classes": len(self.classes), "left_out": left_out, **splits}
+
+
+class Trainer:
+    """One job on one device, epoch by epoch.
+
+    Args:
+        job: What is trained.
+        data: The sweeps.
+        device: Where they are.
+        epochs: Passes over the training sweeps.
+        precision: ``bf16`` (mixed) or ``float32`` (TF32 where the device has it).
+    """
+
+    def __init__(self, job: Job, data: Resident, device: torch.device, epochs: int, precision: str) -> None:
+        self.job, self.data, self.device, self.precision = job, data, device, precision
+        self.config = dataclasses.replace(job.config(epochs), precision=precision)
+        self.options = {"classes": len(data.classes), "decoder": self.config.decoder}
+        model = load_model(job.model, seed=job.seed, **self.options)
+        with seeded(job.seed):
+            self.learner: Any = make_learner(job.objective, model).to(device)
+        if device.type == "cuda":
+            self.learner = self.learner.to(memory_format=torch.channels_last)
+        self.model = self.learner.model
+        self.rate = torch.zeros((), device=device)
+        self.optimizer = make_optimizer(self.config.optimizer, self.learner.parameters(), self.config.learning_rate)
+        make_capturable(self.optimizer, self.rate)
+        self.trained = [parameter for parameter in self.learner.parameters() if parameter.requires_grad]
+        self.augmentation = Augmentation(self.config.augmentation, self.config.masking)
+        self.generator = torch.Generator(device).manual_seed(job.seed)
+        batch = self.config.batch_size
+        self.steps, self.checks = max(1, len(data.train) // batch), math.ceil(len(data.validation) / EVALUATED)
+        options: dict[str, Any] = {"device": device}
+        self.cursor = torch.zeros(1, dtype=torch.long, **options)
+        self.order = torch.zeros(self.steps, min(batch, len(data.train)), dtype=torch.long, **options)
+        self.rates = torch.zeros(self.steps, **options)
+        self.losses = torch.zeros(self.steps, **options)
+        self.checked = torch.zeros(1, dtype=torch.long, **options)
+        rows = torch.arange(self.checks * EVALUATED, **options).view(self.checks, -1)
+        self.check_rows, self.check_weights = rows % len(data.validation), (rows < len(data.validation)).float()
+        self.found = torch.zeros((), **options)
+        self.epoch, self.best, self.best_epoch = 0, math.inf, None
+        self.kept: dict[str, torch.Tensor] = {}
+        self.seconds = 0.0
+
+    def prepare(self, *, graphs: bool = True) -> None:
+        """Warm up and capture the training step and the validation step; the network is as new afterwards."""
+        start = {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
+        self._set_epoch(0)
+        self.learner.train()
+        generators = (self.generator,)
+        self.step = captured(self._step, self.device, generators=generators) if graphs else self._step
+        self.learner.eval()
+        with torch.no_grad():
+            self.check = captured(self._check, self.device, generators=generators) if graphs else self._check
+        copy_state(self.learner, start)
+        reset_optimizer(self.optimizer)
+        self.kept = {name: value.clone() for name, value in self.learner.state_dict().items()}
+
+    def _step(self) -> None:
+        rows = self.order.index_select(0, self.cursor)[0]
+        x, labels = self.data.train.take(rows), self.data.train.labels.index_select(0, rows)
+        self.rate.copy_(self.rates.index_select(0, self.cursor)[0])
+        self.optimizer.zero_grad(set_to_none=True)
+        with self._autocast():
+            loss, _ = self.learner(self._views(x), labels)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
+        self.optimizer.step()
+        self.losses.index_copy_(0, self.cursor, loss.detach().float().view(1))
+        self.cursor.add_(1).remainder_(self.steps)
+
+    def _check(self) -> None:
+        """Count what one batch of the validation sweeps adds: right answers, or the self-supervised loss."""
+        rows = self.check_rows.index_select(0, self.checked)[0]
+        weights = self.check_weights.index_select(0, self.checked)[0]
+        x, labels = self.data.validation.take(rows), self.data.validation.labels.index_select(0, rows)
+        with self._autocast():
+            if self.learner.supervised:
+                self.found.add_(((self.model(x).argmax(1) == labels).float() * weights).sum())
+            else:
+                loss, _ = self.learner(self._views(x), labels)
+                self.found.add_(loss.float())
+        self.checked.add_(1).remainder_(self.checks)
+
+    def _views(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(self.augmentation(x, self.generator) for _ in range(self.learner.views))
+
+    def _autocast(self) -> Any:
+        return torch.autocast(self.device.type, dtype=torch.bfloat16) if self.precision == "bf16" else nullcontext()
+
+    def _set_epoch(self, epoch: int) -> None:
+        config = self.config
+        generator = torch.Generator().manual_seed(job_seed(config.seed, epoch))
+        order = torch.randperm(len(self.data.train), generator=generator)[: self.order.numel()]
+        rates = [
+            config.learning_rate
+            * rate_factor(
+                config.schedule,
+                epoch + step / self.steps,
+                epochs=config.epochs,
+                warmup_epochs=config.warmup_epochs,
+            )
+            for step in range(self.steps)
+        ]
+        self.order.copy_(order.view_as(self.order))
+        self.rates.copy_(torch.tensor(rates))
+        self.cursor.zero_()
+        self.generator.manual_seed(job_seed(config.seed, epoch))
+
+    def train_epoch(self, launch: Any) -> float:
+        """Train one epoch; return its mean loss. ``launch`` is called around every launch of a step."""
+        started = time.monotonic()
+        with launch():
+            self._set_epoch(self.epoch)
+        self.learner.train()
+        ahead: list[Any] = []
+        for _ in range(self.steps):
+            with launch():
+                self.step()
+                if self.device.type == "cuda":
+                    event = torch.cuda.Event()
+                    event.record()
+                    ahead.append(event)
+                    if len(ahead) > 2:  # a deep queue of one job would starve the others
+                        ahead.pop(0).synchronize()
+        with launch():
+            loss = float(self.losses.mean())
+        self.seconds += time.monotonic() - started
+        self.epoch += 1
+        return loss
+
+    def validate(self, launch: Any) -> float:
+        """Return what the best network has least of: 1 − accuracy, or the self-supervised loss; keep the best."""
+        self.learner.eval()
+        with launch(), torch.no_grad():
+            self.checked.zero_()
+            self.found.zero_()
+            for _ in range(self.checks):
+                self.check()
+            found = float(self.found)
+        score = 1 - found / len(self.data.validation) if self.learner.supervised else found / self.checks
+        if score < self.best:
+            self.best, self.best_epoch = score, self.epoch
+            with launch():
+                for name, value in self.learner.state_dict().items():
+                    self.kept[name].copy_(value)
+        return score
+
+    def save(self, path: Path) -> None:
+        """Write everything that going on needs."""
+        plain = {
+            "epoch": self.epoch,
+            "epochs": self.config.epochs,
+            "precision": self.precision,
+            "best": self.best if math.isfinite(self.best) else None,
+            "best_epoch": self.best_epoch,
+            "seconds": self.seconds,
+            "data": self.data.hash,
+        }
+        for group in self.optimizer.param_groups:
+            group["lr"] = float(self.rate)
+        save_state(path, _Both(self.learner, self.kept), self.optimizer, plain)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.rate
+
+    def load(self, path: Path) -> None:
+        """Go on where :meth:`save` was called; after :meth:`prepare`."""
+        holder = _Both(self.learner, self.kept)
+        rate, flags = self.rate, [dict(group) for group in self.optimizer.param_groups]
+        moments = {id(p): dict(self.optimizer.state[p]) for p in self.trained if p in self.optimizer.state}
+        plain = load_state(path, holder, self.optimizer)
+        # The captured step reads the tensors that were there when it was recorded.
+        for parameter in self.trained:
+            for key, old in moments.get(id(parameter), {}).items():
+                if isinstance(old, torch.Tensor):
+                    old.copy_(self.optimizer.state[parameter][key])
+                    self.optimizer.state[parameter][key] = old
+        for group, old in zip(self.optimizer.param_groups, flags, strict=True):
+            group.update({key: value for key, value in old.items() if key != "params"})
+            group["lr"] = rate
+        self.epoch, self.best_epoch, self.seconds = plain["epoch"], plain["best_epoch"], plain["seconds"]
+        self.best = plain["best"] if plain["best"] is not None else math.inf
+
+    def finish(self, out: Path) -> dict[str, Any]:
+        """Evaluate the best network as it will be shipped; write it."""
+        copy_state(self.learner, self.kept)
+        if self.device.type == "cuda":
+            self.model = self.model.to(memory_format=torch.contiguous_format)
+        return publish(self.job, self.model, self.config, self.data, out, self.epoch, self.best_epoch, self.device)
+
+
+class _Both(torch.nn.Module):
+    """A learner and its best weights so far, as one thing to be saved."""
+
+    def __init__(self, learner: torch.nn.Module, kept: dict[str, torch.Tensor]) -> None:
+        super().__init__()
+        self.learner = learner
+        for index, value in enumerate(kept.values()):
+            self.register_buffer(f"kept{index}", value)
+
+
+def job_seed(seed: int, epoch: int) -> int:
+    """Return the seed of the order of an epoch."""
+    return seed * 1_000_003 + epoch
+
+
+def publish(
+    job: Job,
+    model: Any,
+    config: Any,
+    data: Resident,
+    out: Path,
+    epochs: int,
+    best_epoch: int | None,
+    device: torch.device,
+) -> dict[str, Any]:
+    """Write a network in half precision, load it again, probe and evaluate it; return what was found."""
+    options = {"classes": len(data.classes), "decoder": config.decoder}
+
+    def write(evaluation: Any) -> None:
+        info = checkpoint_info(config, data.classes, epochs_done=epochs, best_epoch=best_epoch, evaluation=evaluation)
+        info["data"] = data.summary()
+        card = model_card(config, info)
+        save_checkpoint(
+            out / BEST, model, architecture=job.model, options=options, info=info, card=card, dtype="float16"
+        )
+
+    write(None)
+    load_weights(model, out / BEST / WEIGHTS, what=job.model)
+    if job.objective != "supervised":
+        fit_probe(
+            model,
+            data.train.batches(),
+            classes=len(data.classes),
+            epochs=config.probe_epochs,
+            seed=job.seed,
+            device=device,
+        )
+        write(None)
+        load_weights(model, out / BEST / WEIGHTS, what=job.model)
+    found = evaluate(model, data.test.batches(), device=device)
+    write(found)
+    return {
+        "job": dataclasses.asdict(job),
+        "name": job.name,
+        "epochs": epochs,
+        "best_epoch": best_epoch,
+        "evaluation": dataclasses.asdict(found),
+        "data": data.summary(),
+    }
+
+
+def evaluate_untrained(job: Job, data: Resident, out: Path, device: torch.device) -> dict[str, Any]:
+    """Probe and evaluate a network as it was drawn."""
+    config = dataclasses.replace(Job(job.model, "simclr", seed=job.seed).config(1), precision="float32")
+    model = load_model(job.model, seed=job.seed, classes=len(data.classes)).to(device)
+    fit_probe(
+        model, data.train.batches(), classes=len(data.classes), epochs=config.probe_epochs, seed=job.seed, device=device
+    )
+    found = evaluate(model, data.test.batches(), device=device)
+    result = {
+        "job": dataclasses.asdict(job),
+        "name": job.name,
+        "epochs": 0,
+        "evaluation": dataclasses.asdict(found),
+        "data": data.summary(),
+    }
+    write_json(out / RESULT, result)
+    return result
+
+
+def run_job(
+    job: Job,
+    data: Resident,
+    device: torch.device,
+    out: Path,
+    *,
+    exclusive: Any,
+    shared: Any,
+    long: Any,
+    budget: float,
+    deadline: float,
+    precision: str = "bf16",
+) -> str:
+    """Train a job to its end, or until the deadline; return ``finished``, ``stopped``, ``diverged`` or ``untrained``.
+
+    Args:
+        job, data, device: What, on what, where.
+        out: The job's folder; a state in it is gone on with.
+        exclusive, shared, long: Context managers: recording a graph is alone on the device; launches pause for it,
+            long work does not.
+        budget: Seconds that the training may take; sets the number of epochs after the first one.
+        deadline: time.monotonic() at which it stops.
+        precision: ``bf16`` or ``float32``.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    if (out / RESULT).is_file():
+        return "finished"
+    if job.objective == "untrained":
+        with long():
+            evaluate_untrained(job, data, out, device)
+        return "finished"
+    state = read_plain(out / STATE)
+    epochs = int(state["epochs"]) if state else job.epochs
+    precision = str(state["precision"]) if state else precision
+    if state and state["data"] != data.hash:
+        _log.warning("%s: the state belongs to other data; starting anew", job.name)
+        state = None
+    with exclusive():
+        started = time.monotonic()
+        trainer = Trainer(job, data, device, epochs, precision)
+        try:
+            trainer.prepare()
+        except RuntimeError:
+            if device.type != "cuda":
+                raise
+            _log.exception("%s: its steps cannot be recorded and are launched one by one", job.name)
+            torch.cuda.synchronize(device)
+            trainer = Trainer(job, data, device, epochs, precision)
+            trainer.prepare(graphs=False)
+        if state:
+            trainer.load(out / STATE)
+        prepared = time.monotonic() - started
+    log = (out / LOG).open("a", encoding="utf-8")
+
+    def note(**values: Any) -> None:
+        log.write(json.dumps({"job": job.name, "epoch": trainer.epoch, **values}) + "\n")
+        log.flush()
+
+    note(kind="start", prepared=prepared, steps=trainer.steps, epochs=trainer.config.epochs, precision=precision)
+    while trainer.epoch < trainer.config.epochs:
+        began = time.monotonic()
+        loss = trainer.train_epoch(shared)
+        took = time.monotonic() - began
+        if not math.isfinite(loss):
+            note(kind="diverged", loss=None)
+            break
+        if trainer.epoch == 1 and not state:
+            # Fixed once, so that the schedule is that of a run of so many epochs.
+            left = min(budget - took, deadline - time.monotonic() - 15)
+            epochs = max(2, min(job.epochs, 1 + int(left / max(took, 1e-9))))
+            if epochs < trainer.config.epochs:
+                trainer.config = dataclasses.replace(
+                    trainer.config, epochs=epochs, warmup_epochs=job.config(epochs).warmup_epochs
+                )
+        line: dict[str, Any] = {"kind": "epoch", "loss": loss, "seconds": took}
+        if trainer.epoch % max(1, trainer.config.epochs // 20) == 0 or trainer.epoch == trainer.config.epochs:
+            line["validation"] = trainer.validate(shared)
+        note(**line, epochs=trainer.config.epochs)
+        if time.monotonic() > deadline and trainer.epoch < trainer.config.epochs:
+            with exclusive():
+                trainer.save(out / STATE)
+            note(kind="stopped")
+            return "stopped"
+    status = "finished" if trainer.epoch == trainer.config.epochs else "diverged"
+    with long():
+        result = trainer.finish(out)
+    result |= {
+        "status": status,
+        "training_seconds": trainer.seconds,
+        "sweeps_per_second": trainer.steps * trainer.order.shape[1] * trainer.epoch / max(trainer.seconds, 1e-9),
+        "best": trainer.best,
+        "precision": precision,
+    }
+    write_json(out / RESULT, result)
+    note(kind="finished", top1=result["evaluation"]["top1"])
+    (out / STATE).unlink(missing_ok=True)
+    return status
+
+
+def read_plain(path: Path) -> dict[str, Any] | None:
+    """Return the plain values of a saved state, None if there is none."""
+    if not path.is_file():
+        return None
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        return json.loads(file.metadata()["state"])["plain"]
