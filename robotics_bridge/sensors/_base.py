@@ -124,6 +124,8 @@ class Runtime(abc.ABC):
     """Serves the sensors of one group. Updates launch kernels and do nothing else, so that they can be recorded."""
 
     places: Mapping[str, Place]
+    recordable: bool = True
+    """Whether its updates can become part of a CUDA graph."""
 
     @abc.abstractmethod
     def update(self, state: HandState, dt: float) -> None:

@@ -118,7 +118,8 @@ class SensorSuite:
             wp.capture_launch(self._graph[0])
         else:
             # The first update of a state compiles and allocates; the next ones replay what it does.
-            known = self._status is state.status and self._updates > 0 and self._graph is None
+            known = self._status is state.status and self._graph is None
+            known = known and all(runtime.recordable for runtime in self.runtimes)
             if known:
                 with wp.ScopedDevice(self.device), wp.ScopedCapture() as capture:
                     self._launch(state, dt)

@@ -1,0 +1,153 @@
+"""Surface points in blocks of neighbours, and the proximity taxel that sums over them (thesis 4.11–4.16)."""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from robotics_bridge.sensors._io_kernels import CLEAN, io_functions, io_structs
+from robotics_bridge.sensors._noise_kernels import noise_functions
+from robotics_bridge.sensors._pair_kernels import pair_structs
+
+BLOCK = 32
+"""Points of a block."""
+
+
+@cache
+def cloud_structs() -> SimpleNamespace:
+    """Return the structure ``Cloud``: points, a bounding sphere per block, and the blocks of a geometry per row."""
+    import warp as wp
+
+    @wp.struct
+    class Cloud:
+        point: wp.array(dtype=wp.vec3f)
+        sphere: wp.array(dtype=wp.vec4f)
+        first: wp.array2d(dtype=wp.int32)
+        blocks: wp.array2d(dtype=wp.int32)
+
+    @wp.struct
+    class ProximityParams:
+        stiffness: wp.float32
+        coupling: wp.float32
+
+    return SimpleNamespace(Cloud=Cloud, ProximityParams=ProximityParams)
+
+
+@cache
+def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
+    """Return the kernel of ProximityTaxel. Dim [B, N]."""
+    import warp as wp
+
+    io = io_functions(mode, hysteresis, walk)
+    emit, lost, idle = io.emit, io.lost, io.idle
+    types, pairs_type, structs = io_structs(), pair_structs().Pairs, cloud_structs()
+    probes_type, io_type = types.ProbeSet, types.Io
+    cloud_type, law_type = structs.Cloud, structs.ProximityParams
+    noise = noise_functions()
+    params_type, radius_noise, gain = noise.NoiseParams, noise.radius_noise, noise.gain
+
+    @wp.func
+    def wrench(
+        law: law_type, density: float, x: wp.vec3f, normal: wp.vec3f, mass: float, moment: wp.vec3f, slip: wp.vec3f
+    ) -> wp.spatial_vectorf:
+        """Force and torque of the summed overlaps: ``mass`` ΣP, ``moment`` ΣP (p − x), ``slip`` ΣP v."""
+        push = law.stiffness * density * mass
+        drag = law.coupling * density * (slip - wp.dot(slip, normal) * normal)
+        turn = law.stiffness * density * wp.cross(moment, normal)
+        f = push * normal + drag
+        if wp.static(physical):
+            f = drag - push * normal
+            turn = wp.cross(x, f) - turn
+        return wp.spatial_vectorf(f[0], f[1], f[2], turn[0], turn[1], turn[2])
+
+    @wp.kernel(module="unique")
+    def proximity(
+        probes: probes_type,
+        pairs: pairs_type,
+        cloud: cloud_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        laws: wp.array(dtype=law_type),
+        densities: wp.array2d(dtype=wp.float32),
+        links: wp.array(dtype=wp.int32),
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+    ):
+        env, n = wp.tid()
+        radius = probes.radius[n]
+        if radius <= 0.0:
+            idle(io, 6, env, n)
+            return
+        if (io.status[env] & 1) != 0:
+            lost(io, 6, env, n)
+            return
+        row = env % cloud.first.shape[0]
+        slot = probes.slot[n]
+        part = probes.part[n]
+        probe = probes.probe[n]
+        x = probes.position[n]
+        age = io.age[env]
+        episode = io.episode[env]
+        noisy = radius
+        if wp.static(mode != CLEAN):
+            noisy = wp.max(radius + radius_noise(knobs[part], env + io.env_offset, probe, age, episode), 0.0)
+        reach = wp.max(radius, noisy)
+        own = wp.vec3f(0.0)
+        mass = wp.vec2f(0.0)
+        moment = wp.vec3f(0.0)
+        moment_noisy = wp.vec3f(0.0)
+        slip = wp.vec3f(0.0)
+        slip_noisy = wp.vec3f(0.0)
+        for k in range(pairs.count[env, slot]):
+            at = pairs.first[slot] + k
+            geometry = pairs.geometry[env, at]
+            rotation = pairs.rotation[env, at]
+            here = rotation @ x + pairs.offset[env, at]
+            own_mass = wp.vec2f(0.0)
+            lever = wp.vec3f(0.0)
+            lever_noisy = wp.vec3f(0.0)
+            first = cloud.first[row, geometry]
+            for block in range(cloud.blocks[row, geometry]):
+                sphere = cloud.sphere[first + block]
+                gap = here - wp.vec3f(sphere[0], sphere[1], sphere[2])
+                limit = reach + sphere[3]
+                if wp.dot(gap, gap) < limit * limit:
+                    for i in range(wp.static(BLOCK)):
+                        away = cloud.point[(first + block) * wp.static(BLOCK) + i] - here
+                        square = wp.dot(away, away)
+                        # A comparison with NaN, which fills the last block, is false.
+                        if square < reach * reach:
+                            far = wp.sqrt(square)
+                            overlap = wp.max(radius - far, 0.0)
+                            own_mass[0] = own_mass[0] + overlap
+                            lever += overlap * away
+                            if wp.static(mode != CLEAN):
+                                overlap = wp.max(noisy - far, 0.0)
+                                own_mass[1] = own_mass[1] + overlap
+                                lever_noisy += overlap * away
+            if own_mass[0] > 0.0 or own_mass[1] > 0.0:
+                link = links[part]
+                twist = velocity[env, link]
+                turn = wp.transform_get_rotation(pose[env, link])
+                own = wp.quat_rotate_inv(turn, wp.vec3f(twist[3], twist[4], twist[5]))
+                # Points turn with their own link, not with the difference of both.
+                spin = pairs.spin[env, at] + own
+                speed = pairs.velocity[env, at] + wp.cross(pairs.spin[env, at], x)
+                lever = wp.transpose(rotation) @ lever
+                mass += own_mass
+                moment += lever
+                slip += own_mass[0] * speed + wp.cross(spin, lever)
+                if wp.static(mode != CLEAN):
+                    lever_noisy = wp.transpose(rotation) @ lever_noisy
+                    moment_noisy += lever_noisy
+                    slip_noisy += own_mass[1] * speed + wp.cross(spin, lever_noisy)
+        density = densities[part, row]
+        normal = probes.normal[n]
+        truth = wrench(laws[part], density, x, normal, mass[0], moment, slip)
+        signal = truth
+        if wp.static(mode != CLEAN):
+            scale = gain(knobs[part], env + io.env_offset, probe, episode)
+            signal = scale * wrench(laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
+        for channel in range(6):
+            emit(io, knobs[part], env, n, probe, channel, age, episode, truth[channel], signal[channel])
+
+    return proximity

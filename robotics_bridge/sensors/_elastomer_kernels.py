@@ -1,0 +1,395 @@
+"""Kernels of the elastomer: indentation, spreading over the grid, anchors of slipping points, and the sum.
+
+Thesis 4.17–4.21, and the layer terms derived in docs/tactile.md. Vectors are in the frame of the sensor link.
+Letters: B environment, N marker, P surface point, S sensor of the group.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from robotics_bridge.sensors._cloud_kernels import BLOCK, cloud_structs
+from robotics_bridge.sensors._io_kernels import io_functions, io_structs
+from robotics_bridge.sensors._noise_kernels import noise_functions
+from robotics_bridge.sensors._pair_kernels import pair_structs
+from robotics_bridge.sensors._probe_kernels import deepest_function
+from robotics_bridge.sensors._query_kernels import FAR, distance_function, query_structs
+
+
+@cache
+def elastomer_structs() -> SimpleNamespace:
+    """Return the structure ``Gel``: material and grid of one sensor."""
+    import warp as wp
+
+    @wp.struct
+    class Gel:
+        dilate: wp.float32
+        shear: wp.float32
+        spread: wp.float32
+        """λ_d of 4.19 [1/m²]."""
+        smear: wp.float32
+        """λ_s of 4.20 [1/m²]."""
+        exponent: wp.float32
+        enter: wp.float32
+        leave: wp.float32
+        layered: wp.int32
+        poisson: wp.float32
+        softening: wp.float32
+        thickness: wp.float32
+        expansion: wp.float32
+        frame_x: wp.float32
+        frame_y: wp.float32
+        center: wp.vec3f
+        along: wp.vec3f
+        across: wp.vec3f
+        normal: wp.vec3f
+        start: wp.int32
+        rows: wp.int32
+        columns: wp.int32
+        step_x: wp.float32
+        step_y: wp.float32
+        link: wp.int32
+        slot: wp.int32
+        first_point: wp.int32
+        own_first: wp.int32
+        own_last: wp.int32
+
+    return SimpleNamespace(Gel=Gel)
+
+
+@cache
+def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int) -> Any:
+    """Return the kernel of the indentation h (4.18), and with ``planes`` 2 of the one with radius noise. Dim [B, N]."""
+    import warp as wp
+
+    deepest = deepest_function(kinds, raycast)
+    types, pairs_type, solids_type = io_structs(), pair_structs().Pairs, query_structs().Solids
+    probes_type, io_type = types.ProbeSet, types.Io
+    noise = noise_functions()
+    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
+
+    @wp.kernel(module="unique")
+    def indent(
+        probes: probes_type,
+        solids: solids_type,
+        pairs: pairs_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        stamp: wp.array2d(dtype=wp.int32),
+        height: wp.array3d(dtype=wp.float32),
+    ):
+        env, n = wp.tid()
+        part = probes.part[n]
+        h = float(0.0)
+        noisy = float(0.0)
+        if probes.radius[n] > 0.0 and pairs.count[env, probes.slot[n]] > 0:
+            best, _normal, _place = deepest(probes, solids, pairs, env, n, 0.0)
+            h = wp.max(-best, 0.0)
+            if wp.static(planes == 2):
+                error = radius_noise(knobs[part], env + io.env_offset, probes.probe[n], io.age[env], io.episode[env])
+                noisy = wp.max(error - best, 0.0)
+            if h > 0.0 or noisy > 0.0:
+                stamp[env, part] = io.age[env] * 1024 + io.episode[env]
+        height[0, env, n] = h
+        if wp.static(planes == 2):
+            height[1, env, n] = noisy
+
+    return indent
+
+
+@cache
+def spread_kernel(planes: int) -> Any:
+    """Return the kernel that spreads h along the columns of planar grids: 3 sums per plane. Dim [B, N].
+
+    With one-dimensional weights w(k) = exp(−λ (k·pitch)²): Σ h w, Σ h k·pitch·w and Σ h^α w.
+    """
+    import warp as wp
+
+    probes_type, io_type, gel_type = io_structs().ProbeSet, io_structs().Io, elastomer_structs().Gel
+
+    @wp.kernel(module="unique")
+    def spread(
+        probes: probes_type,
+        io: io_type,
+        gels: wp.array(dtype=gel_type),
+        weights: wp.array3d(dtype=wp.float32),
+        reach: wp.array2d(dtype=wp.int32),
+        stamp: wp.array2d(dtype=wp.int32),
+        height: wp.array3d(dtype=wp.float32),
+        out: wp.array3d(dtype=wp.float32),
+    ):
+        env, n = wp.tid()
+        part = probes.part[n]
+        if stamp[env, part] != io.age[env] * 1024 + io.episode[env]:
+            return
+        gel = gels[part]
+        place = probes.probe[n] % gel.columns
+        row = n - place
+        for plane in range(wp.static(planes)):
+            plain = float(0.0)
+            tilted = float(0.0)
+            raised = float(0.0)
+            low = wp.max(place - reach[part, 0], 0)
+            high = wp.min(place + reach[part, 0] + 1, gel.columns)
+            for source in range(low, high):
+                h = height[plane, env, row + source]
+                if h > 0.0:
+                    away = place - source
+                    w = weights[part, 0, wp.abs(away)]
+                    plain += h * w
+                    tilted += h * w * float(away) * gel.step_x
+                    raised += wp.pow(h, gel.exponent) * w
+            out[3 * plane, env, n] = plain
+            out[3 * plane + 1, env, n] = tilted
+            out[3 * plane + 2, env, n] = raised
+
+    return spread
+
+
+@cache
+def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
+    """Return the kernel that follows surface points inside the elastomer (before 4.20). Dim [B, S].
+
+    A point sets its anchor where it sinks below −enter and loses it above +leave, or when its geometry no longer
+    touches. Points with an anchor are listed without gaps, in a fixed order: place (3), way since the anchor (3),
+    depth. Anchors are [P, 3, B] (x NaN: none), the list is [P, 7, B]: threads are environments.
+    """
+    import warp as wp
+
+    structs, pairs_type, solids_type = cloud_structs(), pair_structs().Pairs, query_structs().Solids
+    io_type, gel_type, cloud_type = io_structs().Io, elastomer_structs().Gel, structs.Cloud
+    distance = distance_function(kinds, raycast)
+
+    @wp.kernel(module="unique")
+    def anchors(
+        gels: wp.array(dtype=gel_type),
+        own: wp.array(dtype=wp.int32),
+        tracked: wp.array(dtype=wp.int32),
+        solids: solids_type,
+        pairs: pairs_type,
+        cloud: cloud_type,
+        io: io_type,
+        anchor: wp.array3d(dtype=wp.float32),
+        live: wp.array2d(dtype=wp.int32),
+        listed: wp.array3d(dtype=wp.float32),
+    ):
+        env, part = wp.tid()
+        gel = gels[part]
+        count = pairs.count[env, gel.slot]
+        fresh = io.age[env] == 0
+        if (io.status[env] & 1) != 0:
+            live[part, env] = 0
+            return
+        if fresh:
+            live[part, env] = 0
+        if count == 0 and live[part, env] == 0:
+            return
+        row = env % cloud.first.shape[0]
+        solid_row = env % solids.kind.shape[0]
+        # After a lull (none alive) every stored anchor is stale.
+        stale = live[part, env] == 0
+        found = int(0)
+        place = int(gel.first_point)
+        for member in range(tracked.shape[0]):
+            geometry = tracked[member]
+            at = int(-1)
+            for k in range(count):
+                if pairs.geometry[env, pairs.first[gel.slot] + k] == geometry:
+                    at = pairs.first[gel.slot] + k
+            first = cloud.first[row, geometry]
+            blocks = cloud.blocks[row, geometry]
+            for block in range(blocks):
+                near = at >= 0
+                for i in range(wp.static(BLOCK)):
+                    index = place + block * wp.static(BLOCK) + i
+                    kept = anchor[index, 0, env]
+                    if stale:
+                        kept = wp.static(float("nan"))
+                    if near:
+                        p = cloud.point[(first + block) * wp.static(BLOCK) + i]
+                        if not wp.isnan(p[0]):
+                            rotation = pairs.rotation[env, at]
+                            z = wp.transpose(rotation) @ (p - pairs.offset[env, at])
+                            phi = float(wp.static(FAR))
+                            if gel.own_last > gel.own_first:
+                                for o in range(gel.own_first, gel.own_last):
+                                    g = own[o]
+                                    frame = solids.frame[solid_row, g]
+                                    local = wp.transform_point(wp.transform_inverse(frame), z)
+                                    limit = 2.0 * solids.bound[solid_row, g][3]
+                                    phi = wp.min(phi, distance(solids, solid_row, g, local, limit)[3])
+                            else:
+                                phi = wp.dot(z - gel.center, gel.normal)
+                            if wp.isnan(kept):
+                                if phi < -gel.enter:
+                                    kept = z[0]
+                                    anchor[index, 0, env] = z[0]
+                                    anchor[index, 1, env] = z[1]
+                                    anchor[index, 2, env] = z[2]
+                                elif stale:
+                                    anchor[index, 0, env] = kept
+                            elif phi > gel.leave:
+                                kept = wp.static(float("nan"))
+                                anchor[index, 0, env] = kept
+                            if not wp.isnan(kept):
+                                spot = gel.first_point + found
+                                listed[spot, 0, env] = z[0]
+                                listed[spot, 1, env] = z[1]
+                                listed[spot, 2, env] = z[2]
+                                listed[spot, 3, env] = z[0] - anchor[index, 0, env]
+                                listed[spot, 4, env] = z[1] - anchor[index, 1, env]
+                                listed[spot, 5, env] = z[2] - anchor[index, 2, env]
+                                listed[spot, 6, env] = wp.max(-phi, 0.0)
+                                found += 1
+                        elif stale:
+                            anchor[index, 0, env] = kept
+                    else:
+                        anchor[index, 0, env] = wp.static(float("nan"))
+            place += blocks * wp.static(BLOCK)
+        live[part, env] = found
+
+    return anchors
+
+
+@cache
+def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: bool, walk: bool) -> Any:
+    """Return the kernel that sums dilation and shear at every marker (4.19–4.21). Dim [B, N].
+
+    Args:
+        way: 0 sums sources directly; 1: h was spread along the columns of planar grids; 2: h was convolved in full.
+        layered: some sensor uses the layer terms.
+        planes: 2 when the measured branch has its own h.
+        mode: of the noise.
+        hysteresis: whether the group stores hysteresis.
+        walk: whether the group stores a drift.
+    """
+    import warp as wp
+
+    io = io_functions(mode, hysteresis, walk)
+    emit, lost, idle = io.emit, io.lost, io.idle
+    types, gel_type = io_structs(), elastomer_structs().Gel
+    probes_type, io_type = types.ProbeSet, types.Io
+    noise = noise_functions()
+    params_type, gain = noise.NoiseParams, noise.gain
+
+    @wp.func
+    def across_plane(v: wp.vec3f, n: wp.vec3f) -> wp.vec3f:
+        return v - wp.dot(v, n) * n
+
+    @wp.func
+    def traction(gel: gel_type, away: wp.vec3f, slip: wp.vec3f) -> wp.vec3f:
+        """Cerruti's surface displacement, softened over the contact, minus its image below the bonded base."""
+        square = wp.dot(away, away) + gel.softening * gel.softening
+        inverse = 1.0 / wp.sqrt(square)
+        u = inverse * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * inverse * inverse) * away)
+        if gel.thickness > 0.0:
+            deep = 1.0 / wp.sqrt(square + 4.0 * gel.thickness * gel.thickness)
+            u -= deep * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * deep * deep) * away)
+        return u
+
+    @wp.kernel(module="unique")
+    def markers(
+        probes: probes_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        gels: wp.array(dtype=gel_type),
+        weights: wp.array3d(dtype=wp.float32),
+        reach: wp.array2d(dtype=wp.int32),
+        stamp: wp.array2d(dtype=wp.int32),
+        height: wp.array3d(dtype=wp.float32),
+        spread: wp.array3d(dtype=wp.float32),
+        live: wp.array2d(dtype=wp.int32),
+        listed: wp.array3d(dtype=wp.float32),
+    ):
+        env, n = wp.tid()
+        if probes.radius[n] <= 0.0:
+            idle(io, 3, env, n)
+            return
+        if (io.status[env] & 1) != 0:
+            lost(io, 3, env, n)
+            return
+        part = probes.part[n]
+        probe = probes.probe[n]
+        gel = gels[part]
+        x = probes.position[n]
+        normal = probes.normal[n]
+        truth = wp.vec3f(0.0)
+        signal = wp.vec3f(0.0)
+        if stamp[env, part] == io.age[env] * 1024 + io.episode[env]:
+            for plane in range(wp.static(planes)):
+                u = wp.vec3f(0.0)
+                total = float(0.0)
+                if wp.static(way == 2):
+                    u = gel.dilate * (
+                        spread[3 * plane, env, n] * gel.along
+                        + spread[3 * plane + 1, env, n] * gel.across
+                        + spread[3 * plane + 2, env, n] * normal
+                    )
+                elif wp.static(way == 1):
+                    place = probe // gel.columns
+                    along = float(0.0)
+                    across = float(0.0)
+                    raised = float(0.0)
+                    low = wp.max(place - reach[part, 1], 0)
+                    high = wp.min(place + reach[part, 1] + 1, gel.rows)
+                    for source in range(low, high):
+                        at = n + (source - place) * gel.columns
+                        w = weights[part, 1, wp.abs(place - source)]
+                        along += w * spread[3 * plane + 1, env, at]
+                        across += w * float(place - source) * gel.step_y * spread[3 * plane, env, at]
+                        raised += w * spread[3 * plane + 2, env, at]
+                    u = gel.dilate * (along * gel.along + across * gel.across + raised * normal)
+                else:
+                    for source in range(gel.rows * gel.columns):
+                        h = height[plane, env, gel.start + source]
+                        if h > 0.0:
+                            away = across_plane(x - probes.position[gel.start + source], normal)
+                            w = wp.exp(-gel.spread * wp.dot(away, away))
+                            u += gel.dilate * w * (h * away + wp.pow(h, gel.exponent) * normal)
+                if wp.static(layered):
+                    if gel.expansion != 0.0:
+                        for source in range(gel.rows * gel.columns):
+                            total += height[plane, env, gel.start + source]
+                        local = x - gel.center
+                        bx = wp.dot(local, gel.along)
+                        by = wp.dot(local, gel.across)
+                        scale = gel.expansion * total / float(gel.rows * gel.columns)
+                        ux = bx
+                        uy = by
+                        if gel.frame_x > 0.0:
+                            # Displacement of a layer whose edges are clamped: the first mode that vanishes there.
+                            ux = gel.frame_x / wp.pi * wp.sin(wp.pi * wp.clamp(bx / gel.frame_x, -1.0, 1.0))
+                            uy = gel.frame_y / wp.pi * wp.sin(wp.pi * wp.clamp(by / gel.frame_y, -1.0, 1.0))
+                        u += scale * (ux * gel.along + uy * gel.across)
+                if plane == 0:
+                    truth = u
+                else:
+                    signal = u
+        slide = wp.vec3f(0.0)
+        for k in range(live[part, env]):
+            at = gel.first_point + k
+            h = listed[at, 6, env]
+            if h > 0.0:
+                z = wp.vec3f(listed[at, 0, env], listed[at, 1, env], listed[at, 2, env])
+                slip = across_plane(wp.vec3f(listed[at, 3, env], listed[at, 4, env], listed[at, 5, env]), normal)
+                away = across_plane(x - z, normal)
+                if wp.static(layered):
+                    if gel.layered == 1:
+                        slide += gel.shear * h * traction(gel, away, slip)
+                    else:
+                        slide += gel.shear * h * wp.exp(-gel.smear * wp.dot(away, away)) * slip
+                else:
+                    slide += gel.shear * h * wp.exp(-gel.smear * wp.dot(away, away)) * slip
+        if wp.static(planes == 1):
+            signal = truth
+        truth += slide
+        age = io.age[env]
+        episode = io.episode[env]
+        scale = float(1.0)
+        if wp.static(mode > 0):
+            scale = gain(knobs[part], env + io.env_offset, probe, episode)
+        signal = scale * (signal + slide)
+        for channel in range(3):
+            emit(io, knobs[part], env, n, probe, channel, age, episode, truth[channel], signal[channel])
+
+    return markers

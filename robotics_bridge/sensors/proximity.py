@@ -1,0 +1,97 @@
+"""ProximityTaxel: signal of the object surface near a taxel, before and in contact (thesis 4.11–4.16)."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Self
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from robotics_bridge._device import warp
+from robotics_bridge.sensors._base import Convention, ProbeRuntime, ProbeSensor
+from robotics_bridge.sensors._clouds import sample_cloud
+from robotics_bridge.sensors.kinematic import check_convention
+from robotics_bridge.sensors.noise import TAXEL_KNOBS
+
+if TYPE_CHECKING:
+    from robotics_bridge.physics.state import HandState
+    from robotics_bridge.sensors._base import Context
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProximityTaxel(ProbeSensor):
+    """Force (N) and torque (N·m) [N, 6] from surface points within the sensing radius, in the link frame.
+
+    Every tracked point p within R of the taxel adds its overlap P = R − |p − q|, scaled by density / point count:
+    a force k P along the normal a, and k_s P times the point's velocity across a.
+
+    ``thesis`` pulls along +a and takes the torque about the taxel (published); ``physical`` pushes the sensor along
+    −a and takes it about the link's origin, so that taxels add up to a wrench. Defaults: published parameters.
+    """
+
+    stiffness: float = 300.0
+    """k, N/m."""
+    coupling: float = 10.0
+    """k_s, N·s/m²."""
+    density: float = 100.0
+    """Scale of the point density (4.14)."""
+    points: int = 5000
+    """Surface points spread over all tracked geometries (the published configuration file has 1000)."""
+    convention: Convention = "physical"
+
+    channels: ClassVar[int] = 6
+    units: ClassVar[str] = "N, N m"
+    knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_convention(self.convention)
+        if self.points < 1:
+            raise UsageError(f"A proximity taxel needs at least one surface point; received {self.points}.")
+
+    def group(self) -> Hashable:
+        """Sensors of one class and equal group share one runtime and its kernels."""
+        return (self.convention, self.points, self.track, self.link if not self.track else "")
+
+    @classmethod
+    def build(cls, sensors: Mapping[str, Self], context: Context) -> ProximityRuntime:
+        """Return the runtime that serves these sensors together."""
+        return ProximityRuntime(sensors, context)
+
+
+class ProximityRuntime(ProbeRuntime):
+    """Serves proximity taxels that track the same geometries."""
+
+    def __init__(self, sensors: Mapping[str, ProximityTaxel], context: Context) -> None:
+        from robotics_bridge.sensors._cloud_kernels import cloud_structs
+
+        noise = max(sensor.noise.radius for sensor in sensors.values())
+        super().__init__(sensors, 6, context, reach=noise)
+        wp, device = warp(), context.device
+        first = next(iter(sensors.values()))
+        self._physical = first.convention == "physical"
+        tracked, rows = first.tracked(context.scene), context.solids.rows
+        self.cloud = sample_cloud(context.scene, tracked, first.points, rows, device)
+        kind = cloud_structs().ProximityParams
+        laws, densities = [], np.zeros((len(sensors), rows), np.float32)
+        for row, sensor in zip(densities, sensors.values(), strict=True):
+            law = kind()
+            law.stiffness, law.coupling = sensor.stiffness, sensor.coupling
+            laws.append(law)
+            row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
+        self._laws = wp.array(laws, dtype=kind, device=device)
+        self._densities = wp.array(densities, dtype=wp.float32, device=device)
+        links = [context.scene.link_index(sensor.link) for sensor in sensors.values()]
+        self._links = wp.array(np.array(links, np.int32), dtype=wp.int32, device=device)
+
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state."""
+        from robotics_bridge.sensors._cloud_kernels import proximity_kernel
+
+        self.begin(state, dt)
+        kernel = proximity_kernel(self._physical, self.mode, *self.stores)
+        shared = [self.probes, self.context.pairs.struct, self.cloud.struct, self.io, self.knobs]
+        self.launch(kernel, *shared, self._laws, self._densities, self._links, state.pose, state.velocity)
+        self.finish(dt)
