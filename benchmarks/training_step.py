@@ -25,6 +25,7 @@ from results import table, write_section
 from brainbench.models.extract import evaluating
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
+from brainbench.models.training.captured import captured, fuse, make_capturable
 from brainbench.models.training.run import compiled
 
 STEPS = 22
@@ -93,6 +94,8 @@ def sweeps(batch: int, device: torch.device, steps: int = STEPS) -> torch.Tensor
 
 def training_step(module: Any, model: Any, x: torch.Tensor, labels: torch.Tensor, autocast: Any) -> Callable[[], None]:
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=x.is_cuda)
+    if x.is_cuda:
+        make_capturable(optimizer, torch.full((), 1e-4, device=x.device))
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
@@ -115,23 +118,19 @@ def train_part(options: argparse.Namespace, device: torch.device) -> str:
     rows, rates, ceilings = [], {}, {"float32": ceiling(device, torch.float32), "bf16": ceiling(device, torch.bfloat16)}
     for who in options.who.split(","):
         peer, precision, how = who.split(":")
-        model = load_model(options.model).to(device).train()
-        if device.type == "cuda" and peer == "ours":
-            model = model.to(memory_format=torch.channels_last)
-        module = compiled(Loop(model) if peer == "loop" else model, how)
-        autocast = half if precision == "bf16" else nullcontext
-        start = time.perf_counter()
-        step = training_step(module, model, x, labels, autocast)
-        step()
-        first = time.perf_counter() - start
-        seconds = clock(device, step, options.repeats, warm=1)
-        with evaluating(model), torch.no_grad(), autocast():
-            forward = clock(device, lambda module=module: module(x), options.repeats, warm=1)
+        try:
+            timed = time_one(options, device, peer, how, half if precision == "bf16" else nullcontext, x, labels)
+        except Exception as error:  # noqa: BLE001 - the others are still worth measuring
+            print(f"{who} failed: {type(error).__name__}: {error}", flush=True)
+            continue
+        first, seconds, forward, memory = timed
         rates[who] = options.batch / seconds
         share = 3 * operations * options.batch / seconds / ceilings[precision]
         share_forward = operations * options.batch / forward / ceilings[precision]
-        timed = [f"{first:.1f}", f"{seconds * 1e3:,.0f}", f"{rates[who]:,.1f}", f"{share:.0%}"]
-        rows.append([peer, precision, how, *timed, f"{options.batch / forward:,.1f}", f"{share_forward:.0%}"])
+        cells = [f"{first:.1f}", f"{seconds * 1e3:,.1f}", f"{rates[who]:,.1f}", f"{share:.0%}"]
+        rows.append(
+            [peer, precision, how, *cells, f"{options.batch / forward:,.1f}", f"{share_forward:.0%}", f"{memory:.1f}"]
+        )
         print(rows[-1], flush=True)
     head = [
         "who",
@@ -143,6 +142,7 @@ def train_part(options: argparse.Namespace, device: torch.device) -> str:
         "of ceiling",
         "forward sweeps/s",
         "of ceiling",
+        "memory GB",
     ]
     reference = rates.get("loop:float32:off")
     best = max(rates, key=lambda who: rates[who])
@@ -155,6 +155,48 @@ def train_part(options: argparse.Namespace, device: torch.device) -> str:
     text += f", {rates[best] / max(peers):.2f} × the best other loop" if peers else ""
     hours = 100 * 100_000 / rates[best] / 60
     return f"{text}. 100 epochs of 100,000 sweeps: {hours:,.0f} minutes."
+
+
+def time_one(
+    options: argparse.Namespace,
+    device: torch.device,
+    peer: str,
+    how: str,
+    autocast: Any,
+    x: torch.Tensor,
+    labels: torch.Tensor,
+) -> tuple[float, float, float, float]:
+    """Return seconds of the first step, of a step and of a forward pass, and the memory at most [GB]."""
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+    model = load_model(options.model).to(device).train()
+    recorded = how in ("captured", "graphs") and device.type == "cuda" and peer == "ours"
+    if device.type == "cuda" and peer == "ours":
+        model = model.to(memory_format=torch.channels_last)
+    fuse(model, how in ("fused", "graphs"))
+    module = Loop(model) if peer == "loop" else model
+    if how in ("parts", "default") or (how == "graphs" and peer == "loop"):
+        module = compiled(module, how)
+    start = time.perf_counter()
+    step = training_step(module, model, x, labels, autocast)
+    if recorded:
+        step = captured(step, device)
+    step()
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    first = time.perf_counter() - start
+    seconds = clock(device, step, options.repeats, warm=1)
+
+    def forward() -> None:
+        with autocast():
+            module(x)
+
+    with evaluating(model), torch.no_grad():
+        answer = captured(forward, device) if recorded else forward
+        spent = clock(device, answer, options.repeats, warm=1)
+    memory = torch.cuda.max_memory_allocated() / 1e9 if device.type == "cuda" else float("nan")
+    return first, seconds, spent, memory
 
 
 def bandwidth() -> float:
@@ -218,7 +260,8 @@ def main() -> None:
     parser.add_argument(
         "--who",
         default="loop:float32:off,loop:bf16:off,ours:float32:off,ours:bf16:off",
-        help="comma-separated PEER:PRECISION:COMPILED with loop|ours, float32|bf16, off|parts|default|graphs",
+        help="comma-separated PEER:PRECISION:COMPILED with loop|ours, float32|bf16, off|parts|default|graphs, for ours "
+        "also captured (recorded) and fused (cells compiled); graphs is both",
     )
     parser.add_argument("--write", action="store_true", help="write the section into RESULTS.md")
     options = parser.parse_args()

@@ -29,7 +29,7 @@ from brainbench.models.normaliser import Normaliser
 from brainbench.models.objectives import make_learner
 from brainbench.models.optimizers import make_optimizer, rate_factor
 from brainbench.models.registry import load_model
-from brainbench.models.training.captured import captured, copy_state, make_capturable, reset_optimizer
+from brainbench.models.training.captured import captured, copy_state, fuse, make_capturable, reset_optimizer
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.probe import fit_probe
 from brainbench.models.training.state import load_state, save_state
@@ -127,8 +127,9 @@ class Trainer:
         self.kept: dict[str, torch.Tensor] = {}
         self.seconds = 0.0
 
-    def prepare(self, *, graphs: bool = True) -> None:
+    def prepare(self, *, fused: bool = True, graphs: bool = True) -> None:
         """Warm up and capture the training step and the validation step; the network is as new afterwards."""
+        fuse(self.learner, fused and self.device.type == "cuda")
         start = {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
         self._set_epoch(0)
         self.learner.train()
@@ -269,6 +270,7 @@ class Trainer:
     def finish(self, out: Path) -> dict[str, Any]:
         """Evaluate the best network as it will be shipped; write it."""
         copy_state(self.learner, self.kept)
+        fuse(self.learner, False)
         if self.device.type == "cuda":
             self.model = self.model.to(memory_format=torch.contiguous_format)
         return publish(self.job, self.model, self.config, self.data, out, self.epoch, self.best_epoch, self.device)
@@ -393,16 +395,7 @@ def run_job(
         state = None
     with exclusive():
         started = time.monotonic()
-        trainer = Trainer(job, data, device, epochs, precision)
-        try:
-            trainer.prepare()
-        except RuntimeError:
-            if device.type != "cuda":
-                raise
-            _log.exception("%s: its steps cannot be recorded and are launched one by one", job.name)
-            torch.cuda.synchronize(device)
-            trainer = Trainer(job, data, device, epochs, precision)
-            trainer.prepare(graphs=False)
+        trainer = prepared_trainer(job, data, device, epochs, precision)
         if state:
             trainer.load(out / STATE)
         prepared = time.monotonic() - started
@@ -451,6 +444,22 @@ def run_job(
     note(kind="finished", top1=result["evaluation"]["top1"])
     (out / STATE).unlink(missing_ok=True)
     return status
+
+
+def prepared_trainer(job: Job, data: Resident, device: torch.device, epochs: int, precision: str) -> Trainer:
+    """Return a trainer, in the fastest way that works here."""
+    for fused, graphs in ((True, True), (False, True), (False, False)):
+        trainer = Trainer(job, data, device, epochs, precision)
+        try:
+            trainer.prepare(fused=fused, graphs=graphs)
+        except Exception:  # compilers and drivers fail in many ways
+            if not graphs or device.type != "cuda":
+                raise
+            _log.exception("%s: fused %s, recorded %s does not work here", job.name, fused, graphs)
+            torch.cuda.synchronize(device)
+        else:
+            return trainer
+    raise RuntimeError("unreachable")
 
 
 def read_plain(path: Path) -> dict[str, Any] | None:

@@ -145,10 +145,11 @@ class TimeDecay(Cell):
         return self.norm(state), state
 
 
-class _GatedCell(Cell):
+class GatedCell(Cell):
     """A cell with one fused convolution for all its gates."""
 
     gates: ClassVar[tuple[str, ...]] = ()
+    fused_parts: ClassVar[tuple[str, ...]] = ("settle",)
 
     def __init__(
         self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
@@ -165,14 +166,32 @@ class _GatedCell(Cell):
         """Return the input's share of the fused convolution, biases included, for inputs [N, C, H, W]."""
         return (self.conv.share(x, 0, use_bias=True),)
 
-    def _gates(self, x: torch.Tensor, memory: torch.Tensor, projected: Projected) -> list[torch.Tensor]:
-        """Return each gate's pre-activation [B, out, H, W] in the order of :attr:`gates`."""
-        return self._normalised(self._fused(self.conv, x, memory, projected[:1]), self.gates)
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y [B, out, H, W], state [B, state channels, H, W])."""
+        state = self._check(x, state)
+        return self.settle(self._fused(self.conv, x, state, projected[:1]), x, state)
+
+    def settle(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state) from the gates' pre-activations [B, gates × out, H, W]: all that follows the convolution.
+
+        It reads every number a few times and computes little, so one fused kernel does it best: :meth:`fuse`.
+        """
+        raise NotImplementedError
+
+    def fuse(self, on: bool = True) -> None:
+        """Let PyTorch's compiler make what follows the convolutions into kernels of its own, or leave it to PyTorch."""
+        for name in self.fused_parts:
+            self.__dict__.pop(name, None)
+            if on:
+                setattr(self, name, torch.compile(getattr(self, name), dynamic=False))
 
     def _fused(self, conv: Conv2d, x: torch.Tensor, memory: torch.Tensor, projected: Projected) -> torch.Tensor:
         if projected:
             return projected[0] + conv.share(memory, self.in_channels, use_bias=False)
-        return conv(torch.cat((x, memory), 1))
+        # In mixed precision the memory is single and the convolution half: what it reads is rounded here, once.
+        return conv(torch.cat((x, memory.to(x.dtype)), 1))
 
     def _normalised(self, fused: torch.Tensor, names: tuple[str, ...]) -> list[torch.Tensor]:
         parts = fused.chunk(len(names), 1)
@@ -181,24 +200,21 @@ class _GatedCell(Cell):
         return [self.norms[name](part) for name, part in zip(names, parts, strict=True)]
 
 
-class UGRNN(_GatedCell):
+class UGRNN(GatedCell):
     """Update-gate cell: g = σ(g' + 1), c = tanh(c'), s ← g s + (1 − g) c, y = s (Collins et al. 2017)."""
 
     gates = ("g", "c")
     tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv", "norms.g": "ln_g_act", "norms.c": "ln_c_act"}
 
-    def forward(
-        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (y, state), both [B, out, H, W]."""
-        state = self._check(x, state)
-        keep, candidate = self._gates(x, state, projected)
+    def settle(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
+        keep, candidate = self._normalised(fused, self.gates)
         keep = torch.sigmoid(keep + FORGET_BIAS)
         state = keep * state + (1 - keep) * torch.tanh(candidate)
         return state, state
 
 
-class IntersectionRNN(_GatedCell):
+class IntersectionRNN(GatedCell):
     """Cell gated through time and through depth (Collins et al. 2017).
 
     State: p = σ(p' + 1), s ← p s + (1 − p) tanh(m'). Output: q = σ(q' + 1), y = q x + (1 − q) relu(n').
@@ -217,19 +233,16 @@ class IntersectionRNN(_GatedCell):
             )
         super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
 
-    def forward(
-        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (y, state), both [B, out, H, W]."""
-        state = self._check(x, state)
-        keep, candidate, through, output = self._gates(x, state, projected)
+    def settle(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
+        keep, candidate, through, output = self._normalised(fused, self.gates)
         keep = torch.sigmoid(keep + FORGET_BIAS)
         through = torch.sigmoid(through + FORGET_BIAS)
         y = through * x + (1 - through) * torch.relu(output)
-        return y, keep * state + (1 - keep) * torch.tanh(candidate)
+        return y.to(x.dtype), keep * state + (1 - keep) * torch.tanh(candidate)
 
 
-class GRU(_GatedCell):
+class GRU(GatedCell):
     """Gated recurrent unit with two convolutions (Cho et al. 2014).
 
     r = σ(r' + 1), u = σ(u') from cat(x, s); c = tanh of a second convolution of cat(x, r s);
@@ -237,6 +250,7 @@ class GRU(_GatedCell):
     """
 
     gates = ("r", "u")
+    fused_parts = ("remember", "settle")
     tnn_names: ClassVar[Mapping[str, str]] = {
         "conv": "conv_ru",
         "candidate": "conv_c",
@@ -262,15 +276,22 @@ class GRU(_GatedCell):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, out, H, W]."""
         state = self._check(x, state)
-        reset, keep = self._gates(x, state, projected)
-        reset, keep = torch.sigmoid(reset + FORGET_BIAS), torch.sigmoid(keep)
-        fused = self._fused(self.candidate, x, reset * state, projected[1:])
+        remembered, keep = self.remember(self._fused(self.conv, x, state, projected[:1]), state)
+        return self.settle(self._fused(self.candidate, x, remembered, projected[1:]), keep, state)
+
+    def remember(self, fused: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (r s, u) from the gates' pre-activations."""
+        reset, keep = self._normalised(fused, self.gates)
+        return torch.sigmoid(reset + FORGET_BIAS) * state, torch.sigmoid(keep)
+
+    def settle(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state) from the candidate's pre-activation and, in place of x, the update gate u."""
         (candidate,) = self._normalised(fused, ("c",))
-        state = keep * state + (1 - keep) * torch.tanh(candidate)
+        state = x * state + (1 - x) * torch.tanh(candidate)
         return state, state
 
 
-class LSTM(_GatedCell):
+class LSTM(GatedCell):
     """Long short-term memory; the state is cat(c, h) [B, 2 out, H, W].
 
     c ← c σ(f' + 1) + σ(i') tanh(j'), normalised too with ``layer_norm``; h = tanh(c) σ(o'); y = h.
@@ -298,8 +319,14 @@ class LSTM(_GatedCell):
         self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y [B, out, H, W], state [B, 2 out, H, W])."""
-        memory, hidden = self._check(x, state).chunk(2, 1)
-        write, candidate, keep, read = self._gates(x, hidden, projected)
+        state = self._check(x, state)
+        return self.settle(self._fused(self.conv, x, state.chunk(2, 1)[1], projected[:1]), x, state)
+
+    def settle(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y [B, out, H, W], state [B, 2 out, H, W]) from the gates' pre-activations."""
+        del x
+        memory = state.chunk(2, 1)[0]
+        write, candidate, keep, read = self._normalised(fused, self.gates)
         memory = memory * torch.sigmoid(keep + FORGET_BIAS) + torch.sigmoid(write) * torch.tanh(candidate)
         (memory,) = self._normalised(memory, ("c",))
         hidden = torch.tanh(memory) * torch.sigmoid(read)

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import nn
 
+from brainbench.models.cells import GatedCell
+
 WARM_UP = 3
 """Runs before a capture: they choose algorithms, fill caches and allocate the optimiser's state."""
 
@@ -50,6 +52,18 @@ def captured(
     with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         work()
     return graph.replay
+
+
+def fuse(module: nn.Module, on: bool = True) -> None:
+    """Fuse what follows the convolutions of all gated cells in a module, or undo it."""
+    cells = [part for part in module.modules() if isinstance(part, GatedCell)]
+    if on and cells:
+        import torch._dynamo
+
+        # One version per width and batch of every cell, for training and for evaluation.
+        torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
+    for cell in cells:
+        cell.fuse(on)
 
 
 def make_capturable(optimizer: torch.optim.Optimizer, rate: torch.Tensor) -> None:
