@@ -176,8 +176,10 @@ def time_one(
         model = model.to(memory_format=torch.channels_last)
     fuse(model, how in ("fused", "graphs"))
     module = Loop(model) if peer == "loop" else model
-    if how in ("parts", "default") or (how == "graphs" and peer == "loop"):
+    if how in ("parts", "default"):
         module = compiled(module, how)
+    elif how == "graphs" and peer == "loop":
+        module = torch.compile(module, mode="reduce-overhead")
     start = time.perf_counter()
     step = training_step(module, model, x, labels, autocast)
     if recorded:

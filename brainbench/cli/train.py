@@ -39,7 +39,7 @@ def train(
     masking: Annotated[float | None, typer.Option(help="Share of masked time steps (published with 0.75).")] = None,
     precision: Annotated[str | None, typer.Option(help="bf16 (mixed) or float32.")] = None,
     compile: Annotated[
-        str | None, typer.Option(help="off, parts (of the network), default (the whole) or graphs (CUDA graphs too).")
+        str | None, typer.Option(help="off, parts (of the network), default (the whole) or graphs (whole steps as CUDA graphs).")
     ] = None,
     weights_dtype: Annotated[
         str | None, typer.Option(help="Precision of the model that is written: float32, float16 or bfloat16.")

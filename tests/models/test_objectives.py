@@ -29,6 +29,14 @@ def test_nt_xent_is_the_sum_over_pairs_of_its_definition():
     assert float(nt_xent(first, second)) == pytest.approx(total / 10, rel=1e-5)
 
 
+def test_mixed_precision_does_not_round_the_cosines_that_the_temperature_magnifies():
+    generator = torch.Generator().manual_seed(0)
+    first, second = torch.randn(2, 16, 8, generator=generator)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = nt_xent(first, second)
+    assert torch.equal(mixed, nt_xent(first, second))
+
+
 def test_equal_embeddings_of_all_cost_the_logarithm_of_the_choices():
     assert float(nt_xent(torch.ones(4, 8), torch.ones(4, 8))) == pytest.approx(math.log(7))
 

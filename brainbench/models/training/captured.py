@@ -7,6 +7,7 @@ takes longest. A captured step reads its inputs from tensors that stay in place.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -96,3 +97,75 @@ def copy_state(module: nn.Module, state: dict[str, torch.Tensor]) -> None:
     own = module.state_dict()
     for name, value in state.items():
         own[name].copy_(value)
+
+
+class Gradients:
+    """The loss of a batch, its clipped gradients in the parameters, and their norm.
+
+    Args:
+        forward: Maps (views, labels) to (loss, anything).
+        parameters: What is trained.
+        clip: Largest norm; 0 leaves it alone.
+        autocast: Makes the context of the forward pass.
+        record: Record the pass for the shape that comes first, and replay it whenever that shape comes again.
+        module: Whose buffers a pass changes, put back after the runs that precede a recording.
+    """
+
+    def __init__(
+        self,
+        forward: Callable[..., Any],
+        parameters: Sequence[nn.Parameter],
+        *,
+        clip: float,
+        autocast: Callable[[], Any],
+        record: bool = False,
+        module: nn.Module | None = None,
+    ) -> None:
+        self.forward, self.parameters, self.clip, self.autocast = forward, tuple(parameters), clip, autocast
+        self.record, self.module = record, module
+        self._inputs: tuple[torch.Tensor, ...] = ()
+        self._kept: list[torch.Tensor | None] = []
+
+    def __call__(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (loss, norm of the gradients before clipping), not yet waited for."""
+        given = (*views, labels)
+        if not self.record:
+            return self._compute(given)
+        if not self._inputs:
+            self._record(given)
+        if [item.shape for item in given] != [item.shape for item in self._inputs]:
+            return self._compute(given)
+        for mine, item in zip(self._inputs, given, strict=True):
+            mine.copy_(item)
+        self._replay()
+        # The recorded pass writes to these, whatever stood in the parameters meanwhile.
+        for parameter, gradient in zip(self.parameters, self._kept, strict=True):
+            parameter.grad = gradient
+        return self._found
+
+    def _compute(self, given: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+        for parameter in self.parameters:
+            parameter.grad = None
+        with self.autocast():
+            loss, _ = self.forward(given[:-1], given[-1])
+        loss.backward()
+        trained = [parameter for parameter in self.parameters if parameter.grad is not None]
+        return loss.detach(), torch.nn.utils.clip_grad_norm_(trained, self.clip or float("inf"))
+
+    def _record(self, given: tuple[torch.Tensor, ...]) -> None:
+        device = given[0].device
+        self._inputs = tuple(item.clone() for item in given)
+        buffers = {name: value.clone() for name, value in self.module.named_buffers()} if self.module else {}
+        random = torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()
+
+        def work() -> None:
+            self._found = self._compute(self._inputs)
+            self._kept = [parameter.grad for parameter in self.parameters]
+
+        self._replay = captured(work, device)
+        if device.type == "cuda":
+            torch.cuda.set_rng_state(random, device)
+        else:
+            torch.set_rng_state(random)
+        if self.module is not None:
+            copy_state(self.module, buffers)

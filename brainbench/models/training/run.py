@@ -35,6 +35,7 @@ from brainbench.models.objectives import make_learner
 from brainbench.models.optimizers import make_optimizer, rate_factor
 from brainbench.models.registry import load_model
 from brainbench.models.training.batches import Batches, Data
+from brainbench.models.training.captured import Gradients, fuse
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.logs import RunLog
@@ -124,7 +125,15 @@ class _Run:
         self.learner: Any = where.prepare(learner)
         self.model: torch.nn.Module = self.learner.model
         self.optimizer = make_optimizer(config.optimizer, self.learner.parameters(), config.learning_rate)
-        self.forward = self._compiled(where.wrap(self.learner))
+        forward = self._compiled(where.wrap(self.learner))
+        self.gradients = Gradients(
+            forward,
+            [parameter for parameter in self.learner.parameters() if parameter.requires_grad],
+            clip=config.clip,
+            autocast=self._precision,
+            record=config.compile == "graphs" and where.count == 1,
+            module=self.learner,
+        )
         self.augmentation = Augmentation(config.augmentation, config.masking)
         batches = self._batches("train", shuffle=True)
         if batches is None:
@@ -181,13 +190,8 @@ class _Run:
         )
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * factor
-        self.optimizer.zero_grad(set_to_none=True)
-        with self._precision():
-            loss, _ = self.forward(views, labels)
-        loss.backward()
-        trained = [parameter for parameter in self.learner.parameters() if parameter.grad is not None]
-        norm = float(torch.nn.utils.clip_grad_norm_(trained, config.clip or math.inf))
-        value = float(loss.detach())
+        found = self.gradients(views, labels)
+        value, norm = map(float, found)
         # Gradients are averaged over processes, so all of them see the same norm.
         if not math.isfinite(norm) or self.where.any(not math.isfinite(value)):
             return self._keep_failure(views, labels, value, norm)
@@ -389,7 +393,10 @@ def compiled(module: torch.nn.Module, how: str) -> Any:
             if isinstance(part, PARTS):
                 part.compile()
         return module
-    return torch.compile(module, mode="reduce-overhead" if how == "graphs" else "default")
+    if how == "graphs":
+        fuse(module)
+        return module
+    return torch.compile(module)
 
 
 def _generator(seed: int, step: int, view: int) -> torch.Generator:

@@ -220,7 +220,7 @@ def test_two_processes_train_as_one(tmp_path):
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["parts", "default"])
+@pytest.mark.parametrize("how", ["parts", "default", "graphs"])
 def test_a_compiled_run_learns_too(how, tmp_path):
     result = train(_config(epochs=4, compile=how, model="zhuang-small"), tiny(), out=tmp_path, device="cpu")
     assert result.status == "finished"
