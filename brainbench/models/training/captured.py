@@ -125,6 +125,7 @@ class Gradients:
         self.record, self.module = record, module
         self._inputs: tuple[torch.Tensor, ...] = ()
         self._kept: list[torch.Tensor | None] = []
+        self._found = (torch.empty(()), torch.empty(()))
 
     def __call__(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (loss, norm of the gradients before clipping), not yet waited for."""
