@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     import torch
     from numpy.typing import ArrayLike
 
+_DERIVED = ("dof_length",)
+"""Fields that the compiler derives for the thresholds of sleeping bodies; the first variant's serve all."""
 _MASSES = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "qpos0", "dof_armature")
 
 
@@ -194,7 +196,7 @@ def _put_model(engine: Any, model: Any, varied: Mapping[str, np.ndarray], num_en
     shapes = {name: getattr(field.type, "shape", ()) for name, field in fields.items()}
     usable = {name: value for name, value in varied.items() if shapes.get(name, ("",))[:1] == ("*",)}
     # What the compiler derived for collision trees on the host plays no part on the device.
-    fixed = sorted(name for name in varied if name not in usable and name in fields)
+    fixed = sorted(name for name in varied if name not in usable and name in fields and name not in _DERIVED)
     if fixed:
         raise UsageError(
             f"MuJoCo Warp keeps {', '.join(fixed)} equal in all environments; use MujocoEngine, or variants that "

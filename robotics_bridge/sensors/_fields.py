@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from brainbench.geometry import Mesh
 
 _log = logging.getLogger(__name__)
-_FORMAT = 2
+_FORMAT = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,8 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
 
     Args:
         mesh: its surface; where it has holes, inside is where its winding number exceeds one half.
-        resolution: cells along the longest edge of the bounding box; the grid extends four cells beyond the box.
+        resolution: cells along the longest edge of the bounding box; the grid extends a quarter of that edge beyond the
+            box on every side, further out distances are extrapolated.
         device: where it is computed.
 
     Raises:
@@ -49,7 +50,7 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
         raise UsageError(f"The resolution of a distance field lies between 4 and 512 cells; received {resolution}.")
     low, high = mesh.bounds
     spacing = float((high - low).max()) / resolution
-    counts = np.ceil((high - low) / spacing).astype(int) + 9
+    counts = np.ceil((high - low) / spacing).astype(int) + 1 + 2 * max(4, -(-resolution // 4))
     origin = (0.5 * (low + high) - 0.5 * spacing * (counts - 1)).astype(np.float32)
     path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npy"
     if path.is_file():

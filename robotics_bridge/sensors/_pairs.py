@@ -31,6 +31,8 @@ class PairTable:
         self._slots: list[dict[str, Any]] = []
         self.struct: Any = None
         """The Warp structure ``Pairs``; None before :meth:`freeze`."""
+        self.plan: Any = None
+        """The Warp structure ``Slots``; None before :meth:`freeze`."""
         self.crowded: Any = None
         """Warp array [B]: 1 where more geometries met a sensor than its list holds."""
 
@@ -94,7 +96,7 @@ class PairTable:
         centers = np.array([s["center"] for s in slots], np.float32).reshape(-1, 3)
         plan.center = wp.array(centers, dtype=wp.vec3f, device=device)
         plan.reach = wp.array(np.array([s["reach"] for s in slots], np.float32), dtype=wp.float32, device=device)
-        self._plan = plan
+        self.plan = plan
         shape = (self._num_envs, max(int(first[-1]), 1))
         found = pair_structs().Pairs()
         found.first = plan.first
@@ -113,8 +115,8 @@ class PairTable:
             return
         wp, solids = warp(), self._solids.struct
         if self.contacts_needed:
-            inputs = [self._plan, solids.link, state.contact_count, state.contact_geom, state.contact_env]
+            inputs = [self.plan, solids.link, state.contact_count, state.contact_geom, state.contact_env]
             inputs += [self._words, self._bits]
             wp.launch(touch_kernel().touch, dim=state.contact_env.shape[0], inputs=inputs, device=self._device)
-        inputs = [self._plan, solids, state.pose, state.velocity, self._words, self._bits, self.struct, self.crowded]
+        inputs = [self.plan, solids, state.pose, state.velocity, self._words, self._bits, self.struct, self.crowded]
         wp.launch(pair_kernel().pairs, dim=(self._num_envs, len(self._slots)), inputs=inputs, device=self._device)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
+
+import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
 from robotics_bridge._device import warp
@@ -47,6 +49,9 @@ class KinematicTaxel(QuerySensor):
     twist: float = 2.0
     """k_ω, N·m·s."""
     convention: Convention = "physical"
+    total: Literal["law", "engine"] = "law"
+    """``law``: each taxel by itself, as published. ``engine``: the field is scaled so that it pushes with just the
+    normal force that the physics engine resolved between the link and what it tracks."""
 
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
@@ -55,12 +60,14 @@ class KinematicTaxel(QuerySensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_convention(self.convention)
+        if self.total not in ("law", "engine"):
+            raise unknown_name("total of a force field", self.total, ("law", "engine"))
         if not self.exponent > 0:
             raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
 
     def group(self) -> Hashable:
         """Sensors of one class and equal group share one runtime and its kernels."""
-        return (self.query, self.convention)
+        return (self.query, self.convention, self.total)
 
     @classmethod
     def build(cls, sensors: Mapping[str, Self], context: Context) -> KinematicRuntime:
@@ -74,8 +81,9 @@ class KinematicRuntime(ProbeRuntime):
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: Context) -> None:
         from robotics_bridge.sensors._probe_kernels import kinematic_functions
 
-        super().__init__(sensors, 6, context)
         first = next(iter(sensors.values()))
+        scaled = first.total == "engine"
+        super().__init__(sensors, 6, context, fusable=not scaled)
         self._options = (first.query == "raycast", first.convention == "physical")
         kind = kinematic_functions(self._options[1]).KinematicParams
         laws = []
@@ -84,7 +92,13 @@ class KinematicRuntime(ProbeRuntime):
             for name in ("stiffness", "damping", "exponent", "shear", "twist"):
                 setattr(law, name, getattr(sensor, name))
             laws.append(law)
-        self._laws = warp().array(laws, dtype=kind, device=context.device)
+        wp = warp()
+        self._laws = wp.array(laws, dtype=kind, device=context.device)
+        self._loads = wp.zeros((len(laws), context.num_envs), dtype=wp.vec3f, device=context.device) if scaled else None
+        self._scales = wp.zeros((len(laws), context.num_envs), dtype=wp.float32, device=context.device)
+        slots = self.probes.slot.numpy()
+        spans = np.array([(p.start, p.start + p.count, slots[p.start]) for p in self.places.values()], np.int32)
+        self._spans = wp.array(spans, dtype=wp.vec3i, device=context.device)
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
@@ -94,4 +108,27 @@ class KinematicRuntime(ProbeRuntime):
         kernel = kinematic_kernel(self.kinds, *self._options, self.mode, *self.stores)
         c = self.context
         self.launch(kernel, self.probes, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._laws)
+        if self._loads is not None:
+            self._scale(state)
         self.finish(dt)
+
+    def _scale(self, state: HandState) -> None:
+        """Make the field push as the engine does."""
+        from robotics_bridge.sensors._load_kernels import load_kernels
+
+        wp, c, kernels = warp(), self.context, load_kernels()
+        dim, device = self._loads.shape, c.device
+        self._loads.zero_()
+        contacts = [
+            state.contact_count,
+            state.contact_geom,
+            state.contact_env,
+            state.contact_normal,
+            state.contact_force,
+        ]
+        inputs = [self._spans, c.pairs.plan, c.solids.struct.link, *contacts, self._loads]
+        wp.launch(kernels.gather, dim=state.contact_env.shape[0], inputs=inputs, device=device)
+        inputs = [self._spans, c.pairs.plan, state.pose, self._truth, self._loads, self._scales]
+        wp.launch(kernels.weigh, dim=dim, inputs=inputs, device=device)
+        inputs = [self.probes.part, self._scales, self._truth, self._measured, int(self.noisy)]
+        self.launch(kernels.scale, *inputs)

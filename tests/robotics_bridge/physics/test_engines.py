@@ -1,0 +1,155 @@
+"""Both engines fill the same state; poses, velocities and contacts are MuJoCo's own."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from brainbench.errors import UsageError
+from robotics_bridge.physics import HandState, MujocoEngine, MujocoWarpEngine, initial_velocities, pyramid
+
+TWO = """<mujoco><option timestep="0.005"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
+<body name="a" pos="0 0 .1"><freejoint/><geom name="a" type="box" size=".1 .1 .1"/></body>
+<body name="b" pos=".03 .01 .31"><freejoint/><geom name="b" type="sphere" size=".1"/></body></worldbody></mujoco>"""
+
+
+def test_state_holds_what_mujoco_computed() -> None:
+    model = mujoco.MjModel.from_xml_string(TWO)
+    engine = MujocoEngine(model, 3, threads=2)
+    engine.set(qvel=0.3 * np.random.default_rng(0).normal(size=(3, model.nv)))
+    engine.step(20)
+    engine.forward()
+    pose, velocity = engine.state.pose_torch.numpy(), engine.state.velocity_torch.numpy()
+    total = 0
+    for env, data in enumerate(engine.data):
+        for body in range(model.nbody):
+            np.testing.assert_allclose(pose[env, body, :3], data.xpos[body], atol=1e-6)
+            np.testing.assert_allclose(pose[env, body, 3:], data.xquat[body][[1, 2, 3, 0]], atol=1e-6)
+            twist = np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
+            np.testing.assert_allclose(velocity[env, body], [*twist[3:], *twist[:3]], atol=1e-5)
+        for c in range(data.ncon):
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(model, data, c, wrench)
+            assert engine.state.contact_force.numpy()[total] == pytest.approx(wrench[0], abs=1e-4)
+            assert engine.state.contact_geom.numpy()[total].tolist() == data.contact.geom[c].tolist()
+            assert engine.state.contact_env.numpy()[total] == env
+            total += 1
+    assert int(engine.state.contact_count.numpy()[0]) == total > 3
+
+
+def test_threads_do_not_change_the_outcome() -> None:
+    model = mujoco.MjModel.from_xml_string(TWO)
+    start = np.random.default_rng(1).normal(size=(5, model.nv))
+    states = []
+    for threads in (1, 3):
+        engine = MujocoEngine(model, 5, threads=threads)
+        engine.set(qvel=start)
+        engine.step(10)
+        states.append(engine.state.pose.numpy().copy())
+    np.testing.assert_array_equal(*states)
+
+
+def test_fields_vary_between_environments_and_reset_returns_to_the_start() -> None:
+    model = mujoco.MjModel.from_xml_string(TWO)
+    masses = np.tile(model.body_mass, (2, 1))
+    masses[1, 2] *= 10
+    engine = MujocoEngine(model, 2, fields={"body_mass": masses})
+    engine.step(400)
+    count = int(engine.state.contact_count.numpy()[0])
+    force, env = engine.state.contact_force.numpy()[:count], engine.state.contact_env.numpy()[:count]
+    assert force[env == 1].sum() > 1.5 * force[env == 0].sum()
+    engine.reset([1])
+    assert engine.state.time.numpy()[1] == 0
+    assert engine.state.time.numpy()[0] > 1
+    np.testing.assert_allclose(engine.qpos[1], model.qpos0)
+
+
+def test_unknown_fields_and_wrong_shapes_are_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(TWO)
+    with pytest.raises(UsageError, match="did you mean 'body_mass'"):
+        MujocoEngine(model, 2, fields={"body_mas": np.zeros((2, 3))})
+    with pytest.raises(UsageError, match=r"shape \(2, 3\); received \(3,\)"):
+        MujocoEngine(model, 2, fields={"body_mass": np.zeros(3)})
+    with pytest.raises(UsageError, match="at least one environment"):
+        MujocoEngine(model, 0)
+    with pytest.raises(UsageError, match="qvel has the shape"):
+        MujocoEngine(model, 2).set(qvel=np.zeros(5))
+
+
+def test_states_refuse_what_does_not_fit() -> None:
+    state = HandState.empty(2, 3, contacts=1)
+    with pytest.raises(UsageError, match="room for 1 contacts; received 2"):
+        state.set_contacts([0, 1], [[0, 1], [0, 1]])
+    with pytest.raises(UsageError, match=r"shape \(2, 3, 7\)"):
+        state.set_pose(np.zeros((3, 3, 7)))
+    with pytest.raises(UsageError, match="has no 'colour'"):
+        state.set_contacts([0], [[0, 1]], colour=[1])
+
+
+def test_a_state_tells_which_environments_diverged_and_when_contacts_were_lost() -> None:
+    state = HandState.empty(3, 2, contacts=2)
+    velocity = np.zeros((3, 2, 6))
+    velocity[1, 1, 4] = np.inf
+    state.set_velocity(velocity)
+    state.check()
+    assert state.status_torch.tolist() == [0, 1, 0]
+    state.contact_count.fill_(3)
+    state.check()
+    assert state.status_torch.tolist() == [2, 3, 2]
+
+
+@pytest.mark.slow
+def test_mujoco_warp_agrees_with_c_mujoco() -> None:
+    """The published pyramid, 20 steps; MuJoCo Warp runs on the processor here, in single precision."""
+    pytest.importorskip("mujoco_warp")
+    model = pyramid()
+    start = initial_velocities(4, model.nv)
+    cpu, gpu = MujocoEngine(model, 4), MujocoWarpEngine(model, 4, device="cpu")
+    for engine in (cpu, gpu):
+        engine.set(qvel=start)
+        engine.step(20)
+    np.testing.assert_allclose(gpu.state.pose.numpy(), cpu.state.pose.numpy(), atol=5e-4)
+    np.testing.assert_allclose(gpu.state.velocity.numpy(), cpu.state.velocity.numpy(), atol=2e-2)
+    np.testing.assert_allclose(gpu.state.time.numpy(), cpu.state.time.numpy(), atol=1e-5)
+    counts = [int(engine.state.contact_count.numpy()[0]) for engine in (cpu, gpu)]
+    assert abs(counts[0] - counts[1]) < 0.05 * counts[0]
+    weight = float(model.body_mass.sum()) * 9.81
+    for engine in (cpu, gpu):
+        engine.step(300)
+    forces = []
+    for engine, count in zip((cpu, gpu), counts, strict=True):
+        del count
+        n = int(engine.state.contact_count.numpy()[0])
+        pair = engine.state.contact_geom.numpy()[:n]
+        floor = (pair == 0).any(axis=1)
+        forces.append(engine.state.contact_force.numpy()[:n][floor].sum() / 4)
+    np.testing.assert_allclose(forces, weight, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_sensors_read_the_same_from_both_engines_with_objects_that_differ() -> None:
+    pytest.importorskip("mujoco_warp")
+    from robotics_bridge.physics import Geometry, compile_variants
+    from robotics_bridge.sensors import ContactDepthProbe, KinematicTaxel, Probes, SensorSuite
+
+    spec = mujoco.MjSpec.from_string(TWO)
+    shapes = [Geometry(name="b", link="b", kind="sphere", size=(radius,)) for radius in (0.1, 0.09)]
+    models = compile_variants(spec, "b", shapes)
+    grid = Probes.grid(6, 6, size=(0.1, 0.1), center=(0.03, 0.01, 0.1), radius=0.02)
+    sensors = {
+        "depth": ContactDepthProbe(link="a", probes=grid, track=("b",)),
+        "taxel": KinematicTaxel(link="a", probes=grid, track=("b",)),
+    }
+    read = []
+    for engine in (MujocoEngine(models, 4), MujocoWarpEngine(models, 4, device="cpu")):
+        engine.step(12)
+        suite = SensorSuite(engine.scene, sensors, num_envs=4)
+        suite.update(engine.state, engine.timestep)
+        read.append({name: suite.read(name).numpy().copy() for name in sensors})
+    assert read[0]["depth"].max() > 1e-3
+    np.testing.assert_allclose(read[1]["depth"], read[0]["depth"], atol=2e-4)
+    scale = np.abs(read[0]["taxel"]).max()
+    np.testing.assert_allclose(read[1]["taxel"], read[0]["taxel"], atol=0.03 * scale)
+    assert np.abs(read[0]["depth"][0] - read[0]["depth"][1]).max() > 1e-4

@@ -1,0 +1,59 @@
+"""Small scenes and states that several tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robotics_bridge.physics import Geometry, HandState, Scene
+
+PAD = Geometry(name="pad", link="hand", kind="box", size=(0.02, 0.02, 0.005))
+
+
+def pad_scene(*objects: Geometry, pad: Geometry = PAD) -> Scene:
+    """A pad on link ``hand`` (its top at z = 5 mm), and objects on links of their own."""
+    links = ("world", "hand", *dict.fromkeys(g.link for g in objects))
+    return Scene(links, (pad, *objects))
+
+
+def random_pose(rng: np.random.Generator, reach: float = 0.05) -> np.ndarray:
+    """A pose [7] (x, y, z, qx, qy, qz, qw)."""
+    return np.concatenate([rng.uniform(-reach, reach, 3), Rotation.random(rng=rng).as_quat()])
+
+
+def state_of(scene: Scene, poses: np.ndarray, velocities: np.ndarray | None = None, *, touch: bool = True) -> HandState:
+    """A state [B, L, 7]; with ``touch``, geometry 0 is in contact with every other one."""
+    poses = np.asarray(poses, dtype=float)
+    others = range(1, len(scene.geometries))
+    state = HandState.empty(len(poses), len(scene.links), max(len(poses) * len(scene.geometries), 1))
+    state.set_pose(poses)
+    if velocities is not None:
+        state.set_velocity(velocities)
+    if touch:
+        env = np.repeat(np.arange(len(poses)), len(others))
+        state.set_contacts(env, [(0, g) for _ in range(len(poses)) for g in others])
+    return state
+
+
+def poses_at(links: int, positions: dict[int, Sequence[float]], envs: int = 1) -> np.ndarray:
+    """Poses [B, L, 7] with every link upright at the origin, but for those named."""
+    poses = np.zeros((envs, links, 7))
+    poses[..., 6] = 1
+    for link, position in positions.items():
+        poses[:, link, :3] = position
+    return poses
+
+
+def move_all(poses: np.ndarray, velocities: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Move whole environments by one rigid motion [7]."""
+    turn = Rotation.from_quat(motion[3:])
+    shape = poses.shape[:-1]
+    flat = poses.reshape(-1, 7)
+    moved = np.concatenate(
+        [turn.apply(flat[:, :3]) + motion[:3], (turn * Rotation.from_quat(flat[:, 3:])).as_quat()], 1
+    )
+    v = velocities.reshape(-1, 6)
+    spun = np.concatenate([turn.apply(v[:, :3]), turn.apply(v[:, 3:])], 1)
+    return moved.reshape(*shape, 7), spun.reshape(*shape, 6)

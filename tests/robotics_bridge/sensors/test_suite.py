@@ -1,0 +1,262 @@
+"""The suite: what is built, what is read, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench.errors import UsageError
+from brainbench.geometry import Mesh
+from robotics_bridge.physics import Geometry, Scene
+from robotics_bridge.sensors import (
+    ContactDepthProbe,
+    ContactProbe,
+    KinematicTaxel,
+    Noise,
+    Probes,
+    SensorSuite,
+    SurfaceDistanceProbe,
+    _cloud_kernels,
+    _elastomer_kernels,
+    _probe_kernels,
+)
+from tests.robotics_bridge.scenes import PAD, move_all, pad_scene, poses_at, random_pose, state_of
+
+BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
+GRID = Probes.grid(4, 5, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.003)
+
+
+def _suite(sensors: dict, envs: int = 1, scene: Scene | None = None, **options: object) -> SensorSuite:
+    return SensorSuite(scene or pad_scene(BALL), sensors, num_envs=envs, **options)  # type: ignore[arg-type]
+
+
+def _touching(envs: int = 1, height: float = 0.0145) -> np.ndarray:
+    return poses_at(3, {2: (0.001, -0.002, height)}, envs)
+
+
+def test_readings_have_the_shapes_of_their_layouts_and_share_memory() -> None:
+    line = Probes([[0, 0, 0.005]] * 7, [[0, 0, 1.0]] * 7, 0.003)
+    suite = _suite(
+        {
+            "grid": ContactDepthProbe(link="hand", probes=GRID),
+            "line": ContactDepthProbe(link="hand", probes=line),
+            "taxel": KinematicTaxel(link="hand", probes=GRID),
+        },
+        envs=3,
+    )
+    suite.update(state_of(suite.scene, _touching(3)))
+    assert suite.read("grid").shape == (3, 4, 5)
+    assert suite.read("line").shape == (3, 7)
+    assert suite.read("taxel").shape == (3, 4, 5, 6)
+    assert suite.read("grid").data_ptr() == suite.read("grid").data_ptr()
+    view = suite.read("grid")
+    before = view.clone()
+    suite.update(state_of(suite.scene, _touching(3, height=0.014)))
+    assert not torch.equal(view, before)
+
+
+def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> None:
+    for factory in (_probe_kernels.kinematic_kernel, _cloud_kernels.proximity_kernel, _elastomer_kernels.marker_kernel):
+        factory.cache_clear()
+    _probe_kernels.depth_kernel.cache_clear()
+    mesh = Mesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    aside = Geometry(name="aside", link="aside", kind="mesh", mesh=mesh)
+    scene = pad_scene(BALL, aside)
+    sensors = {f"tip{i}": ContactProbe(link="hand", probes=GRID, track=("object",)) for i in range(5)}
+    suite = _suite(sensors, scene=scene)
+    suite.update(state_of(scene, poses_at(4, {2: (0, 0, 0.0145), 3: (1, 0, 0)})))
+    assert len(suite.runtimes) == 1
+    assert suite.solids.field_count == 0
+    assert suite.solids.tree_count == 0
+    assert _probe_kernels.depth_kernel.cache_info().currsize == 1
+    assert _probe_kernels.kinematic_kernel.cache_info().currsize == 0
+    assert _cloud_kernels.proximity_kernel.cache_info().currsize == 0
+    assert _elastomer_kernels.marker_kernel.cache_info().currsize == 0
+
+
+def test_only_meshes_that_a_sensor_tracks_get_a_field_and_equal_meshes_share_it() -> None:
+    mesh = Mesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    twins = [Geometry(name=f"m{i}", link=f"m{i}", kind="mesh", mesh=mesh) for i in range(3)]
+    scene = pad_scene(*twins, BALL)
+    track = {"sdf": ("m0", "m1"), "raycast": ("m2",)}
+    sensors = {
+        query: ContactDepthProbe(link="hand", probes=GRID, track=links, query=query)  # type: ignore[arg-type]
+        for query, links in track.items()
+    }
+    suite = SensorSuite(scene, sensors, num_envs=1, resolution=8)
+    assert suite.solids.field_count == 1
+    assert suite.solids.tree_count == 1
+
+
+def test_fillers_read_zero_whatever_the_noise() -> None:
+    radius = np.full(20, 0.003)
+    radius[[3, 7]] = 0
+    probes = Probes(GRID.position, GRID.normal, radius, (4, 5))
+    noise = Noise(white=1e-3, bias=0.1, dead_probability=0.5, dead_range=(1.0, 2.0))
+    suite = _suite({"depth": ContactDepthProbe(link="hand", probes=probes, noise=noise)})
+    suite.update(state_of(suite.scene, _touching()))
+    read = suite.read("depth").flatten()
+    assert (read[[3, 7]] == 0).all()
+    assert (np.delete(read.numpy(), [3, 7]) != 0).all()
+
+
+def test_contact_latches_and_releases_for_truth_and_measurement_apart() -> None:
+    probe = Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 1e-6)
+    noise = Noise(bias=2e-4)
+    sensor = ContactProbe(link="hand", probes=probe, threshold=5e-4, release=2e-4, noise=noise)
+    suite = _suite({"bit": sensor})
+    seen = []
+    for depth in (0.0, 4e-4, 6e-4, 3e-4, 1e-4, 4e-4):
+        suite.update(state_of(suite.scene, poses_at(3, {2: (0, 0, 0.015 + 1e-6 - depth)})))
+        seen.append((int(suite.read_ground_truth("bit")[0, 0]), int(suite.read("bit")[0, 0])))
+    assert seen == [(0, 0), (0, 1), (1, 1), (1, 1), (0, 1), (0, 1)]
+
+
+def test_reset_starts_single_environments_anew() -> None:
+    sensor = ContactProbe(link="hand", probes=Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 1e-6), release=1e-4)
+    suite = _suite({"bit": sensor}, envs=2)
+    for depth in (6e-4, 3e-4):
+        suite.update(state_of(suite.scene, poses_at(3, {2: (0, 0, 0.015 + 1e-6 - depth)}, 2)))
+    assert suite.read("bit").flatten().tolist() == [1, 1]
+    suite.reset([1])
+    suite.update(state_of(suite.scene, poses_at(3, {2: (0, 0, 0.015 + 1e-6 - 3e-4)}, 2)))
+    assert suite.read("bit").flatten().tolist() == [1, 0]
+
+
+def test_a_diverged_environment_reads_nan_and_harms_no_other() -> None:
+    sensors = {"depth": ContactDepthProbe(link="hand", probes=GRID), "taxel": KinematicTaxel(link="hand", probes=GRID)}
+    suite, alone = _suite(sensors, envs=3), _suite(sensors)
+    poses = _touching(3)
+    poses[1, 2, 0] = np.nan
+    suite.update(state_of(suite.scene, poses))
+    alone.update(state_of(alone.scene, _touching()))
+    assert suite.diverged.tolist() == [False, True, False]
+    for name in sensors:
+        assert suite.read(name)[1].isnan().all()
+        assert torch.equal(suite.read(name)[2], alone.read(name)[0])
+    suite.update(state_of(suite.scene, _touching(3)))
+    assert torch.equal(suite.read("depth")[1], alone.read("depth")[0])
+
+
+def test_history_holds_the_last_readings_oldest_first_and_is_cleared_by_reset() -> None:
+    suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID, history=3)}, envs=2)
+    read = []
+    for height in (0.0145, 0.0143, 0.0141, 0.0139):
+        suite.update(state_of(suite.scene, _touching(2, height)))
+        read.append(suite.read("depth").clone())
+    assert torch.equal(suite.read_history("depth"), torch.stack(read[1:], dim=1))
+    suite.reset([0])
+    suite.update(state_of(suite.scene, _touching(2)))
+    kept = suite.read_history("depth")
+    assert (kept[0, :2] == 0).all()
+    assert torch.equal(kept[1, 1], read[3][1])
+
+
+def test_readings_do_not_depend_on_batch_pose_or_order_of_probes() -> None:
+    rng = np.random.default_rng(3)
+    scene = pad_scene(BALL)
+    poses = np.concatenate([_touching(), _touching(1, 0.0142), _touching(1, 0.0148)])
+    velocities = rng.normal(0, 0.1, (3, 3, 6))
+    order = rng.permutation(20)
+    shuffled = Probes(GRID.position[order], GRID.normal[order], GRID.radius[order])
+    suite = SensorSuite(
+        scene,
+        {"taxel": KinematicTaxel(link="hand", probes=GRID), "shuffled": KinematicTaxel(link="hand", probes=shuffled)},
+        num_envs=3,
+    )
+    suite.update(state_of(scene, poses, velocities))
+    read = suite.read("taxel").flatten(1, 2).clone()
+    assert (read != 0).any()
+    assert torch.equal(suite.read("shuffled"), read[:, order])
+    alone = SensorSuite(scene, {"taxel": KinematicTaxel(link="hand", probes=GRID)}, num_envs=1)
+    alone.update(state_of(scene, poses[1:2], velocities[1:2]))
+    assert torch.equal(alone.read("taxel").flatten(1, 2)[0], read[1])
+    moved = move_all(poses, velocities, random_pose(rng, 0.2))
+    suite.update(state_of(scene, *moved))
+    np.testing.assert_allclose(
+        suite.read("taxel").flatten(1, 2).numpy(), read.numpy(), atol=2e-4 * float(read.abs().max())
+    )
+
+
+def test_an_empty_scene_touches_nothing() -> None:
+    scene = Scene(("world", "hand"), (PAD,))
+    suite = _suite(
+        {
+            "depth": ContactDepthProbe(link="hand", probes=GRID),
+            "far": SurfaceDistanceProbe(link="hand", probes=GRID),
+            "near": SurfaceDistanceProbe(link="hand", probes=GRID, max_range=0.3),
+        },
+        scene=scene,
+    )
+    suite.update(state_of(scene, poses_at(2, {})))
+    assert (suite.read("depth") == 0).all()
+    assert torch.isinf(suite.read("far")).all()
+    assert (suite.read("near") == np.float32(0.3)).all()
+
+
+def test_depth_needs_a_contact_pair_unless_all_pairs_are_asked_for() -> None:
+    suite = _suite(
+        {
+            "contact": ContactDepthProbe(link="hand", probes=GRID),
+            "all": ContactDepthProbe(link="hand", probes=GRID, pairs="all"),
+        }
+    )
+    suite.update(state_of(suite.scene, _touching(), touch=False))
+    assert (suite.read("contact") == 0).all()
+    assert (suite.read("all") > 0).any()
+    suite.update(state_of(suite.scene, _touching()))
+    assert torch.equal(suite.read("contact"), suite.read("all"))
+
+
+def test_seeds_and_offsets_decide_the_noise_and_nothing_else() -> None:
+    noise = Noise(white=1e-3)
+    sensors = {"a": ContactDepthProbe(link="hand", probes=GRID, noise=noise)}
+    whole, shard = _suite(sensors, envs=4, seed=5), _suite(sensors, envs=2, seed=5, env_offset=2)
+    other = _suite(sensors, envs=4, seed=6)
+    for suite in (whole, shard, other):
+        suite.update(state_of(suite.scene, _touching(suite.num_envs)))
+    assert torch.equal(whole.read("a")[2:], shard.read("a"))
+    assert not torch.equal(whole.read("a"), other.read("a"))
+    assert torch.equal(whole.read_ground_truth("a"), other.read_ground_truth("a"))
+
+
+def test_a_noisy_taxel_keeps_at_most_130_bytes() -> None:
+    grid = Probes.grid(10, 10, size=(0.02, 0.02), radius=0.003)
+    noise = Noise.preset("published-force")
+    suite = _suite({"taxel": KinematicTaxel(link="hand", probes=grid, noise=noise)})
+    held = suite.state_bytes
+    assert (held["sensors"] + held["shared"]) / 100 <= 130
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: _suite({"a": ContactProbe(link="hnad", probes=GRID)}), "did you mean 'hand'"),
+        (lambda: _suite({"a": GRID}), "must be a sensor"),
+        (lambda: _suite({}, envs=0), "at least one environment"),
+        (lambda: ContactProbe(link="hand", probes=GRID, threshold=1e-4, release=2e-4), "release=0.0002"),
+        (lambda: KinematicTaxel(link="hand", probes=GRID, convention="thesys"), "thesis"),  # type: ignore[arg-type]
+        (lambda: ContactDepthProbe(link="hand", probes=GRID, query="ray"), "'sdf' or 'raycast'"),  # type: ignore[arg-type]
+        (lambda: SurfaceDistanceProbe(link="hand", probes=GRID, noise=Noise(gain=(0.5, 2.0))), "no noise knob 'gain'"),
+    ],
+)
+def test_mistakes_are_named(make: object, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        make()  # type: ignore[operator]
+
+
+def test_states_and_names_that_do_not_fit_are_refused() -> None:
+    suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID)}, envs=2)
+    with pytest.raises(UsageError, match="serves 2 environments with 3 links; the state has 1"):
+        suite.update(state_of(suite.scene, _touching(1)))
+    with pytest.raises(UsageError, match="positive time"):
+        suite.update(state_of(suite.scene, _touching(2)), dt=0.0)
+    with pytest.raises(UsageError, match="did you mean 'depth'"):
+        suite.read("dept")
+    with pytest.raises(UsageError, match="keeps no history"):
+        suite.read_history("depth")
+    with pytest.raises(UsageError, match="nearest=True"):
+        suite.read_nearest("depth")
+    with pytest.raises(UsageError, match="Environments are 0 to 1"):
+        suite.reset([2])
