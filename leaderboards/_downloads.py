@@ -8,8 +8,10 @@ import io
 import math
 import zipfile
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
+from brainbench.files import atomic_path
 from brainbench.types import Score
 from leaderboards.ranking import Board
 
@@ -18,7 +20,8 @@ _COLUMNS = (
     "row", "rank_first", "rank_last", "name", "value", "low", "high", "level", "status", "reasons",
     "p", "p_smallest", "r", "reliability", "ceiling_lower", "ceiling_upper",
     "layer", "best_layer", "best_layer_value", "animals",
-    "family", "objective", "augmentation", "parameters", "multiply_adds", "top1", "top5", "seed", "weights", "identity",
+    "family", "encoder", "attender", "objective", "augmentation", "parameters", "multiply_adds", "top1", "top5", "seed",
+    "weights", "identity",
 )  # fmt: skip
 
 
@@ -28,11 +31,9 @@ def link(content: str | bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def boards_csv(boards: Iterable[Board]) -> str:
-    """Return every row of every board, baselines included, as CSV with one header line."""
-    stream = io.StringIO()
-    writer: csv.DictWriter[str] = csv.DictWriter(stream, _COLUMNS, restval="", lineterminator="\n")
-    writer.writeheader()
+def boards_table(boards: Iterable[Board]) -> list[dict[str, Any]]:
+    """Return every row of every board, baselines included; absent values are None."""
+    rows = []
     for board in boards:
         common = {
             "recordings": board.recordings,
@@ -48,11 +49,35 @@ def boards_csv(boards: Iterable[Board]) -> str:
             described = {name: getattr(card, name) for name in _COLUMNS if card and hasattr(card, name)}
             values = common | described | _score_values(row.record.score, row.record.score.name)
             values |= {"row": "model", "rank_first": row.first, "rank_last": row.last, "identity": row.identity}
-            writer.writerow({key: _cell(value) for key, value in values.items()})
-        for baseline in board.baselines:
-            values = common | _score_values(baseline.score, baseline.name) | {"row": "baseline"}
-            writer.writerow({key: _cell(value) for key, value in values.items()})
+            rows.append(values)
+        rows += [common | _score_values(item.score, item.name) | {"row": "baseline"} for item in board.baselines]
+    return [{name: _known(row.get(name)) for name in _COLUMNS} for row in rows]
+
+
+def boards_csv(boards: Iterable[Board]) -> str:
+    """Return :func:`boards_table` as CSV with one header line."""
+    stream = io.StringIO()
+    writer: csv.DictWriter[str] = csv.DictWriter(stream, _COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in row.items()} for row in boards_table(boards))
     return stream.getvalue()
+
+
+def boards_parquet(table: list[dict[str, Any]], path: Path) -> bool:
+    """Write :func:`boards_table` as Parquet; return False where ``pyarrow`` is not installed."""
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        return False
+    whole = ("rank_first", "rank_last", "animals", "parameters", "multiply_adds", "seed")
+    numbers = ("value", "low", "high", "level", "p", "p_smallest", "r", "reliability", "ceiling_lower", "ceiling_upper",
+               "best_layer_value", "top1", "top5")  # fmt: skip
+    kinds = {name: pa.int64() for name in whole} | {name: pa.float64() for name in numbers} | {"synthetic": pa.bool_()}
+    columns = pa.schema([(name, kinds.get(name, pa.string())) for name in _COLUMNS])
+    with atomic_path(path) as temporary:
+        parquet.write_table(pa.Table.from_pylist(table, schema=columns), temporary)
+    return True
 
 
 def records_zip(boards: Iterable[Board]) -> bytes:
@@ -80,8 +105,12 @@ def _score_values(score: Score, name: str) -> dict[str, Any]:
     return values
 
 
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def _cell(value: Any) -> Any:
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+    if value is None:
         return ""
     # A spreadsheet would run text that starts like a formula.
     if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")):

@@ -137,6 +137,11 @@ def colour_stops() -> tuple[tuple[float, str], ...]:
     return tuple((100 * i / (len(_VIRIDIS) - 1), f"#{colour}") for i, colour in enumerate(_VIRIDIS))
 
 
+def colour_at(share: float) -> str:
+    """Return the colour of a value that lies a share (0 to 1) along the colour scale, as ``#rrggbb``."""
+    return f"#{_colour(round(min(max(share, 0.0), 1.0) * (_LEVELS - 1))).hex()}"
+
+
 def _png(cells: list[list[int | None]]) -> str:
     """Encode colour levels (None: transparent) as an indexed PNG (W3C recommendation, third edition).
 

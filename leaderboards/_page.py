@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from brainbench.files import to_plain
 from leaderboards import _figures, _words
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
+    from leaderboards._svg import Drawing
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -32,6 +36,23 @@ def render(template: str, **values: Any) -> str:
     )
     page = _environment().get_template(template)
     return page.render(**values, policy=policy, style=Markup(style), script=Markup(script))
+
+
+def drawn(drawing: Drawing | None) -> Any:
+    """Return a drawing as markup for a template, None for none."""
+    from markupsafe import Markup
+
+    return None if drawing is None else Markup(drawing.render())
+
+
+def script_json(value: Any) -> Any:
+    """Return ``value`` as JSON that can stand inside a script element: nothing in it can end the element."""
+    from markupsafe import Markup
+
+    text = json.dumps(to_plain(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for mark, escaped in (("<", "\\u003c"), (">", "\\u003e"), ("&", "\\u0026")):
+        text = text.replace(mark, escaped)
+    return Markup(text)
 
 
 @cache

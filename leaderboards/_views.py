@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 from brainbench.types import LayerScore, ResultRecord, Score
 from leaderboards import _origin, _words
+from leaderboards._diagram import diagram
 from leaderboards._figures import Axis, Mark, axis_of, known, rdm_picture, score_axis
-from leaderboards.ranking import Board, RankedRecord
+from leaderboards._page import drawn
 from leaderboards.store import record_name
 
 _SHAPES = {"model": "dot", "baseline": "diamond", "animals": "square"}
@@ -41,37 +42,6 @@ class _LayerRow:
     note: str
     shape: str
     open: bool
-
-
-@dataclass(frozen=True)
-class _BoardRow:
-    label: str
-    kind: str
-    score: Score
-    mark: Mark
-    small: tuple[str, ...]
-    rank: str = ""
-    first: int | str = ""
-    anchor: str = ""
-    parameters: int | None = None
-    apart: bool = False
-    """True for the first row below the ranked ones."""
-
-    @property
-    def shape(self) -> str:
-        return _SHAPES[self.kind]
-
-    @property
-    def key(self) -> str:
-        return _key(self.score.value)
-
-    @property
-    def p_key(self) -> str:
-        return _key(self.score.p)
-
-    @property
-    def raw_key(self) -> str:
-        return _key(self.score.r)
 
 
 def report_view(record: ResultRecord) -> dict[str, Any]:
@@ -114,83 +84,7 @@ def report_view(record: ResultRecord) -> dict[str, Any]:
         "card": _words.card_rows(record.card) if record.card else [],
         "provenance": _words.provenance_rows(score.provenance),
         "file_name": record_name(record),
-    }
-
-
-def board_view(board: Board) -> dict[str, Any]:
-    """Return what ``leaderboard.html.j2`` shows of one board."""
-    scores = [row.record.score for row in board.rows] + [baseline.score for baseline in board.baselines]
-    axis = score_axis(scores)
-    layer_axis = axis_of(layer.value for row in board.rows for layer in row.record.score.layers)
-    animals = next((baseline.score for baseline in board.baselines if baseline.kind == "animals"), None)
-    return {
-        "board": board,
-        "size": _words.plural(len(board.rows), "result"),
-        "axis": axis,
-        "layer_axis": layer_axis,
-        "band": _band(animals),
-        "ceiling": next((score.ceiling for score in scores if _ends(score)), None),
-        "rows": _board_rows(board, axis),
-        "brain_rdm": next((picture for s in scores if (picture := rdm_picture(s.brain_rdm, s.stimuli))), None),
-        "models": [_model_view(row, layer_axis) for row in board.rows],
-    }
-
-
-def _board_rows(board: Board, axis: Axis) -> list[_BoardRow]:
-    """Put the baselines in their places among the ranked rows; what is not ranked follows below."""
-    ranked = [_model_row(row, axis) for row in board.rows if row.first is not None]
-    unranked = [_model_row(row, axis) for row in board.rows if row.first is None]
-    for baseline in board.baselines:
-        score = baseline.score
-        row = _BoardRow(baseline.name, baseline.kind, score, axis.mark(score.value, score.interval), baseline.notes)
-        (ranked if score.status == "ok" else unranked).append(row)
-    ranked.sort(key=lambda row: -row.score.value)
-    if ranked and unranked:
-        unranked[0] = replace(unranked[0], apart=True)
-    return ranked + unranked
-
-
-def _model_row(row: RankedRecord, axis: Axis) -> _BoardRow:
-    record = row.record
-    card = record.card
-    small = [part for part in (card.objective, card.augmentation) if part] if card else []
-    small += ["collapsed to one class"] if card and card.collapsed else []
-    small += [f"not ranked: {row.unranked_because}"] if row.unranked_because else []
-    return _BoardRow(
-        record.score.name,
-        "model",
-        record.score,
-        axis.mark(record.score.value, record.score.interval),
-        (*small, *row.notes),
-        row.rank,
-        row.first or "",
-        _anchor(row),
-        card.parameters if card else None,
-    )
-
-
-def _model_view(row: RankedRecord, axis: Axis) -> dict[str, Any]:
-    record, score = row.record, row.record.score
-    facts = [
-        ("score", f"{_words.number(score.value)} {_words.span(score.interval)}".strip()),
-        ("p", f"{_words.probability(score.p)}; {_words.p_sentence(score)}".strip("; ")),
-        ("raw r", _words.number(score.r)),
-        ("reliability", f"{_words.number(score.reliability)} {_words.span(score.reliability_interval)}".strip()),
-        ("layer", f"{score.layer or 'none'}; {score.layer_rule}".strip("; ")),
-        ("optimistic maximum", f"{_words.number(score.best_layer_value)} at {score.best_layer} (not a result)"),
-        ("animals", str(len(score.subjects))),
-        *(_words.card_rows(record.card) if record.card else []),
-        ("record", row.file_name),
-        ("brainbench", str(score.provenance.get("version") or "unknown version")),
-    ]
-    return {
-        "row": row,
-        "anchor": _anchor(row),
-        "layers": _layer_rows(score, axis),
-        "model_rdm": rdm_picture(score.model_rdm, score.stimuli),
-        "brain_rdm": rdm_picture(score.brain_rdm, score.stimuli),
-        "facts": facts,
-        "command": _origin.command(score),
+        "graph": drawn(diagram(record.card.graph, score.name)) if record.card and record.card.graph else None,
     }
 
 
@@ -238,11 +132,3 @@ def _ends(score: Score) -> tuple[float, float] | None:
         if ceiling and math.isfinite(ceiling.lower) and math.isfinite(ceiling.upper)
         else None
     )
-
-
-def _anchor(row: RankedRecord) -> str:
-    return f"m-{row.identity}"
-
-
-def _key(value: float) -> str:
-    return "" if math.isnan(value) else repr(value)

@@ -157,6 +157,31 @@ def card_rows(card: ModelCard) -> list[tuple[str, str]]:
     return rows
 
 
+def loading(record: ResultRecord) -> str:
+    """Return three lines of Python that load the model."""
+    card = record.card
+    name = record.score.name
+    if card is None or card.family in ("features computed elsewhere", ""):
+        return f"# {name}: activations that were computed elsewhere; the record names no model to load."
+    if card.family == "user module":
+        path = _origin.settings(record.score).get("model")
+        shown = path if isinstance(path, str) else name
+        made = f"model = load_user_model({shown!r}, seed={card.seed or 0})"
+        return f"from brainbench.models.user import load_user_model\n\n{made}"
+    seed = f", seed={card.seed}" if card.seed and card.objective == "untrained" else ""
+    made = f"model = brainbench.load_model({name!r}{seed})"
+    return f"import brainbench\n\n{made}  # [B, T, 30, 5, 7] in N and N·m → [B, classes]"
+
+
+def training_rows(card: ModelCard) -> list[tuple[str, str]]:
+    """Return what the card says of the training, as label and text."""
+    stated = {key: value for key, value in card.training.items() if value not in (None, "", {}, [])}
+    rows = [("objective", card.objective or ""), ("augmentation", card.augmentation or "")] if stated else []
+    rows += [(key.replace("_", " "), _inline(value)) for key, value in sorted(stated.items()) if key != "augmentation"]
+    rows += [("untrained twin", card.twin)] if stated and card.twin else []
+    return [(label, text) for label, text in rows if text]
+
+
 def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the provenance as label and text, without the command, which the page shows by itself."""
     rows = []

@@ -104,20 +104,20 @@ def test_labels_are_matched_by_a_file(run, files, tmp_path):
 
 def test_the_leaderboard_is_built_from_records(run, files, tmp_path):
     _score(run, files, files["features"])
-    page = tmp_path / "board.html"
+    page = tmp_path / "board"
     broken = Path(files["out"]) / "broken.json"
     broken.write_text("{")
     result = run("leaderboard", "build", files["out"], "--out", str(page), "--json")
     data = json.loads(result.out)
     assert data["records"] == 1
     assert len(data["problems"]) == 1
-    assert "features" in page.read_text()
+    assert "features" in (page / "index.html").read_text()
 
 
 def test_the_leaderboard_of_no_records_says_how_to_get_some(run, tmp_path):
-    result = run("leaderboard", "build", str(tmp_path / "none"), "--out", str(tmp_path / "page.html"))
+    result = run("leaderboard", "build", str(tmp_path / "none"), "--out", str(tmp_path / "page"))
     assert result.status == 2
-    assert not (tmp_path / "page.html").exists()
+    assert not (tmp_path / "page").exists()
     assert "brainbench score" in result.err
 
 

@@ -14,13 +14,13 @@ def build(
     records: Annotated[
         list[Path] | None, typer.Argument(help="Record files or folders of them; ./brainbench-results by default.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The page to write.")] = Path("leaderboard.html"),
-    title: Annotated[str, typer.Option(help="Title of the page.")] = "brainbench leaderboard",
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the site.")] = Path("leaderboard"),
+    title: Annotated[str, typer.Option(help="Title of the page.")] = "Which networks process touch like a brain?",
     as_json: JsonOption = False,
 ) -> None:
-    """Write one self-contained HTML page from result records."""
+    """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
     from brainbench.errors import DataFileNotFoundError
-    from leaderboards.report import build_leaderboard
+    from leaderboards.site import build_leaderboard
     from leaderboards.store import read_records
 
     sources = records or [Path("brainbench-results")]

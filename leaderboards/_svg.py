@@ -1,0 +1,168 @@
+"""Small vector drawings: escaped text, marks that take their colours from classes, axes with round ticks.
+
+Drawn on the server side so that one drawing serves the site, the reports and a paper. Classes and no
+``style`` attributes, because the pages forbid those; :func:`standalone` adds the colours for a file of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from html import escape
+
+STYLE = """
+svg.figure{font:12px system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif;fill:#17202b}
+.figure text{fill:#17202b}.figure .quiet{fill:#566373}.figure .title{font-weight:650}.figure .small{font-size:10.5px}
+.figure .end{text-anchor:end}.figure .mid{text-anchor:middle}.figure .line{fill:none;stroke:#8a95a3}
+.figure .grid{stroke:#e3e8ee}.figure .one{stroke:#566373;stroke-dasharray:2 3}
+.figure .band{fill:#2b7a3d;fill-opacity:.13}
+.figure .fit{fill:none;stroke:#17202b;stroke-width:1.5}.figure .fitband{fill:#17202b;fill-opacity:.09}
+.figure .span{stroke-width:2}.figure .open{fill:#fff}.figure .faint{fill-opacity:.45;stroke-opacity:.6}
+.figure .c0{fill:#5b6472;stroke:#5b6472}.figure .c1{fill:#0a5ca8;stroke:#0a5ca8}.figure .c2{fill:#c2410c;stroke:#c2410c}
+.figure .c3{fill:#0f766e;stroke:#0f766e}.figure .c4{fill:#7c3aed;stroke:#7c3aed}.figure .c5{fill:#a16207;stroke:#a16207}
+.figure .c6{fill:#be185d;stroke:#be185d}.figure .c7{fill:#4d7c0f;stroke:#4d7c0f}.figure .c8{fill:#0369a1;stroke:#0369a1}
+.figure .open{fill:#fff}.figure text{stroke:none}.figure .edge{fill:none;stroke:#566373;stroke-width:1.4}
+.figure .feedback{stroke:#c2410c;stroke-dasharray:5 3}.figure .box{fill:#f4f6f9;stroke:#b7c1cd}
+"""
+"""Colours of a drawing that stands alone; the pages bring their own for light and dark."""
+
+COLOURS = 8
+"""Classes ``c1`` to ``c8``; ``c0`` is grey."""
+
+
+@dataclass
+class Drawing:
+    """An SVG image that is being drawn; places in pixels from the top left."""
+
+    width: float
+    height: float
+    title: str
+    """What the drawing shows, for readers who do not see it."""
+    parts: list[str] = field(default_factory=list)
+
+    def text(self, x: float, y: float, text: str, kind: str = "") -> None:
+        """Write one line; ``kind`` holds classes such as ``end quiet small``."""
+        self.parts.append(f'<text x="{_n(x)}" y="{_n(y)}"{_class(kind)}>{escape(text)}</text>')
+
+    def line(self, x1: float, y1: float, x2: float, y2: float, kind: str = "line") -> None:
+        """Draw a straight line."""
+        self.parts.append(f'<line x1="{_n(x1)}" y1="{_n(y1)}" x2="{_n(x2)}" y2="{_n(y2)}"{_class(kind)}/>')
+
+    def rect(
+        self,
+        x: float,
+        y: float,
+        width: float,
+        height: float,
+        kind: str = "",
+        *,
+        fill: str = "",
+        rx: float = 0,
+        tip: str = "",
+    ) -> None:
+        """Draw a rectangle, in a colour of its own or by its classes; ``tip`` is shown on hovering."""
+        colour = f' fill="{fill}"' if fill else ""
+        round_ = f' rx="{_n(rx)}"' if rx else ""
+        inner = f"><title>{escape(tip)}</title></rect>" if tip else "/>"
+        size = f'width="{_n(max(width, 0))}" height="{_n(max(height, 0))}"'
+        self.parts.append(f'<rect x="{_n(x)}" y="{_n(y)}" {size}{colour}{round_}{_class(kind)}{inner}')
+
+    def path(self, d: str, kind: str = "line") -> None:
+        """Draw a path given by its commands."""
+        self.parts.append(f'<path d="{d}"{_class(kind)}/>')
+
+    def mark(self, x: float, y: float, shape: str, kind: str, tip: str = "", size: float = 4.5) -> None:
+        """Draw a point: ``dot``, ``square``, ``diamond``, ``up``, ``down`` or ``cross``."""
+        s = size
+        shapes = {
+            "dot": f"M{_n(x - s)} {_n(y)}a{s} {s} 0 1 0 {2 * s} 0a{s} {s} 0 1 0 {-2 * s} 0z",
+            "square": f"M{_n(x - s)} {_n(y - s)}h{2 * s}v{2 * s}h{-2 * s}z",
+            "diamond": f"M{_n(x)} {_n(y - 1.3 * s)}l{1.3 * s} {1.3 * s}l{-1.3 * s} {1.3 * s}l{-1.3 * s} {-1.3 * s}z",
+            "up": f"M{_n(x)} {_n(y - 1.2 * s)}l{1.2 * s} {2.1 * s}h{-2.4 * s}z",
+            "down": f"M{_n(x)} {_n(y + 1.2 * s)}l{1.2 * s} {-2.1 * s}h{-2.4 * s}z",
+            "cross": f"M{_n(x - s)} {_n(y - s)}l{2 * s} {2 * s}m0 {-2 * s}l{-2 * s} {2 * s}",
+        }
+        inner = f"><title>{escape(tip)}</title></path>" if tip else "/>"
+        self.parts.append(f'<path d="{shapes[shape]}"{_class(kind)}{inner}')
+
+    def render(self, *, style: str = "") -> str:
+        """Return the SVG element."""
+        return (
+            f'<svg class="figure" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_n(self.width)} {_n(self.height)}" '
+            f'width="{_n(self.width)}" height="{_n(self.height)}" role="img" aria-label="{escape(self.title)}">'
+            f"{f'<style>{style}</style>' if style else ''}{''.join(self.parts)}</svg>"
+        )
+
+
+def standalone(drawing: Drawing) -> str:
+    """Return a drawing as a file of its own, with its colours and a white ground."""
+    ground = f'<rect width="{_n(drawing.width)}" height="{_n(drawing.height)}" fill="#fff"/>'
+    copy = Drawing(drawing.width, drawing.height, drawing.title, [ground, *drawing.parts])
+    return copy.render(style=STYLE)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A linear or logarithmic axis from values to pixels."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+    log: bool = False
+
+    def at(self, value: float) -> float:
+        """Return the place of a value, held inside the axis."""
+        low, high = (math.log10(self.low), math.log10(self.high)) if self.log else (self.low, self.high)
+        place = math.log10(max(value, 1e-300)) if self.log else value
+        share = min(max((place - low) / (high - low), 0.0), 1.0)
+        return self.start + share * (self.end - self.start)
+
+    @property
+    def ticks(self) -> list[float]:
+        """Round values along the axis."""
+        if self.log:
+            powers = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+            steps = (1, 2, 5) if self.high / self.low < 300 else (1,)
+            return [m * 10.0**k for k in powers for m in steps if self.low <= m * 10.0**k <= self.high * 1.0001]
+        step = nice((self.high - self.low) / 4)
+        first = math.ceil(self.low / step - 1e-9)
+        return [step * i for i in range(first, math.floor(self.high / step + 1e-9) + 1)]
+
+
+def nice(step: float) -> float:
+    """Return the round number (1, 2, 2.5 or 5 times a power of ten) next above a step.
+
+    >>> nice(0.3), nice(0.21), nice(7)
+    (0.5, 0.25, 10.0)
+    """
+    power = 10.0 ** math.floor(math.log10(step))
+    return next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= step * (1 - 1e-9))
+
+
+def scale_of(
+    values: Sequence[float], start: float, end: float, *, floor: float | None = 0.0, top: float | None = None
+) -> Scale:
+    """Return a linear axis that holds the finite values, ``floor`` and ``top``, with a little room."""
+    finite = [value for value in values if math.isfinite(value)]
+    held = [*finite, *([floor] if floor is not None else []), *([top] if top is not None else [])] or [0.0, 1.0]
+    low, high = min(held), max(held)
+    room = 0.04 * ((high - low) or 1.0)
+    return Scale(low if low == floor else low - room, high + room, start, end)
+
+
+def tick_text(value: float) -> str:
+    """Write a tick's value shortly: ``0.25``, ``−1``, ``2 M``."""
+    for size, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{unit}"
+    return f"{round(value, 10):g}".replace("-", "−")
+
+
+def _n(value: float) -> str:
+    return f"{value:.2f}".rstrip("0").rstrip(".") if value % 1 else f"{value:.0f}"
+
+
+def _class(kind: str) -> str:
+    return f' class="{kind}"' if kind else ""
