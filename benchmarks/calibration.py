@@ -408,13 +408,12 @@ def faults(simulations: int) -> Result:
     from brainbench.datasets.synthetic import Design as Recordings
     from brainbench.datasets.synthetic import Geometry, simulate
 
-    studies = max(10, simulations // 50)
     rows = []
     for imbalance in (0.0, 0.5):
         design = Recordings(animals=11, sessions=3, units=20, imbalance=imbalance)
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
             values, reliable = [], []
-            for study in range(studies):
+            for study in range(simulations):
                 geometry = Geometry.from_features(np.random.default_rng(study).normal(size=(6, 4)))
                 animals = simulate(geometry, design, seed=study, faults=given)
                 blocks = [[TrialBlock(b.responses[:, 0], b.labels, b.keys) for b in a.blocks] for a in animals]
@@ -422,9 +421,11 @@ def faults(simulations: int) -> Result:
                 values.append(score.value)
                 reliable.append(score.reliability)
             known = np.array(values)[np.isfinite(values)]
-            spread = f"{known.mean():.2f} ± {known.std() / math.sqrt(len(known)):.2f}"
+            spread = f"{known.mean():.3f} ± {known.std() / math.sqrt(len(known)):.3f}"
             rows.append([f"{imbalance:g}", " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
-    title = f"Animal-to-animal score of 11 animals of one geometry, with the released faults ({studies} studies each)"
+    title = (
+        f"Animal-to-animal score of 11 animals of one geometry, with the released faults ({simulations:,} studies each)"
+    )
     return Result(title, ["imbalance of trials", "fault", "score", "reliability"], rows)
 
 

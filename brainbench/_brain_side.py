@@ -49,20 +49,25 @@ class BrainSide:
         self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
     ) -> tuple[Any, ...]:
         """Every animal prepared by a metric (RSA by default) over the labels ``kept``, in that order."""
-        from brainbench.datasets import blocks
+        from brainbench.datasets import block_covariates, blocks
         from brainbench.metrics import TrialBlock, get_metric
 
         metric = metric or get_metric("rsa")
         index = np.full(len(self.vocabulary), -1)
         index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
         animals = []
+        known = block_covariates(self.dataset)
         for subject, sessions in blocks(self.dataset).items():
             trials = []
-            for responses, labels, keys in sessions:
+            for (responses, labels, keys), covariates in zip(sessions, known[subject], strict=True):
                 rows = index[labels] >= 0
-                features = without_time(responses[rows], time)
                 trials.append(
-                    TrialBlock(features, index[labels][rows], [key for key, row in zip(keys, rows, strict=True) if row])
+                    TrialBlock(
+                        without_time(responses[rows], time),
+                        index[labels][rows],
+                        [key for key, row in zip(keys, rows, strict=True) if row],
+                        {name: values[rows] for name, values in covariates.items()},
+                    )
                 )
             animals.append(metric.animal(subject, trials, len(kept), stimuli=kept, seed=seed, draws=draws))
         return tuple(animals)

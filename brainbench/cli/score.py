@@ -61,7 +61,10 @@ def score(
     bin: Annotated[float | None, typer.Option(help="Bin width of the spike counts in seconds.")] = None,
     estimator: Annotated[str, typer.Option(help="default, thesis or thesis-input (as published).")] = "default",
     metric: Annotated[
-        str, typer.Option(help="rsa, rsa-crossnobis, cka, ridge, procrustes, or FILE.py:CLASS of your own.")
+        str,
+        typer.Option(
+            help="rsa, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, or FILE.py:CLASS of your own."
+        ),
     ] = "rsa",
     normalize: Annotated[
         bool, typer.Option(help="Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI.")
@@ -173,7 +176,8 @@ def _command() -> str:
 def _text(record: ResultRecord) -> str:
     score = record.score
     source = score.provenance["recordings"]["source"]
-    lines = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(score.subjects)} animals  ·  {source}"]
+    known = score.subjects or (record.animal_to_animal.subjects if record.animal_to_animal else ())
+    lines = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(known)} animals  ·  {source}"]
     if record.synthetic:
         lines.append("Synthetic recordings: ranks on them say nothing about brains.")
     rsa = score.metric.startswith("RSA")
@@ -196,13 +200,38 @@ def _text(record: ResultRecord) -> str:
         [name, f"{_number(item.value)} {_interval(item)}", item.status] for name, item in others if item is not None
     ]
     text = "\n".join(lines) + "\n\n" + table("", ["", "", ""], facts)
-    if record.animal_to_animal is not None and score.estimator == "default":
+    if found := _details(score.provenance.get("statistics", {})):
+        text += f"\n\n{found}"
+    if record.animal_to_animal is not None and score.estimator == "default" and score.subjects:
         text += f"\n\nAs much like the animals as they are like one another? {_alike(record, record.animal_to_animal)}"
     if walk := score.provenance.get("statistics", {}).get("estimator_walk"):
         text += f"\n\n{_walk(walk)}"
     if rows:
         text += "\n\n" + table("Baselines, same estimator", ["", "score", "status"], rows)
     return text
+
+
+def _details(statistics: dict[str, Any]) -> str:
+    """Lay out what single metrics add: accuracies by property, shares of variance."""
+    parts = []
+    if accuracies := statistics.get("decoding"):
+        rows = [
+            [
+                item["property"],
+                *(f"{item[name]:.2f}" for name in ("accuracy", "expected", "chance")),
+                f"{item['p']:.2g}",
+            ]
+            for item in accuracies
+        ]
+        columns = ["property", "accuracy", "without information", "1 / classes", "p"]
+        parts.append(table("Decoding of stimuli left out", columns, rows, right=(1, 2, 3, 4)))
+    if shares := statistics.get("variance_partition"):
+        parts.append(
+            f"Variance of the animals' RDMs: {shares['total']:.2f} explained; by the model alone "
+            f"{shares['unique_model']:.2f} (by luck {shares['chance']:.2f}), by {', '.join(shares['nuisances'])} alone "
+            f"{shares['unique_nuisance']:.2f}, by either {shares['shared']:.2f}"
+        )
+    return "\n\n".join(parts)
 
 
 def _number(value: float) -> str:

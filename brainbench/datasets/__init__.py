@@ -4,7 +4,7 @@
 >>> open_recordings("sessions/*.nwb", conditions="trials:stimulus")  # doctest: +SKIP
 """
 
-from brainbench.datasets.blocks import SessionBlock, blocks
+from brainbench.datasets.blocks import SessionBlock, block_covariates, blocks
 from brainbench.datasets.checks import Checkup, check
 from brainbench.datasets.conditions import Conditions
 from brainbench.datasets.exports import export
@@ -30,6 +30,7 @@ __all__ = [
     "SessionBlock",
     "WhiskingDataset",
     "Window",
+    "block_covariates",
     "blocks",
     "check",
     "export",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.datasets.conditions import Conditions, join
+from brainbench.datasets.covariates import trial_covariates
 from brainbench.datasets.selection import Selection, Tally
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, Table, as_labels, natural_key
 from brainbench.datasets.window import Window
@@ -51,6 +52,8 @@ class Part:
     """[R, T] length of each bin, s."""
     columns: dict[str, NDArray[Any]]
     """Unit columns [U]."""
+    covariates: dict[str, NDArray[np.float64]]
+    """What else is known of the trials [R]."""
     tally: Tally
     trials: int
     """Rows of the condition table before any rule."""
@@ -108,6 +111,7 @@ def extract(session: Session, plan: Plan) -> Part:
         counts=counts,
         duration=duration,
         columns={name: _unit_column(session.units, name, kind, units) for name, kind in UNIT_COLUMNS.items()},
+        covariates=trial_covariates(session, table, rows, edges[rows]),
         tally=tally,
         trials=len(table),
         units=len(session.units),

@@ -6,9 +6,11 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.datasets._extract import UNIT_COLUMNS, Part, Plan
 from brainbench.datasets.conditions import natural_vocabulary
+from brainbench.datasets.covariates import COVARIATES
 from brainbench.datasets.sessions import natural_key
 from brainbench.errors import DataError
 from brainbench.files import content_hash
@@ -70,6 +72,7 @@ def join(parts: list[Part], plan: Plan, *, source: str, recipe: str, notes: list
         "unit_session": ("unit", [part.session for part in parts for _ in part.unit_ids]),
         "unit_id": ("unit", [name for part in parts for name in part.unit_ids]),
         **{name: ("unit", np.concatenate([part.columns[name] for part in parts])) for name in UNIT_COLUMNS},
+        **{name: ("trial", _covariate(parts, name)) for name in COVARIATES if any(name in p.covariates for p in parts)},
     }
     dataset = xr.Dataset(
         {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}, coordinates
@@ -90,6 +93,11 @@ def join(parts: list[Part], plan: Plan, *, source: str, recipe: str, notes: list
         "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
     }
     return dataset
+
+
+def _covariate(parts: list[Part], name: str) -> NDArray[np.float64]:
+    """Return one covariate of all trials; NaN in sessions that do not tell it."""
+    return np.concatenate([part.covariates.get(name, np.full(len(part.labels), np.nan)) for part in parts])
 
 
 def _left_out(part: Part) -> str:

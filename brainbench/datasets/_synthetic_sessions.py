@@ -81,6 +81,7 @@ def as_recordings(geometry: Geometry, design: Design | None = None, *, seed: int
                         "layer": np.full(drawn.counts.shape[1], "", dtype="U1"),
                         "inhibitory": np.full(drawn.counts.shape[1], np.nan),
                     },
+                    covariates={},
                     tally=Tally(),
                     trials=len(labels),
                     units=drawn.counts.shape[1],

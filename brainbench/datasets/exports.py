@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from brainbench.datasets._extract import has_units, read_spikes, recorded_span
 from brainbench.datasets._nwb_writer import NwbWriter
+from brainbench.datasets.covariates import LICKS, lick_times
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.reading import Source, each_session, find_recordings
 from brainbench.datasets.recipes import resolve_selection
@@ -101,6 +102,8 @@ def subset(session: Session, selection: Selection = EVERYTHING, table: str = "tr
     for name, item in session.tables.items():
         rows = tally.select(item, selection.trials, "trials") if name == table else np.ones(len(item), dtype=bool)
         tables[name] = Table(name, _plain(item, rows), item.where)
+    if LICKS not in tables and (licks := lick_times(session)) is not None:
+        tables[LICKS] = Table(LICKS, {"start_time": licks, "stop_time": licks}, session.source)
     return replace(session, units=Table("units", columns, units.where), tables=tables, series={})
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from brainbench.datasets.covariates import LICKS
 from brainbench.datasets.sessions import Series, Session, Table, decode, text
 from brainbench.errors import DataError
 
@@ -63,7 +64,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         intracellular=_intracellular(file),
         modules={name: tuple(module) for name, module in _groups(file.get("processing"))},
         notes=tuple(notes),
-        series=dict(_series(file.get("acquisition"))),
+        series=dict([*_series(file.get("acquisition")), *_licks(file)]),
     )
 
 
@@ -105,6 +106,12 @@ def _series(parent: Any) -> Iterator[tuple[str, Series]]:
         if isinstance(begin, h5py.Dataset) and begin.shape == ():
             start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
         yield path, Series(path, _type(group), data, stamps, start, rate)
+
+
+def _licks(file: h5py.File) -> Iterator[tuple[str, Series]]:
+    """Licks, which are processed data with their own times."""
+    for _, module in _groups(file.get("processing")):
+        yield from (item for item in _series(module) if item[0].rpartition("/")[2] == LICKS)
 
 
 def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:

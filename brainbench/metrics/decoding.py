@@ -74,9 +74,9 @@ def decode(
         )
     if not np.isfinite(matrix).all():
         raise UsageError("Responses to be decoded must be finite; leave out units or trials with missing values.")
-    folds = [_fold(matrix, rows, stimulus) for stimulus in range(len(codes))]
     assignments = _assignments(codes, seed)
-    accuracy = np.array([[_correct(fold, codes_, rows, penalty) for fold in folds] for codes_ in assignments])
+    decoder = Decoder(matrix, rows, penalty=penalty)
+    accuracy = np.array([decoder(assignment) for assignment in assignments])
     means = accuracy.mean(axis=1)
     return Decoding(
         accuracy=float(means[0]),
@@ -86,6 +86,25 @@ def decode(
         correct=tuple(accuracy[0].tolist()),
         count=len(assignments),
     )
+
+
+class Decoder:
+    """Decodes any assignment of classes to the stimuli of the same rows.
+
+    Names of classes do not matter, so each partition of the stimuli is decoded once.
+    """
+
+    def __init__(self, matrix: Floats, rows: Ints, *, penalty: float = 1.0) -> None:
+        self._rows, self._penalty = rows, penalty
+        self._folds = [_fold(matrix, rows, stimulus) for stimulus in range(int(rows.max()) + 1)]
+        self._known: dict[tuple[int, ...], list[float]] = {}
+
+    def __call__(self, codes: Ints) -> list[float]:
+        """Return the share of each stimulus' rows decoded rightly [K], with classes ``codes`` [K]."""
+        partition = _partition(codes)
+        if partition not in self._known:
+            self._known[partition] = [_correct(fold, codes, self._rows, self._penalty) for fold in self._folds]
+        return self._known[partition]
 
 
 @dataclass(frozen=True)
@@ -134,6 +153,12 @@ def _fit(features: Floats, target: Ints, classes: int, penalty: float) -> tuple[
 
     found = minimize(loss, np.zeros((width + 1) * classes), jac=True, method="L-BFGS-B").x.reshape(width + 1, classes)
     return found[:-1], found[-1]
+
+
+def _partition(codes: Ints) -> tuple[int, ...]:
+    """Number the classes by first appearance."""
+    seen: dict[int, int] = {}
+    return tuple(seen.setdefault(code, len(seen)) for code in codes.tolist())
 
 
 def _assignments(codes: Ints, seed: int) -> list[Ints]:

@@ -166,6 +166,16 @@ def permuted_values(
     return np.concatenate([statistic(r) for r in found])
 
 
+def layer_p(null: Floats) -> tuple[Floats, Floats]:
+    """Return each layer's p [L], alone and corrected by the largest of all layers, from statistics [N, L].
+
+    The first row is the observed one; the correction is the maximum statistic (Nichols & Holmes 2002).
+    """
+    slack = TIE * np.maximum(1.0, np.abs(null[0]))
+    largest = null.max(axis=1, keepdims=True)
+    return (null >= null[0] - slack).mean(axis=0), (largest >= null[0] - slack).mean(axis=0)
+
+
 def smallest_p(stimuli: int) -> float:
     """Return the smallest p that permuting this many stimuli can give."""
     # Swapping two stimuli leaves their one distance as it is.

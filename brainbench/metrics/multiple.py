@@ -23,7 +23,7 @@ from brainbench.errors import UsageError, unknown_name
 from brainbench.metrics._animals import gather
 from brainbench.metrics._pairs import Floats, rdm_stack
 from brainbench.metrics.compare import check_comparison
-from brainbench.metrics.inference import SMALLEST_STIMULI, TIE, permuted_values
+from brainbench.metrics.inference import SMALLEST_STIMULI, TIE, layer_p, permuted_values
 from brainbench.metrics.intervals import t_interval
 from brainbench.metrics.score import score_with_test
 from brainbench.metrics.subject import SubjectRDM, is_flat
@@ -168,15 +168,9 @@ def layer_tests(
         seed=seed,
         device=device,
     )
-    largest = values.max(axis=1)
-    for row, index in enumerate(usable.tolist()):
-        observed = values[0, row]
-        nothing[index] = LayerTest(
-            nothing[index].layer,
-            float(observed),
-            float((values[:, row] >= observed - TIE).mean()),
-            float((largest >= observed - TIE).mean()),
-        )
+    found = zip(usable.tolist(), values[0].tolist(), *(p.tolist() for p in layer_p(values)), strict=True)
+    for index, observed, p, corrected in found:
+        nothing[index] = LayerTest(nothing[index].layer, observed, p, corrected)
     return tuple(nothing)
 
 

@@ -131,6 +131,21 @@ def variance_partition(
     )
 
 
+def partial_correlations(models: Floats, nuisances: Floats, brain: Floats) -> Floats:
+    """Return correlations [N] of models [N, P] with an animal [P], both without what nuisances [J, P] explain linearly.
+
+    NaN where nothing is left of either, or where the pairs are too few for so many nuisances.
+    """
+    if len(brain) < len(nuisances) + 3:
+        return np.full(len(models), np.nan)
+    rest = _without(nuisances)
+    residual = (brain @ rest)[None]
+    centred = brain - brain.mean()
+    if not (residual**2).sum() > 1e-20 * (centred**2).sum():
+        return np.full(len(models), np.nan)
+    return _partial(models, rest, residual, np.array([(centred**2).sum()]))[0][:, 0]
+
+
 def _without(rivals: Floats) -> Floats:
     """Return the symmetric projection [P, P] that takes away an intercept and the nuisances."""
     pairs = rivals.shape[1]

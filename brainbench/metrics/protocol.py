@@ -129,6 +129,8 @@ def list_metrics() -> tuple[str, ...]:
     """Return the names of the registered metrics, ours first."""
     # Ours register themselves when their module is imported.
     import brainbench.metrics.encoding
+    import brainbench.metrics.label_decoding
+    import brainbench.metrics.partial
     import brainbench.metrics.procrustes
     import brainbench.metrics.rsa  # noqa: F401
 

@@ -17,7 +17,7 @@ numbers of trials leave it unbiased.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,6 +59,8 @@ class TrialBlock:
     keys: Sequence[str] | None = None
     """[R] unique names of the trials, from which the random splits are drawn; None draws them from the
     trials' content. Either way the order of trials, sessions and units is irrelevant."""
+    covariates: Mapping[str, ArrayLike] = field(default_factory=dict, repr=False)
+    """What else was measured in every trial, such as contacts or licks: name → [R], NaN where unknown."""
 
 
 @dataclass(frozen=True)

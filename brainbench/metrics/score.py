@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from brainbench.metrics._animals import (
 from brainbench.metrics._pairs import Floats, rdm_stack
 from brainbench.metrics.bootstrap import bootstrap_animals
 from brainbench.metrics.compare import check_comparison, compare_all
-from brainbench.metrics.inference import SMALLEST_STIMULI, PermutationTest, permuted_statistic, smallest_p
+from brainbench.metrics.inference import SMALLEST_STIMULI, PermutationTest, layer_p, permuted_statistic, smallest_p
 from brainbench.metrics.intervals import t_interval
 from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
 from brainbench.metrics.noise import RELIABILITY_GATE
@@ -47,6 +47,8 @@ class _Choice:
     overall: int
     rule: str
     test: PermutationTest
+    layer_null: tuple[Floats, ...]
+    """Mean of every layer [n, L] under the orders of the stimuli, in parts; empty without a test."""
 
 
 def score_rdms(
@@ -145,7 +147,9 @@ def score_with_test(
         provenance={
             "statistics": {}
             if choice is None
-            else _statistics(rdms[defined], animals, choice, estimator, compare, seed),
+            else _statistics(
+                [names[index] for index in defined], rdms[defined], animals, choice, estimator, compare, seed
+            ),
             "seed": seed,
             "splits": max(len(subject.split_half_r) for subject in animals.subjects),
             "reliability_gate": RELIABILITY_GATE,
@@ -155,9 +159,9 @@ def score_with_test(
 
 
 def _statistics(
-    rdms: Floats, animals: Animals, choice: _Choice, estimator: str, comparison: str, seed: int
+    names: list[str], rdms: Floats, animals: Animals, choice: _Choice, estimator: str, comparison: str, seed: int
 ) -> dict[str, Any]:
-    """Return the Monte-Carlo errors, and the hierarchical bootstrap where the animals hold draws."""
+    """Return Monte-Carlo errors, every layer's p, and the hierarchical bootstrap where the animals hold draws."""
     scored = [animals.subjects[index] for index in animals.scored]
     found: dict[str, Any] = {
         "monte_carlo_error": {
@@ -165,6 +169,8 @@ def _statistics(
             "p": choice.test.monte_carlo_error,
         }
     }
+    if choice.layer_null:
+        found["layer_tests"] = layer_table(names, np.concatenate(choice.layer_null))
     held = min(len(subject.draws) for subject in scored)
     if estimator == "default" and held and all(subject.comparison == comparison for subject in scored):
         boot = bootstrap_animals(rdms, animals, comparison, draws=held, levels="all", seed=seed)
@@ -177,6 +183,14 @@ def _statistics(
         }
         found["monte_carlo_error"]["bootstrap_interval"] = boot.monte_carlo_error("percentile")
     return found
+
+
+def layer_table(names: Sequence[str], null: Floats) -> list[dict[str, Any]]:
+    """Return each layer's p, alone and corrected for the number of layers, from statistics [N, L]."""
+    return [
+        {"layer": name, "p": p, "p_corrected": corrected}
+        for name, p, corrected in zip(names, *(values.tolist() for values in layer_p(null)), strict=True)
+    ]
 
 
 def splits_error(values: Floats, split_half_r: Sequence[Floats]) -> float:
@@ -224,24 +238,34 @@ def _choose(
     r = compare_all(rdms, brain, method=comparison)
     count = len(animals.scored)
     every = np.arange(count)
+    means: list[Floats] = []
+
+    def test(statistic: Callable[[Floats], Floats]) -> PermutationTest:
+        """Test a statistic of r [N, L, A], and keep every layer's mean on the way."""
+
+        def kept(x: Floats) -> Floats:
+            means.append((x * factors).mean(axis=-1))
+            return statistic(x)
+
+        return permuted_statistic(rdms, brain, kept, method=comparison, **test_options)
+
     if len(rdms) == 1:
-        test = permuted_statistic(rdms, brain, lambda x: x[:, 0] @ factors / count, method=comparison, **test_options)
-        return _Choice(r[0], r[0] * factors, (0,) * count, 0, "only layer", test)
+        alone = test(lambda x: x[:, 0] @ factors / count)
+        return _Choice(r[0], r[0] * factors, (0,) * count, 0, "only layer", alone, tuple(means))
     # The published rule; the test takes the same maximum, so its p stays honest where the value is not.
     if estimator != "default":
         best = first_best((r * factors).mean(axis=1))
-        test = permuted_statistic(
-            rdms, brain, lambda x: (x * factors).mean(axis=-1).max(axis=-1), method=comparison, **test_options
-        )
+        largest = test(lambda x: (x * factors).mean(axis=-1).max(axis=-1))
         rule = "maximum over layers on the data that are scored (as published; optimistic)"
-        return _Choice(r[best], r[best] * factors, (best,) * count, best, rule, test)
+        return _Choice(r[best], r[best] * factors, (best,) * count, best, rule, largest, tuple(means))
     if count == 1:
         return _choose_on_halves(rdms, animals.subjects[animals.scored[0]], comparison, test_options)
     chosen = choose_on_others(r)
-    test = permuted_statistic(rdms, brain, lambda x: held_out(x) @ factors / count, method=comparison, **test_options)
+    held = test(lambda x: held_out(x) @ factors / count)
     rule = "chosen on the other animals, evaluated on the animal held out"
     picked = r[chosen, every]
-    return _Choice(picked, picked * factors, tuple(chosen.tolist()), most_chosen(chosen), rule, test)
+    layers = tuple(chosen.tolist())
+    return _Choice(picked, picked * factors, layers, most_chosen(chosen), rule, held, tuple(means))
 
 
 def _choose_on_halves(
@@ -258,15 +282,17 @@ def _choose_on_halves(
     agreement = subject.split_half_by(comparison)
     factor = 1 / math.sqrt(float(agreement[np.isfinite(agreement)].mean()))
     some = halves[:_HALVES_IN_PERMUTATIONS]
+    means: list[Floats] = []
 
     def statistic(x: Floats) -> Floats:
+        means.append(x.mean(axis=-1) * factor)
         pair = x.reshape(*x.shape[:-1], len(some), 2)
         return choose_on_halves(pair[..., 0], pair[..., 1])[1].mean(axis=-1) * factor
 
     test = permuted_statistic(rdms, some.reshape(2 * len(some), -1), statistic, method=comparison, **test_options)
     rule = "chosen on one half of the only reliable animal's trials, evaluated on the other half"
     mean, layer = float(held.mean()), most_chosen(chosen)
-    return _Choice(np.array([mean]), np.array([mean * factor]), (layer,), layer, rule, test)
+    return _Choice(np.array([mean]), np.array([mean * factor]), (layer,), layer, rule, test, tuple(means))
 
 
 def _verdict(

@@ -74,7 +74,7 @@ def reliable_units(
     for block, value in zip(blocks, values, strict=True):
         good = value >= least
         if good.any():
-            kept.append(TrialBlock(np.asarray(block.responses)[:, good], block.labels, block.keys))
+            kept.append(TrialBlock(np.asarray(block.responses)[:, good], block.labels, block.keys, block.covariates))
     every = sum(len(value) for value in values)
     left = sum(int((~(value >= least)).sum()) for value in values)
     return tuple(kept), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

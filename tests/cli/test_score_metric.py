@@ -5,7 +5,7 @@ import pytest
 from tests.cli.test_commands import files  # noqa: F401
 
 
-@pytest.mark.parametrize("metric", ["ridge", "cka", "procrustes", "rsa-crossnobis"])
+@pytest.mark.parametrize("metric", ["ridge", "cka", "procrustes", "rsa-crossnobis", "rsa-partial", "decoding"])
 def test_a_score_by_another_metric_has_record_and_report(run, files, metric):  # noqa: F811
     found = run(
         *("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture"),
@@ -25,6 +25,19 @@ def test_the_text_names_the_metric_and_an_unknown_one_is_refused(run, files):  #
     wrong = run(*arguments, "--metric", "rigde", "--out", files["out"])
     assert wrong.status == 2
     assert "did you mean 'ridge'" in wrong.err
+
+
+def test_decoding_and_partial_rsa_print_what_they_add_and_layers_have_p_in_json(run, files):  # noqa: F811
+    arguments = ("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture")
+    found = run(*arguments, "--metric", "decoding", "--out", files["out"])
+    assert found.status == 0, found.err
+    assert "name no property" in found.out or "Decoding of stimuli left out" in found.out
+    assert "As much like the animals" not in found.out
+    data = json.loads(run(*arguments, "--out", files["out"], "--json").out)
+    score = data["record"]["score"]
+    tests = {item["layer"]: item for item in score["provenance"]["statistics"]["layer_tests"]}
+    assert set(tests) == {item["layer"] for item in score["layers"]}
+    assert all(0 < item["p"] <= item["p_corrected"] <= 1 for item in tests.values())
 
 
 def test_the_walk_from_the_published_estimator_is_printed_and_recorded(run, files):  # noqa: F811
