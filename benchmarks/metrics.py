@@ -1,10 +1,12 @@
 """Speed and memory of the metrics beside rsatoolbox 0.3.2, same definitions, one run.
 
     PYTHONPATH=. python benchmarks/metrics.py [--large] [--write]
+    PYTHONPATH=. python benchmarks/metrics.py --parity [--write]
     PYTHONPATH=. python benchmarks/metrics.py --device cuda [--write]
 
 ``--large`` adds the RDM of 2,000 stimuli and 100,000 units; ``--device`` times instead what a torch device
-computes beside numpy, with the largest difference; ``--write`` puts the tables into RESULTS.md.
+computes beside numpy, with the largest difference; ``--parity`` compares every method and comparison with
+rsatoolbox on balanced data; ``--write`` puts the tables into RESULTS.md.
 """
 
 from __future__ import annotations
@@ -145,6 +147,70 @@ def _ceiling(brain: np.ndarray, method: str) -> tuple[float, float]:
     return tuple(noise_ceiling(brain, method=method))
 
 
+def parity_rows() -> list[list[str]]:
+    """Measure how far every RDM method and comparison is from rsatoolbox on balanced data, in 20 draws."""
+    from rsatoolbox.data import Dataset
+    from rsatoolbox.data.noise import prec_from_unbalanced
+    from rsatoolbox.inference.noise_ceiling import boot_noise_ceiling
+    from rsatoolbox.rdm import RDMs, calc_rdm
+    from rsatoolbox.rdm import compare as their_compare
+
+    from brainbench.metrics import compare, noise_ceiling
+
+    methods = {
+        "correlation": "correlation",
+        "sqeuclidean": "euclidean",
+        "mahalanobis": "mahalanobis",
+        "crossnobis": "crossnobis",
+        "poisson": "poisson",
+    }
+    comparisons = {
+        "pearson": "corr",
+        "spearman": "spearman",
+        "rho-a": "rho-a",
+        "tau-a": "tau-a",
+        "tau-b": "kendall",
+        "cosine": "cosine",
+        "whitened-cosine": "cosine_cov",
+        "whitened-pearson": "corr_cov",
+    }
+    worst: dict[str, float] = {}
+
+    def note(what: str, theirs: object, ours: object) -> None:
+        theirs, ours = np.asarray(theirs), np.asarray(ours)
+        error = float((np.abs(theirs - ours) / np.maximum(1.0, np.abs(theirs))).max())
+        worst[what] = max(worst.get(what, 0.0), error)
+
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        labels, folds = np.repeat(np.arange(6), 20), np.tile(np.arange(5), 24)
+        trials = rng.gamma(2.0, 2.0, (6, 40))[labels] + rng.gamma(1.0, 1.0, (120, 40))
+        data = Dataset(trials, obs_descriptors={"stimulus": labels, "fold": folds})
+        for noise in ("shrinkage_diag", "shrinkage_eye", "diag", "full"):
+            theirs = prec_from_unbalanced(data, "stimulus", method=noise)
+            note(f"noise precision, {noise}", theirs, noise_precision(trials, labels, method=noise))
+        precision = noise_precision(trials, labels)
+        for ours, theirs in methods.items():
+            given = {"noise": precision} if ours in ("mahalanobis", "crossnobis") else {}
+            cross = {"cv_descriptor": "fold"} if ours == "crossnobis" else {}
+            found = calc_rdm(data, method=theirs, descriptor="stimulus", **given, **cross).dissimilarities[0]
+            weight = precision if given else None
+            note(
+                f"RDM, {ours}",
+                found,
+                rdm(trials, labels, method=ours, precision=weight, folds=folds if cross else None),
+            )
+        stack = np.stack([rdm(rng.normal(size=(6, 12))).round(2) for _ in range(7)])
+        for ours, theirs in comparisons.items():
+            pair = their_compare(RDMs(stack[:3]), RDMs(stack[3:]), method=theirs)
+            note(f"comparison, {ours}", pair, compare(stack[:3, None], stack[3:], method=ours))
+        animals = RDMs(stack, rdm_descriptors={"index": np.arange(7)})
+        for ours, theirs in (("pearson", "corr"), ("cosine", "cosine"), ("rho-a", "rho-a"), ("spearman", "spearman")):
+            bounds = boot_noise_ceiling(animals, method=theirs, rdm_descriptor="index")
+            note(f"noise ceiling, {ours}", bounds, tuple(noise_ceiling(stack, method=ours)))
+    return [[what, f"{error:.0e}"] for what, error in worst.items()]
+
+
 def make_animals(count: int = 11, units: int = 91, repeats: int = 60) -> list[TrialBlock]:
     """Sessions of the size of the Rodgers recordings: 999 units over 11 animals."""
     rng = np.random.default_rng(1)
@@ -250,8 +316,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--large", action="store_true")
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--parity", action="store_true")
     parser.add_argument("--device")
     options = parser.parse_args()
+    if options.parity:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            body = table(["quantity", "largest relative difference"], parity_rows())
+        print(body)
+        if options.write:
+            command = "PYTHONPATH=. python benchmarks/metrics.py --parity --write"
+            write_section("Metrics: parity with rsatoolbox", command, body)
+        return
     if options.device:
         columns = ["job", "numpy ms", f"{options.device} ms", "already there ms", "ratio", "largest difference"]
         body = table(columns, device_rows(options.device))
