@@ -13,6 +13,9 @@ device in the same precision.
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -109,19 +112,20 @@ def training_step(module: Any, model: Any, x: torch.Tensor, labels: torch.Tensor
 
 
 def train_part(options: argparse.Namespace, device: torch.device) -> str:
-    x, labels = sweeps(options.batch, device), torch.randint(117, (options.batch,), device=device)
+    x = sweeps(2, device)
     model = load_model(options.model).to(device).eval()
     with torch.no_grad():
-        torch.testing.assert_close(Loop(model)(x[:2]), model(x[:2]), atol=1e-3, rtol=1e-3)
+        torch.testing.assert_close(Loop(model)(x), model(x), atol=1e-3, rtol=1e-3)
     operations = 2 * describe_model(options.model).multiply_adds * STEPS
-    half = lambda: torch.autocast(device.type, dtype=torch.bfloat16)  # noqa: E731
-    rows, rates, ceilings = [], {}, {"float32": ceiling(device, torch.float32), "bf16": ceiling(device, torch.bfloat16)}
+    rows, rates, failed = [], {}, []
+    ceilings = {"float32": ceiling(device, torch.float32), "bf16": ceiling(device, torch.bfloat16)}
+    print("ceilings [TFLOP/s]", {key: round(value / 1e12, 3) for key, value in ceilings.items()}, flush=True)
     for who in options.who.split(","):
         peer, precision, how = who.split(":")
-        try:
-            timed = time_one(options, device, peer, how, half if precision == "bf16" else nullcontext, x, labels)
-        except Exception as error:  # noqa: BLE001 - the others are still worth measuring
-            print(f"{who} failed: {type(error).__name__}: {error}", flush=True)
+        timed = time_apart(options, who)
+        if isinstance(timed, str):
+            failed.append(f"{who}: {timed}")
+            print(failed[-1], flush=True)
             continue
         first, seconds, forward, memory = timed
         rates[who] = options.batch / seconds
@@ -145,6 +149,8 @@ def train_part(options: argparse.Namespace, device: torch.device) -> str:
         "memory GB",
     ]
     reference = rates.get("loop:float32:off")
+    if not rates:
+        return "\n".join(failed)
     best = max(rates, key=lambda who: rates[who])
     text = (
         f"{options.model}, batch {options.batch} × {STEPS} steps. Ceiling: float32 {ceilings['float32'] / 1e12:.3g}, "
@@ -154,22 +160,34 @@ def train_part(options: argparse.Namespace, device: torch.device) -> str:
     peers = [rate for who, rate in rates.items() if who.startswith("loop") and who != "loop:float32:off"]
     text += f", {rates[best] / max(peers):.2f} × the best other loop" if peers else ""
     hours = 100 * 100_000 / rates[best] / 60
-    return f"{text}. 100 epochs of 100,000 sweeps: {hours:,.0f} minutes."
+    text += f". 100 epochs of 100,000 sweeps: {hours:,.0f} minutes."
+    return text + "".join(f"\n\nNot measured: {reason}." for reason in failed)
 
 
-def time_one(
-    options: argparse.Namespace,
-    device: torch.device,
-    peer: str,
-    how: str,
-    autocast: Any,
-    x: torch.Tensor,
-    labels: torch.Tensor,
-) -> tuple[float, float, float, float]:
+def time_apart(options: argparse.Namespace, who: str) -> list[float] | str:
+    """Return what :func:`time_one` finds in a process of its own, or why it found nothing."""
+    words = [sys.executable, __file__, "--one", who, "--model", options.model, "--batch", str(options.batch)]
+    words += ["--repeats", str(options.repeats), "--device", options.device]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=options.limit, check=False)
+    except subprocess.TimeoutExpired:
+        return f"not done after {options.limit:g} s"
+    if done.returncode:
+        print(done.stderr[-1500:], flush=True)
+        return f"failed ({done.stderr.strip().splitlines()[-1][:200]})"
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def time_one(options: argparse.Namespace, device: torch.device) -> tuple[float, float, float, float]:
     """Return seconds of the first step, of a step and of a forward pass, and the memory at most [GB]."""
+    peer, precision, how = options.one.split(":")
+    x, labels = sweeps(options.batch, device), torch.randint(117, (options.batch,), device=device)
+
+    def autocast() -> Any:
+        return torch.autocast(device.type, dtype=torch.bfloat16) if precision == "bf16" else nullcontext()
+
     if device.type == "cuda":
-        torch.cuda.empty_cache()
-        torch.cuda.reset_peak_memory_stats()
+        torch.backends.cudnn.benchmark = True
     model = load_model(options.model).to(device).train()
     recorded = how in ("captured", "graphs") and device.type == "cuda" and peer == "ours"
     if device.type == "cuda" and peer == "ours":
@@ -265,9 +283,14 @@ def main() -> None:
         help="comma-separated PEER:PRECISION:COMPILED with loop|ours, float32|bf16, off|parts|default|graphs, for ours "
         "also captured (recorded) and fused (cells compiled); graphs is both",
     )
+    parser.add_argument("--limit", type=float, default=240.0, help="seconds that one row may take")
+    parser.add_argument("--one", help=argparse.SUPPRESS)
     parser.add_argument("--write", action="store_true", help="write the section into RESULTS.md")
     options = parser.parse_args()
     device = torch.device(options.device)
+    if options.one:
+        print(json.dumps(time_one(options, device)))
+        return
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} threads"
     body = f"{name}. " + PARTS[options.part](options, device)
     print(f"\n{body}")

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import logging
 import math
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -37,6 +38,8 @@ from brainbench.models.training.state import load_state, save_state
 STATE, BEST, RESULT, LOG = "state.safetensors", "best", "result.json", "log.jsonl"
 EVALUATED = 512
 _log = logging.getLogger("train_zoo")
+_drawing = threading.Lock()
+"""Initial weights come from PyTorch's own generator, which threads share."""
 
 
 class Split:
@@ -100,8 +103,8 @@ class Trainer:
         self.job, self.data, self.device, self.precision = job, data, device, precision
         self.config = dataclasses.replace(job.config(epochs), precision=precision)
         self.options = {"classes": len(data.classes), "decoder": self.config.decoder}
-        model = load_model(job.model, seed=job.seed, **self.options)
-        with seeded(job.seed):
+        with _drawing, seeded(job.seed):
+            model = load_model(job.model, seed=job.seed, **self.options)
             self.learner: Any = make_learner(job.objective, model).to(device)
         if device.type == "cuda":
             self.learner = self.learner.to(memory_format=torch.channels_last)
@@ -127,17 +130,17 @@ class Trainer:
         self.kept: dict[str, torch.Tensor] = {}
         self.seconds = 0.0
 
-    def prepare(self, *, fused: bool = True, graphs: bool = True) -> None:
+    def prepare(self, alone: Any, together: Any, *, fused: bool = True, graphs: bool = True) -> None:
         """Warm up and capture the training step and the validation step; the network is as new afterwards."""
         fuse(self.learner, fused and self.device.type == "cuda")
         start = {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
         self._set_epoch(0)
         self.learner.train()
-        generators = (self.generator,)
-        self.step = captured(self._step, self.device, generators=generators) if graphs else self._step
+        options = {"generators": (self.generator,), "alone": alone, "together": together}
+        self.step = captured(self._step, self.device, **options) if graphs else self._step
         self.learner.eval()
         with torch.no_grad():
-            self.check = captured(self._check, self.device, generators=generators) if graphs else self._check
+            self.check = captured(self._check, self.device, **options) if graphs else self._check
         copy_state(self.learner, start)
         reset_optimizer(self.optimizer)
         self.kept = {name: value.clone() for name, value in self.learner.state_dict().items()}
@@ -340,7 +343,8 @@ def publish(
 def evaluate_untrained(job: Job, data: Resident, out: Path, device: torch.device) -> dict[str, Any]:
     """Probe and evaluate a network as it was drawn."""
     config = dataclasses.replace(Job(job.model, "simclr", seed=job.seed).config(1), precision="float32")
-    model = load_model(job.model, seed=job.seed, classes=len(data.classes)).to(device)
+    with _drawing:
+        model = load_model(job.model, seed=job.seed, classes=len(data.classes)).to(device)
     fit_probe(
         model, data.train.batches(), classes=len(data.classes), epochs=config.probe_epochs, seed=job.seed, device=device
     )
@@ -393,12 +397,11 @@ def run_job(
     if state and state["data"] != data.hash:
         _log.warning("%s: the state belongs to other data; starting anew", job.name)
         state = None
-    with exclusive():
-        started = time.monotonic()
-        trainer = prepared_trainer(job, data, device, epochs, precision)
-        if state:
-            trainer.load(out / STATE)
-        prepared = time.monotonic() - started
+    started = time.monotonic()
+    trainer = prepared_trainer(job, data, device, epochs, precision, exclusive, long)
+    if state:
+        trainer.load(out / STATE)
+    prepared = time.monotonic() - started
     log = (out / LOG).open("a", encoding="utf-8")
 
     def note(**values: Any) -> None:
@@ -446,17 +449,20 @@ def run_job(
     return status
 
 
-def prepared_trainer(job: Job, data: Resident, device: torch.device, epochs: int, precision: str) -> Trainer:
+def prepared_trainer(
+    job: Job, data: Resident, device: torch.device, epochs: int, precision: str, alone: Any, together: Any
+) -> Trainer:
     """Return a trainer, in the fastest way that works here."""
     for fused, graphs in ((True, True), (False, True), (False, False)):
-        trainer = Trainer(job, data, device, epochs, precision)
+        with together():
+            trainer = Trainer(job, data, device, epochs, precision)
         try:
-            trainer.prepare(fused=fused, graphs=graphs)
+            trainer.prepare(alone, together, fused=fused, graphs=graphs)
         except Exception:  # compilers and drivers fail in many ways
             if not graphs or device.type != "cuda":
                 raise
             _log.exception("%s: fused %s, recorded %s does not work here", job.name, fused, graphs)
-            torch.cuda.synchronize(device)
+            torch.cuda.current_stream(device).synchronize()
         else:
             return trainer
     raise RuntimeError("unreachable")

@@ -7,6 +7,7 @@ takes longest. A captured step reads its inputs from tensors that stay in place.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -24,6 +25,8 @@ def captured(
     *,
     generators: Sequence[torch.Generator] = (),
     warm_up: int = WARM_UP,
+    together: Callable[[], AbstractContextManager[Any]] = nullcontext,
+    alone: Callable[[], AbstractContextManager[Any]] = nullcontext,
 ) -> Callable[[], None]:
     """Run ``work`` a few times and record it; return what repeats it. On the CPU that is ``work`` itself.
 
@@ -32,25 +35,29 @@ def captured(
         device: Where it works.
         generators: Random numbers it draws, beside PyTorch's own on the device.
         warm_up: Runs before the recording.
+        together: Entered for these runs, and left before the recording.
+        alone: Entered for the recording, during which nothing else may use the device.
 
     What the runs before the recording change (weights, counters) stays changed: see :func:`reset_optimizer`.
     """
     if device.type != "cuda":
-        for _ in range(warm_up):
-            work()
+        with together():
+            for _ in range(warm_up):
+                work()
         return work
-    side = torch.cuda.Stream(device)
-    side.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(side):
-        for _ in range(warm_up):
-            work()
-    torch.cuda.current_stream(device).wait_stream(side)
-    torch.cuda.synchronize(device)
+    with together():
+        side = torch.cuda.Stream(device)
+        side.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(side):
+            for _ in range(warm_up):
+                work()
+        torch.cuda.current_stream(device).wait_stream(side)
+        side.synchronize()
     graph = torch.cuda.CUDAGraph()
     for generator in generators:
         graph.register_generator_state(generator)
     # Other threads may train on the same device meanwhile.
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+    with alone(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
         work()
     return graph.replay
 
