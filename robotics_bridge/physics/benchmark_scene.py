@@ -15,16 +15,17 @@ ROWS = 4
 
 
 def pyramid() -> Any:
-    """Return the ``mujoco.MjModel`` of the pyramid: links ``box0`` … ``box9``, row by row from below, time step 0.01 s.
+    """Return the ``mujoco.MjModel`` of the pyramid: links ``box0`` … ``box9``, time step 0.01 s.
 
+    Numbers run up each leaning column, so that ``box1`` rests on ``box0`` (and on its neighbour), as published.
     The boxes start one thousandth of an edge into one another, so that the published warm-up settles them.
     """
     import mujoco
 
     half, pitch = EDGE / 2, EDGE * SPACING
     boxes = []
-    for level in range(ROWS):
-        for column in range(ROWS - level):
+    for column in range(ROWS):
+        for level in range(ROWS - column):
             x, z = (column + level / 2) * pitch, half + level * pitch
             boxes.append(
                 f'<body name="box{len(boxes)}" pos="{x} 0 {z}"><freejoint/>'

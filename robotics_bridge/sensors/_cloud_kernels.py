@@ -38,12 +38,12 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
     import warp as wp
 
     io = io_functions(mode, hysteresis, walk)
-    emit, lost, idle = io.emit, io.lost, io.idle
+    emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
     types, pairs_type, structs = io_structs(), pair_structs().Pairs, cloud_structs()
     probes_type, io_type = types.ProbeSet, types.Io
     cloud_type, law_type = structs.Cloud, structs.ProximityParams
     noise = noise_functions()
-    params_type, radius_noise, gain = noise.NoiseParams, noise.radius_noise, noise.gain
+    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
 
     @wp.func
     def wrench(
@@ -144,10 +144,10 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
         normal = probes.normal[n]
         truth = wrench(laws[part], density, x, normal, mass[0], moment, slip)
         signal = truth
+        fixed = wp.vec3f(1.0, 0.0, 0.0)
         if wp.static(mode != CLEAN):
-            scale = gain(knobs[part], env + io.env_offset, probe, episode)
-            signal = scale * wrench(laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
-        for channel in range(6):
-            emit(io, knobs[part], env, n, probe, channel, age, episode, truth[channel], signal[channel])
+            fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
+            signal = fixed[0] * wrench(laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
+        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, 6, truth, signal)
 
     return proximity

@@ -76,6 +76,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int) -> Any:
         io: io_type,
         knobs: wp.array(dtype=params_type),
         stamp: wp.array2d(dtype=wp.int32),
+        exponent: wp.array(dtype=wp.float32),
         height: wp.array3d(dtype=wp.float32),
     ):
         env, n = wp.tid()
@@ -93,6 +94,15 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int) -> Any:
         height[0, env, n] = h
         if wp.static(planes == 2):
             height[1, env, n] = noisy
+        # The bulge h^α is asked for by many markers, so it is raised once.
+        for plane in range(wp.static(planes)):
+            value = h
+            if plane == 1:
+                value = noisy
+            raised = float(0.0)
+            if value > 0.0:
+                raised = wp.pow(value, exponent[part])
+            height[wp.static(planes) + plane, env, n] = raised
 
     return indent
 
@@ -138,7 +148,7 @@ def spread_kernel(planes: int) -> Any:
                     w = weights[part, 0, wp.abs(away)]
                     plain += h * w
                     tilted += h * w * float(away) * gel.step_x
-                    raised += wp.pow(h, gel.exponent) * w
+                    raised += height[wp.static(planes) + plane, env, row + source] * w
             out[3 * plane, env, n] = plain
             out[3 * plane + 1, env, n] = tilted
             out[3 * plane + 2, env, n] = raised
@@ -151,8 +161,8 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
     """Return the kernel that follows surface points inside the elastomer (before 4.20). Dim [B, S].
 
     A point sets its anchor where it sinks below −enter and loses it above +leave, or when its geometry no longer
-    touches. Points with an anchor are listed without gaps, in a fixed order: place (3), way since the anchor (3),
-    depth. Anchors are [P, 3, B] (x NaN: none), the list is [P, 7, B]: threads are environments.
+    touches. Points with an anchor are listed without gaps, in a fixed order, if they moved since: place (3) and
+    s_s h times the way since the anchor (3). Anchors are [P, 3, B] (x NaN: none): threads are environments.
     """
     import warp as wp
 
@@ -171,7 +181,8 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
         io: io_type,
         anchor: wp.array3d(dtype=wp.float32),
         live: wp.array2d(dtype=wp.int32),
-        listed: wp.array3d(dtype=wp.float32),
+        moved: wp.array2d(dtype=wp.int32),
+        listed: wp.array2d(dtype=wp.spatial_vectorf),
     ):
         env, part = wp.tid()
         gel = gels[part]
@@ -179,16 +190,19 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
         fresh = io.age[env] == 0
         if (io.status[env] & 1) != 0:
             live[part, env] = 0
+            moved[part, env] = 0
             return
         if fresh:
             live[part, env] = 0
         if count == 0 and live[part, env] == 0:
+            moved[part, env] = 0
             return
         row = env % cloud.first.shape[0]
         solid_row = env % solids.kind.shape[0]
         # After a lull (none alive) every stored anchor is stale.
         stale = live[part, env] == 0
         found = int(0)
+        alive = int(0)
         place = int(gel.first_point)
         for member in range(tracked.shape[0]):
             geometry = tracked[member]
@@ -232,21 +246,22 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
                                 kept = wp.static(float("nan"))
                                 anchor[index, 0, env] = kept
                             if not wp.isnan(kept):
-                                spot = gel.first_point + found
-                                listed[spot, 0, env] = z[0]
-                                listed[spot, 1, env] = z[1]
-                                listed[spot, 2, env] = z[2]
-                                listed[spot, 3, env] = z[0] - anchor[index, 0, env]
-                                listed[spot, 4, env] = z[1] - anchor[index, 1, env]
-                                listed[spot, 5, env] = z[2] - anchor[index, 2, env]
-                                listed[spot, 6, env] = wp.max(-phi, 0.0)
-                                found += 1
+                                drive = gel.shear * wp.max(-phi, 0.0)
+                                way = z - wp.vec3f(anchor[index, 0, env], anchor[index, 1, env], anchor[index, 2, env])
+                                if drive * wp.length_sq(way) > 0.0:
+                                    way = drive * way
+                                    listed[gel.first_point + found, env] = wp.spatial_vectorf(
+                                        z[0], z[1], z[2], way[0], way[1], way[2]
+                                    )
+                                    found += 1
+                                alive += 1
                         elif stale:
                             anchor[index, 0, env] = kept
                     else:
                         anchor[index, 0, env] = wp.static(float("nan"))
             place += blocks * wp.static(BLOCK)
-        live[part, env] = found
+        live[part, env] = alive
+        moved[part, env] = found
 
     return anchors
 
@@ -266,11 +281,11 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
     import warp as wp
 
     io = io_functions(mode, hysteresis, walk)
-    emit, lost, idle = io.emit, io.lost, io.idle
+    emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
     types, gel_type = io_structs(), elastomer_structs().Gel
     probes_type, io_type = types.ProbeSet, types.Io
     noise = noise_functions()
-    params_type, gain = noise.NoiseParams, noise.gain
+    params_type = noise.NoiseParams
 
     @wp.func
     def across_plane(v: wp.vec3f, n: wp.vec3f) -> wp.vec3f:
@@ -299,7 +314,7 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
         height: wp.array3d(dtype=wp.float32),
         spread: wp.array3d(dtype=wp.float32),
         live: wp.array2d(dtype=wp.int32),
-        listed: wp.array3d(dtype=wp.float32),
+        listed: wp.array2d(dtype=wp.spatial_vectorf),
     ):
         env, n = wp.tid()
         if probes.radius[n] <= 0.0:
@@ -345,7 +360,8 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
                         if h > 0.0:
                             away = across_plane(x - probes.position[gel.start + source], normal)
                             w = wp.exp(-gel.spread * wp.dot(away, away))
-                            u += gel.dilate * w * (h * away + wp.pow(h, gel.exponent) * normal)
+                            bulge = height[wp.static(planes) + plane, env, gel.start + source]
+                            u += gel.dilate * w * (h * away + bulge * normal)
                 if wp.static(layered):
                     if gel.expansion != 0.0:
                         for source in range(gel.rows * gel.columns):
@@ -367,29 +383,27 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
                     signal = u
         slide = wp.vec3f(0.0)
         for k in range(live[part, env]):
-            at = gel.first_point + k
-            h = listed[at, 6, env]
-            if h > 0.0:
-                z = wp.vec3f(listed[at, 0, env], listed[at, 1, env], listed[at, 2, env])
-                slip = across_plane(wp.vec3f(listed[at, 3, env], listed[at, 4, env], listed[at, 5, env]), normal)
-                away = across_plane(x - z, normal)
-                if wp.static(layered):
-                    if gel.layered == 1:
-                        slide += gel.shear * h * traction(gel, away, slip)
-                    else:
-                        slide += gel.shear * h * wp.exp(-gel.smear * wp.dot(away, away)) * slip
+            point = listed[gel.first_point + k, env]
+            slip = across_plane(wp.vec3f(point[3], point[4], point[5]), normal)
+            away = across_plane(x - wp.vec3f(point[0], point[1], point[2]), normal)
+            if wp.static(layered):
+                if gel.layered == 1:
+                    slide += traction(gel, away, slip)
                 else:
-                    slide += gel.shear * h * wp.exp(-gel.smear * wp.dot(away, away)) * slip
+                    slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
+            else:
+                slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
         if wp.static(planes == 1):
             signal = truth
         truth += slide
         age = io.age[env]
         episode = io.episode[env]
-        scale = float(1.0)
+        fixed = wp.vec3f(1.0, 0.0, 0.0)
         if wp.static(mode > 0):
-            scale = gain(knobs[part], env + io.env_offset, probe, episode)
-        signal = scale * (signal + slide)
-        for channel in range(3):
-            emit(io, knobs[part], env, n, probe, channel, age, episode, truth[channel], signal[channel])
+            fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
+        signal = fixed[0] * (signal + slide)
+        all_truth = wp.spatial_vectorf(truth[0], truth[1], truth[2], 0.0, 0.0, 0.0)
+        all_signal = wp.spatial_vectorf(signal[0], signal[1], signal[2], 0.0, 0.0, 0.0)
+        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, 3, all_truth, all_signal)
 
     return markers

@@ -44,7 +44,8 @@ def io_structs() -> SimpleNamespace:
 def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
     """Return the functions that write a reading.
 
-    ``emit(io, knobs, env, n, probe, channel, truth, signal)`` writes one channel; ``measure`` returns the measured
+    ``emit(io, knobs, env, n, probe, channel, truth, signal)`` writes one channel, ``emit_six`` up to six, drawing all
+    that they share once (``fixed`` is what ``episode_draw`` gave); ``measure`` returns the measured
     value and stores its memories without writing it; ``lost(io, channels, env, n)`` marks a diverged environment.
 
     Args:
@@ -59,6 +60,8 @@ def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
     io_type = io_structs().Io
     noise = noise_functions()
     params_type, apply_noise = noise.NoiseParams, noise.apply_noise
+    apply_drawn, decay = noise.apply_drawn, noise.decay
+    episode_draw, pair_normals = noise.episode_draw, noise.pair_normals
 
     @wp.func
     def measure(
@@ -106,6 +109,49 @@ def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
             io.measured[channel, env, n] = signal
 
     @wp.func
+    def emit_six(
+        io: io_type,
+        knobs: params_type,
+        env: int,
+        n: int,
+        probe: int,
+        age: int,
+        episode: int,
+        fixed: wp.vec3f,
+        channels: int,
+        truth: wp.spatial_vectorf,
+        signal: wp.spatial_vectorf,
+    ):
+        fading = float(0.0)
+        if wp.static(hysteresis and mode == FUSED):
+            if knobs.hysteresis != 0.0:
+                fading = decay(io.dt / knobs.tau)
+        for pair in range((channels + 1) // 2):
+            z = wp.vec4f(0.0)
+            if wp.static(mode == FUSED):
+                z = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
+            for odd in range(2):
+                channel = 2 * pair + odd
+                if channel < channels:
+                    io.truth[channel, env, n] = truth[channel]
+                    if wp.static(mode == STAGED):
+                        io.measured[channel, env, n] = signal[channel]
+                    if wp.static(mode == FUSED):
+                        lag = float(0.0)
+                        drift = float(0.0)
+                        if age > 0:
+                            if wp.static(hysteresis):
+                                lag = io.hysteresis[channel, env, n]
+                            if wp.static(walk):
+                                drift = io.walk[channel, env, n]
+                        y = apply_drawn(knobs, signal[channel], z[2 * odd], z[2 * odd + 1], fixed, fading, lag, drift)
+                        io.measured[channel, env, n] = y[0]
+                        if wp.static(hysteresis):
+                            io.hysteresis[channel, env, n] = y[1]
+                        if wp.static(walk):
+                            io.walk[channel, env, n] = y[2]
+
+    @wp.func
     def lost(io: io_type, channels: int, env: int, n: int):
         for channel in range(channels):
             io.truth[channel, env, n] = wp.static(float("nan"))
@@ -119,7 +165,9 @@ def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
             if wp.static(mode != CLEAN):
                 io.measured[channel, env, n] = 0.0
 
-    return SimpleNamespace(emit=emit, measure=measure, lost=lost, idle=idle)
+    return SimpleNamespace(
+        emit=emit, emit_six=emit_six, episode_draw=episode_draw, measure=measure, lost=lost, idle=idle
+    )
 
 
 @cache

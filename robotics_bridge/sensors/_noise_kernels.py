@@ -154,14 +154,6 @@ def noise_functions() -> SimpleNamespace:
         return p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
 
     @wp.func
-    def channel_normals(p: NoiseParams, env: int, probe: int, channel: int, age: int, episode: int) -> wp.vec2:
-        """Return the normal numbers of white noise and random walk; channels 2k and 2k + 1 share one Philox call."""
-        w0, w1, w2, w3 = draw(p, env, probe, age, episode, wp.static(CHANNELS) + channel // 2)
-        if channel % 2 == 0:
-            return normals(w0, w1)
-        return normals(w2, w3)
-
-    @wp.func
     def decay(t: float) -> float:
         """Return exp(−t) for t ≥ 0, by a series."""
         n = wp.min(wp.floor(t * float(1.4426950408889634) + float(0.5)), float(126.0))
@@ -172,6 +164,71 @@ def noise_functions() -> SimpleNamespace:
         for _ in range(int(n)):
             series = series * float(0.5)
         return series
+
+    @wp.func
+    def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, episode: int) -> wp.vec4:
+        """Return (white, walk) of channel 2 ``pair`` and of the next, from one Philox call; 0 where neither is set."""
+        if p.white <= float(0.0) and p.walk <= float(0.0):
+            return wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
+        w0, w1, w2, w3 = draw(p, env, probe, age, episode, wp.static(CHANNELS) + pair)
+        first = normals(w0, w1)
+        second = normals(w2, w3)
+        return wp.vec4(first[0], first[1], second[0], second[1])
+
+    @wp.func
+    def episode_draw(p: NoiseParams, env: int, probe: int, episode: int) -> wp.vec3:
+        """Return what holds for an episode: (gain, 1 if the probe is dead, the value it is stuck at)."""
+        out = wp.vec3(p.gain_low, float(0.0), float(0.0))
+        if p.gain_high > p.gain_low or p.dead_probability > float(0.0):
+            w0, w1, w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
+            if p.gain_high > p.gain_low:
+                out[0] = p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
+            if uniform(w1) < p.dead_probability:
+                out[1] = float(1.0)
+                out[2] = p.dead_low + (p.dead_high - p.dead_low) * uniform(w2)
+        return out
+
+    @wp.func
+    def apply_drawn(
+        p: NoiseParams,
+        x: float,
+        white: float,
+        walk: float,
+        fixed: wp.vec3,
+        fading: float,
+        hysteresis_state: float,
+        walk_state: float,
+    ) -> wp.vec3:
+        """Return what :func:`apply_noise` does, from numbers drawn before.
+
+        Args:
+            p: Knobs of the sensor.
+            x: The signal.
+            white: Standard normal number of the white noise.
+            walk: Standard normal number of the drift.
+            fixed: Of :func:`episode_draw`.
+            fading: e^(−Δt/τ).
+            hysteresis_state: As there.
+            walk_state: As there.
+        """
+        if not wp.isfinite(x):
+            return wp.vec3(x, hysteresis_state, walk_state)
+        y = x
+        lag = float(0.0)
+        if p.hysteresis != float(0.0):
+            xi = hysteresis_state + x
+            lag = fading * xi - x
+            y = y + p.hysteresis * xi
+        drift = float(0.0)
+        if p.white > float(0.0) or p.walk > float(0.0):
+            drift = walk_state + p.walk * walk
+            y = y + drift + p.white * white
+        y = y + p.bias
+        if p.quantum > float(0.0):
+            y = p.quantum * wp.rint(y / p.quantum)
+        if fixed[1] > float(0.0):
+            y = fixed[2]
+        return wp.vec3(y, lag, drift)
 
     @wp.func
     def apply_noise(
@@ -201,27 +258,17 @@ def noise_functions() -> SimpleNamespace:
             hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
             walk_state: Drift d of the last update (0 at first).
         """
-        if not wp.isfinite(x):
-            return wp.vec3(x, hysteresis_state, walk_state)
-        y = x
-        lag = float(0.0)
+        z = pair_normals(p, env, probe, channel // 2, age, episode)
+        white = z[0]
+        walk = z[1]
+        if channel % 2 == 1:
+            white = z[2]
+            walk = z[3]
+        fading = float(0.0)
         if p.hysteresis != float(0.0):
-            xi = hysteresis_state + x
-            lag = decay(dt / p.tau) * xi - x
-            y = y + p.hysteresis * xi
-        drift = float(0.0)
-        if p.white > float(0.0) or p.walk > float(0.0):
-            z = channel_normals(p, env, probe, channel, age, episode)
-            drift = walk_state + p.walk * z[1]
-            y = y + drift + p.white * z[0]
-        y = y + p.bias
-        if p.quantum > float(0.0):
-            y = p.quantum * wp.rint(y / p.quantum)
-        if p.dead_probability > float(0.0):
-            _w0, w1, w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
-            if uniform(w1) < p.dead_probability:
-                y = p.dead_low + (p.dead_high - p.dead_low) * uniform(w2)
-        return wp.vec3(y, lag, drift)
+            fading = decay(dt / p.tau)
+        fixed = episode_draw(p, env, probe, episode)
+        return apply_drawn(p, x, white, walk, fixed, fading, hysteresis_state, walk_state)
 
     @wp.func
     def delay_jitter(p: NoiseParams, env: int, age: int, episode: int) -> float:
@@ -237,6 +284,10 @@ def noise_functions() -> SimpleNamespace:
         radius_noise=radius_noise,
         gain=gain,
         apply_noise=apply_noise,
+        apply_drawn=apply_drawn,
+        decay=decay,
+        episode_draw=episode_draw,
+        pair_normals=pair_normals,
         delay_jitter=delay_jitter,
     )
 

@@ -215,11 +215,11 @@ def kinematic_kernel(
 
     deepest = deepest_function(kinds, raycast)
     io = io_functions(mode, hysteresis, walk)
-    emit, lost, idle = io.emit, io.lost, io.idle
+    emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
     types, pairs_type, solids_type = io_structs(), pair_structs().Pairs, query_structs().Solids
     probes_type, io_type = types.ProbeSet, types.Io
     noise = noise_functions()
-    params_type, radius_noise, gain = noise.NoiseParams, noise.radius_noise, noise.gain
+    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
     law = kinematic_functions(physical)
     law_type, wrench = law.KinematicParams, law.wrench
 
@@ -261,11 +261,11 @@ def kinematic_kernel(
             episode = io.episode[env]
             number = env + io.env_offset
             noisy = wp.max(radius + radius_noise(knobs[part], number, probe, age, episode), 0.0) - best
-            noisy = noisy * gain(knobs[part], number, probe, episode)
+            fixed = episode_draw(knobs[part], number, probe, episode)
+            noisy = noisy * fixed[0]
             signal = wp.spatial_vectorf()
             if noisy > 0.0:
                 signal = wrench(laws[part], x, noisy, normal, velocity, spin)
-            for channel in range(6):
-                emit(io, knobs[part], env, n, probe, channel, age, episode, truth[channel], signal[channel])
+            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, 6, truth, signal)
 
     return kinematic

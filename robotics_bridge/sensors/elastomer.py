@@ -161,14 +161,17 @@ class ElastomerRuntime(ProbeRuntime):
         def floats(*shape: int) -> Any:
             return wp.zeros(shape, dtype=wp.float32, device=device)
 
-        self._height = floats(self._planes, envs, self.count)
+        self._height = floats(2 * self._planes, envs, self.count)
         self._spread = floats(3 * self._planes, envs, self.count) if self._way != "direct" else floats(1, 1, 1)
         self._stamp = wp.full((envs, count), -1, dtype=wp.int32, device=device)
         self._live = wp.zeros((count, envs), dtype=wp.int32, device=device)
         total = max(count * self._total, 1)
         # Threads of a GPU are environments and want them side by side; a processor walks through the points of one.
         self._anchor = floats(total, 3, envs) if device.is_cuda else floats(envs, total, 3).transpose((1, 2, 0))
-        self._listed = floats(envs, total, 7).transpose((1, 2, 0))
+        self._listed = wp.zeros((envs, total), dtype=wp.spatial_vectorf, device=device).transpose((1, 0))
+        self._moved = wp.zeros((count, envs), dtype=wp.int32, device=device)
+        exponents = np.array([sensor.exponent for sensor in self._sensors], np.float32)
+        self._exponents = wp.array(exponents, dtype=wp.float32, device=device)
         self._weights, self._reach = self._weigh()
         self._gels = self._describe(own)
         self._spectra: list[Any] = []
@@ -176,9 +179,9 @@ class ElastomerRuntime(ProbeRuntime):
     @property
     def state_bytes(self) -> int:
         """Lasting memory per environment [bytes]: readings, anchors, and what kernels hand to one another."""
-        followed = 10 * self._total * len(self._sensors) + 2 * len(self._sensors)
+        followed = 9 * self._total * len(self._sensors) + 3 * len(self._sensors)
         spread = 3 * self._planes if self._way != "direct" else 0
-        return super().state_bytes + 4 * (followed + self.count * (self._planes + spread))
+        return super().state_bytes + 4 * (followed + self.count * (2 * self._planes + spread))
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
@@ -188,7 +191,7 @@ class ElastomerRuntime(ProbeRuntime):
         self.begin(state, dt)
         solids, pairs = c.solids.struct, c.pairs.struct
         indent = kernels.indent_kernel(self.kinds, self._raycast, self._planes)
-        self.launch(indent, self.probes, solids, pairs, self.io, self.knobs, self._stamp, self._height)
+        self.launch(indent, self.probes, solids, pairs, self.io, self.knobs, self._stamp, self._exponents, self._height)
         if self._way == "separable":
             inputs = [self.probes, self.io, self._gels, self._weights, self._reach, self._stamp, self._height]
             self.launch(kernels.spread_kernel(self._planes), *inputs, self._spread)
@@ -196,13 +199,13 @@ class ElastomerRuntime(ProbeRuntime):
             self._transform()
         if self._cloud:
             inputs = [self._gels, self._own, self._tracked, solids, pairs, self._cloud.struct, self.io]
-            inputs += [self._anchor, self._live, self._listed]
+            inputs += [self._anchor, self._live, self._moved, self._listed]
             kernel = kernels.anchor_kernel(self._own_kinds, self._raycast)
             wp.launch(kernel, dim=(c.num_envs, len(self._sensors)), inputs=inputs, device=c.device)
         way = ("direct", "separable", "fft").index(self._way)
         kernel = kernels.marker_kernel(way, self._layered, self._planes, self.mode, *self.stores)
         inputs = [self.probes, self.io, self.knobs, self._gels, self._weights, self._reach, self._stamp, self._height]
-        self.launch(kernel, *inputs, self._spread, self._live, self._listed)
+        self.launch(kernel, *inputs, self._spread, self._moved, self._listed)
         self.finish(dt)
 
     def _describe(self, own: list[tuple[int, ...]]) -> Any:
@@ -283,7 +286,8 @@ class ElastomerRuntime(ProbeRuntime):
             for plane in range(self._planes):
                 h = height[plane, :, span].unflatten(1, (rows, columns))
                 flat = torch.fft.rfft2(h, s=size)
-                raised = torch.fft.rfft2(h**sensor.exponent, s=size)
+                bulge = height[self._planes + plane, :, span].unflatten(1, (rows, columns))
+                raised = torch.fft.rfft2(bulge, s=size)
                 for channel, signal in enumerate((flat, flat, raised)):
                     field = torch.fft.irfft2(signal * spectrum[channel], s=size)
                     out[3 * plane + channel, :, span] = field[
