@@ -84,6 +84,10 @@ def score(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the record and the report.")] = Path(
         "brainbench-results"
     ),
+    report_file: Annotated[
+        Path | None,
+        typer.Option("--report", help="Also write a report for a paper: FILE.md, FILE.html or FILE.pdf."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score a model against neural recordings and write a result record and an HTML report."""
@@ -120,7 +124,13 @@ def score(
     path = write_record(record, out)
     report = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
-    emit(data, f"{_text(record)}\n\nrecord  {path}\nreport  {report}", as_json=as_json)
+    text = f"{_text(record)}\n\nrecord  {path}\nreport  {report}"
+    if report_file is not None:
+        from leaderboards.paper import write_paper
+
+        data["paper_paths"] = write_paper([record], report_file, title=f"{record.score.name}: brainbench score")
+        text += f"\npaper   {', '.join(map(str, data['paper_paths'][:2]))}"
+    emit(data, text, as_json=as_json)
 
 
 def _alike(record: ResultRecord, animals: Score) -> str:
@@ -166,9 +176,9 @@ def _command() -> str:
     words = iter(sys.argv[1:])
     kept = []
     for word in words:
-        if word in ("--out", "-o"):
+        if word in ("--out", "-o", "--report"):
             next(words, None)
-        elif word not in ("--json", "-v", "--verbose") and not word.startswith("--out="):
+        elif word not in ("--json", "-v", "--verbose") and not word.startswith(("--out=", "--report=")):
             kept.append(word)
     return shlex.join(["brainbench", *kept])
 

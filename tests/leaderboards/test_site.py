@@ -99,7 +99,7 @@ def test_conflicts_and_stale_records_are_said_in_the_row_and_on_the_page(make_re
 
 
 def test_downloads_hold_the_records_and_the_table(make_record, tmp_path):
-    import pyarrow.parquet as parquet
+    parquet = pytest.importorskip("pyarrow.parquet")
 
     records = [make_record("=HYPERLINK(1)", 0.3), make_record("b", 0.8), make_record("c", status="undefined")]
     site = build(records, tmp_path)

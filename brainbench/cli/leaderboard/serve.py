@@ -1,0 +1,45 @@
+"""``brainbench leaderboard serve``: read a leaderboard in the browser."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def serve(
+    source: Annotated[Path, typer.Argument(help="A built site, or a folder of records to build one from.")] = Path(
+        "brainbench-results"
+    ),
+    host: Annotated[str, typer.Option(help="Address to listen on; the default is seen by this machine alone.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option(help="Port; 0 takes a free one.")] = 8000,
+) -> None:
+    """Serve a leaderboard for local reading, without writing anything; stop it with Ctrl-C."""
+    from brainbench.errors import DataFileNotFoundError
+    from leaderboards.serve import LOOPBACK, make_server
+    from leaderboards.site import build_leaderboard
+    from leaderboards.store import read_records
+
+    if not source.exists():
+        raise DataFileNotFoundError(
+            f"There is no site or folder of records {str(source)!r}; "
+            "make records first, for example with: brainbench score zhuang-intersection-ln"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        built = (source / "index.html").is_file() and (source / "data").is_dir()
+        site = source if built else build_leaderboard(read_records(source), Path(folder) / "site").parent
+        server = make_server(site, host=host, port=port)
+        shown = f"[{host}]" if ":" in host else host
+        print(f"http://{shown}:{server.server_address[1]}/  (Ctrl-C ends)", flush=True)
+        if host not in LOOPBACK:
+            print("Other machines can read this.", flush=True)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print("ended")
+        finally:
+            server.server_close()
