@@ -16,16 +16,20 @@ import argparse
 import json
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from results import table, write_section
 
+from brainbench.models.export import export_model, read_onnx
 from brainbench.models.extract import evaluating
+from brainbench.models.packing import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
 from brainbench.models.training.captured import captured, fuse, make_capturable
@@ -231,27 +235,54 @@ def stream_part(options: argparse.Namespace, device: torch.device) -> str:
     speed = bandwidth() if device.type == "cpu" else float("nan")
     for name in options.model.split(","):
         model = load_model(name).to(device)
-        step = StreamingStep(model)
-        x = sweeps(1, device)[:, 0]
         weights = 4 * sum(p.numel() for p in model.parameters())
         bound = weights / speed * 1e3
-        for what in ("step", "flat state"):
-            times = []
+        for what, stream in streams(model, name, device):
+            times = stream(options.repeats * 20)
+            least, p50, p99 = np.percentile(times[10:], [0, 50, 99])
+            cells = [f"{least:.2f}", f"{p50:.2f}", f"{p99:.2f}", f"{weights / 1e6:.1f}", f"{bound:.2f}"]
+            rows.append([name, what, *cells, f"{p50 / bound:.1f}"])
+            print(rows[-1], flush=True)
+    head = ["model", "way", "least ms", "p50 ms", "p99 ms", "float32 weights MB", "ms to read them once", "p50 of that"]
+    rate = ceiling(device, torch.float32), ceiling(device, torch.bfloat16)
+    text = f"Batch 1, one thread; memory read at {speed / 1e9:.1f} GB/s by a plain sum; matrix products at "
+    text += f"{rate[0] / 1e9:.0f} GFLOP/s in float32 and {rate[1] / 1e9:.0f} in bf16."
+    return f"{text}\n\n{table(head, rows)}"
+
+
+def streams(model: Any, name: str, device: torch.device) -> Iterator[tuple[str, Callable[[int], list[float]]]]:
+    """Yield ways to stream a network: by name, a function that takes steps and returns how long each took [ms]."""
+    x = sweeps(1, device)[:, 0]
+    limit = model.spec.max_steps or 10**9
+
+    def timed(call: Callable[[Any], Any], start: Callable[[], Any]) -> Callable[[int], list[float]]:
+        def run(count: int) -> list[float]:
+            times, state = [], start()
             with torch.no_grad():
-                state = model.init_state(1) if what == "step" else step.init_state(1)
-                for count in range(options.repeats * 20):
-                    if model.spec.max_steps and count % model.spec.max_steps == 0:
-                        state = model.init_state(1) if what == "step" else step.init_state(1)
-                    start = time.perf_counter()
-                    _, state = model.step(x, state) if what == "step" else step(x, state)
+                for index in range(count):
+                    state = start() if index % limit == 0 else state
+                    began = time.perf_counter()
+                    state = call(state)
                     if device.type == "cuda":
                         torch.cuda.synchronize()
-                    times.append((time.perf_counter() - start) * 1e3)
-            p50, p99 = np.percentile(times[10:], [50, 99])
-            rows.append([name, what, f"{p50:.2f}", f"{p99:.2f}", f"{weights / 1e6:.1f}", f"{bound:.2f}"])
-            print(rows[-1], flush=True)
-    head = ["model", "call", "p50 ms", "p99 ms", "weights MB", "ms to read them once"]
-    return f"Batch 1, one thread; memory read at {speed / 1e9:.1f} GB/s by a plain sum.\n\n{table(head, rows)}"
+                    times.append((time.perf_counter() - began) * 1e3)
+            return times
+
+        return run
+
+    yield "step", timed(lambda state: model.step(x, state)[1], lambda: model.init_state(1))
+    flat = StreamingStep(model)
+    yield "flat state", timed(lambda state: flat(x, state)[1], lambda: flat.init_state(1))
+    if device.type == "cpu":
+        for precision in ("float32", "bf16"):
+            fast: Any = packed(model, precision=precision)
+            yield (
+                f"packed {precision}",
+                timed(lambda state, fast=fast: fast.step(x, state)[1], lambda fast=fast: fast.init_state(1)),
+            )
+        with tempfile.TemporaryDirectory() as folder:
+            run = read_onnx(export_model(model, Path(folder) / "step.onnx", name=name).path, threads=1)
+            yield "ONNX Runtime", timed(lambda state: run(x.numpy(), state)[1], lambda: flat.init_state(1).numpy())
 
 
 def length_part(options: argparse.Namespace, device: torch.device) -> str:

@@ -67,7 +67,8 @@ class Job:
         """Return the configuration that ``brainbench train`` would train it with.
 
         The published recipes are for 100 epochs: a tenth of the rate every 30 of them means nothing to a shorter run,
-        so all anneal by a cosine after a tenth of warm-up. Rates are points of the published search spaces.
+        so all anneal by a cosine after a tenth of warm-up, with AdamW at rates of the published (supervised) search
+        spaces. SimCLR was published with LARS, under which the loss of so short a run hardly fell.
         """
         chosen = TrainingConfig.published(
             self.model,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -85,6 +85,28 @@ def initialise(
             layer.bias.fill_(bias)
 
 
+class Packed:
+    """A matrix [out, in] laid out for products with few rows on the CPU, in single or half precision."""
+
+    def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None, dtype: torch.dtype) -> None:
+        self.dtype = dtype
+        self.bias = None if bias is None else bias.detach()
+        weight = weight.to(dtype).contiguous()
+        reorder = getattr(torch.ops.mkldnn, "_reorder_linear_weight", None)
+        self.plain = weight if reorder is None else None
+        self.ordered = None if reorder is None else reorder(weight, None)
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        """Return x [..., in] times the matrix, plus the bias, in the precision of ``x``."""
+        rounded = x.to(self.dtype)
+        if self.ordered is None:
+            y = functional.linear(rounded, cast(torch.Tensor, self.plain))
+        else:
+            y = torch.ops.mkldnn._linear_pointwise(rounded, self.ordered, None, "none", [], "")
+        y = y.to(x.dtype)
+        return y if self.bias is None else y + self.bias
+
+
 class Conv2d(nn.Conv2d):
     """2-D convolution [B, C, H, W] → [B, out, H', W'] with zero padding "same", "valid" or a number.
 
@@ -107,6 +129,7 @@ class Conv2d(nn.Conv2d):
     ) -> None:
         self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
         self._extra: tuple[int, int, int, int] | None = None
+        self._packed: Packed | None = None
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":
             left, right, top, bottom = same_padding(kernel_size)
@@ -121,7 +144,27 @@ class Conv2d(nn.Conv2d):
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Convolve [B, C, H, W]."""
+        if self._packed is not None and len(input) == 1:
+            return self._convolve_packed(input, self._packed)
         return self._convolve(input, self.weight, self.bias)
+
+    def pack(self, dtype: torch.dtype) -> None:
+        """Keep a copy of the weights in the order in which one stimulus is multiplied with them fastest, on the CPU."""
+        rows = self.weight.detach().permute(0, 2, 3, 1).flatten(1)
+        self._packed = Packed(rows, self.bias, dtype)
+
+    def _convolve_packed(self, input: torch.Tensor, packed: Packed) -> torch.Tensor:
+        (top, left), (rows, columns), (down, right) = _two(self.padding), self.kernel_size, _two(self.stride)
+        padded = functional.pad(input, self._extra or (left, left, top, top))[0].permute(1, 2, 0).contiguous()
+        height, width, channels = padded.shape
+        size = ((height - rows) // down + 1, (width - columns) // right + 1)
+        # Channels innermost, the columns of a window lie side by side.
+        windows = padded.as_strided(
+            (*size, rows, columns * channels),
+            (down * width * channels, right * channels, width * channels, 1),
+        )
+        y = packed(windows.reshape(size[0] * size[1], -1))
+        return y.T.reshape(1, -1, *size)
 
     def share(self, input: torch.Tensor, start: int, *, use_bias: bool) -> torch.Tensor:
         """Convolve some of the input channels, those from ``start`` on; the shares of all add up to the whole."""
@@ -166,7 +209,18 @@ class Linear(nn.Linear):
         method: Mapping[str, Any] | None = None,
     ) -> None:
         self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
+        self._packed: Packed | None = None
         super().__init__(in_features, out_features, bias=use_bias)
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        """Multiply [..., in] with the weights."""
+        if self._packed is not None and len(input) == 1:
+            return self._packed(input)
+        return super().forward(input)
+
+    def pack(self, dtype: torch.dtype) -> None:
+        """Keep a copy of the weights in the order in which few inputs are multiplied with them fastest, on the CPU."""
+        self._packed = Packed(self.weight.detach(), self.bias, dtype)
 
     def reset_parameters(self) -> None:
         """Draw new weights from the global random state."""

@@ -149,12 +149,19 @@ def _write_torch(step: Any, path: Path, opset: int) -> None:
         torch.export.save(program, path)
 
 
-def read_onnx(path: str | Path) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """Return the step of an exported ONNX file as a function of NumPy arrays (obs, h_in) → (features, h_out)."""
+def read_onnx(path: str | Path, *, threads: int | None = None) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Return the step of an exported ONNX file as a function of NumPy arrays (obs, h_in) → (features, h_out).
+
+    Args:
+        path: The file.
+        threads: Threads that ONNX Runtime computes with; its own choice if None.
+    """
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
+    if threads is not None:
+        options.intra_op_num_threads = options.inter_op_num_threads = threads
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
     def run(obs: Any, h_in: Any) -> tuple[Any, Any]:
