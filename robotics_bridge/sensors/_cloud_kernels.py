@@ -148,6 +148,6 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
         if wp.static(mode != CLEAN):
             fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
             signal = fixed[0] * wrench(laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
-        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, 6, truth, signal)
+        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, truth, signal)
 
     return proximity

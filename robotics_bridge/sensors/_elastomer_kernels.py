@@ -280,7 +280,7 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
     """
     import warp as wp
 
-    io = io_functions(mode, hysteresis, walk)
+    io = io_functions(mode, hysteresis, walk, 3)
     emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
     types, gel_type = io_structs(), elastomer_structs().Gel
     probes_type, io_type = types.ProbeSet, types.Io
@@ -404,6 +404,6 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
         signal = fixed[0] * (signal + slide)
         all_truth = wp.spatial_vectorf(truth[0], truth[1], truth[2], 0.0, 0.0, 0.0)
         all_signal = wp.spatial_vectorf(signal[0], signal[1], signal[2], 0.0, 0.0, 0.0)
-        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, 3, all_truth, all_signal)
+        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, all_truth, all_signal)
 
     return markers

@@ -41,7 +41,7 @@ def io_structs() -> SimpleNamespace:
 
 
 @cache
-def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
+def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> SimpleNamespace:
     """Return the functions that write a reading.
 
     ``emit(io, knobs, env, n, probe, channel, truth, signal)`` writes one channel, ``emit_six`` up to six, drawing all
@@ -52,6 +52,7 @@ def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
         mode: :data:`CLEAN`, :data:`FUSED` or :data:`STAGED`.
         hysteresis: whether the group stores hysteresis.
         walk: whether the group stores a drift.
+        channels: that ``emit_six`` writes, known to the compiler so that vectors stay in registers.
     """
     import warp as wp
 
@@ -118,7 +119,6 @@ def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
         age: int,
         episode: int,
         fixed: wp.vec3f,
-        channels: int,
         truth: wp.spatial_vectorf,
         signal: wp.spatial_vectorf,
     ):
@@ -126,13 +126,13 @@ def io_functions(mode: int, hysteresis: bool, walk: bool) -> SimpleNamespace:
         if wp.static(hysteresis and mode == FUSED):
             if knobs.hysteresis != 0.0:
                 fading = decay(io.dt / knobs.tau)
-        for pair in range((channels + 1) // 2):
+        for pair in range(wp.static((channels + 1) // 2)):
             z = wp.vec4f(0.0)
             if wp.static(mode == FUSED):
                 z = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
             for odd in range(2):
                 channel = 2 * pair + odd
-                if channel < channels:
+                if channel < wp.static(channels):
                     io.truth[channel, env, n] = truth[channel]
                     if wp.static(mode == STAGED):
                         io.measured[channel, env, n] = signal[channel]

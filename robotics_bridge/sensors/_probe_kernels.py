@@ -266,6 +266,6 @@ def kinematic_kernel(
             signal = wp.spatial_vectorf()
             if noisy > 0.0:
                 signal = wrench(laws[part], x, noisy, normal, velocity, spin)
-            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, 6, truth, signal)
+            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, truth, signal)
 
     return kinematic

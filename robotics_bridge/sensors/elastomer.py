@@ -280,7 +280,7 @@ class ElastomerRuntime(ProbeRuntime):
         height, out = wp.to_torch(self._height), wp.to_torch(self._spread)
         if not self._spectra:
             self._spectra = [_spectrum(sensor, height.device) for sensor in self._sensors]
-        for sensor, place, (size, spectrum) in zip(self._sensors, self.places.values(), self._spectra, strict=True):
+        for place, (size, spectrum) in zip(self.places.values(), self._spectra, strict=True):
             rows, columns = place.layout
             span = slice(place.start, place.start + place.count)
             for plane in range(self._planes):
