@@ -1,9 +1,9 @@
 """From records to the rows that people read: one entry per model, its seeds folded together.
 
-Networks that differ only in the seed of their weights are one **entry**. Its value is the mean over seeds;
-its interval is the t interval over animals of each animal's mean over seeds, so it speaks of the same
-uncertainty as that of a single record; the spread over seeds stands beside it. Entries are ranked as
-records are (:mod:`leaderboards.ranking`): where intervals overlap, models are tied and ranks are ranges.
+Networks that differ only in the seed of their weights are one **entry**. Its value is the mean over seeds.
+Its interval crosses animals and seeds: the half widths of the t intervals of each animal's mean over seeds and
+of each seed's mean over animals, added in squares (a little too wide, since both hold the residual). The
+spread over seeds stands beside it. Entries are ranked as records are (:mod:`leaderboards.ranking`): where intervals overlap, models are tied and ranks are ranges.
 """
 
 from __future__ import annotations
@@ -177,12 +177,20 @@ def _interval(scores: Sequence[Score]) -> Interval | None:
     means = [_mean(values) for values in animals.values() if len(values) == len(scores)]
     if len(means) < 2:
         return None
+    seeds = [score.value for score in scores]
+    if not all(map(math.isfinite, seeds)):
+        return None
+    half = math.hypot(_half(means), _half(seeds))
+    middle = _mean(seeds)
+    text = f"t over {len(means)} animals and {len(scores)} seeds, added in squares"
+    return Interval(middle - half, middle + half, 0.95, text)
+
+
+def _half(values: Sequence[float]) -> float:
+    """Return half the width of the 95 % t interval of a mean."""
     from scipy.special import stdtrit
 
-    half = float(stdtrit(len(means) - 1, 0.975)) * statistics.stdev(means) / math.sqrt(len(means))
-    middle = _mean(means)
-    text = f"t over {len(means)} animals, each the mean of {len(scores)} seeds"
-    return Interval(middle - half, middle + half, 0.95, text)
+    return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -141,9 +141,9 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     text += f" Interval of a record: {_words.level(score.interval)}." if score.interval else ""
     if seeds > 1:
         text += (
-            f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, their "
-            "interval the t interval over animals of each animal's mean over seeds, and the spread is the standard "
-            "deviation over seeds."
+            f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, "
+            "their interval joins the t intervals over animals and over seeds in squares, and the spread is the "
+            "standard deviation over seeds."
         )
     # The mean under permutation is one record's own.
     significance = re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method)

@@ -55,7 +55,7 @@ def make_server(folder: str | os.PathLike[str], *, host: str = "127.0.0.1", port
             f"There is no leaderboard in {os.fspath(folder)!r}; build one with: brainbench leaderboard build RECORDS"
         )
     try:
-        return ThreadingHTTPServer((host, port), partial(_Handler, root=root))
+        return ThreadingHTTPServer((host, port), partial(_Handler, root=root, host=host))
     except OSError as error:
         raise UsageError(
             f"The address {host}:{port} cannot be had ({error.strerror or error}); choose another with --port."
@@ -69,8 +69,8 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
     timeout = 30
 
-    def __init__(self, *arguments: object, root: Path, **options: object) -> None:
-        self._root = root
+    def __init__(self, *arguments: object, root: Path, host: str, **options: object) -> None:
+        self._root, self._host = root, host
         super().__init__(*arguments, **options)  # pyright: ignore[reportArgumentType]
 
     def do_GET(self) -> None:
@@ -100,9 +100,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _is_ours(self) -> bool:
         """Tell whether the request names this server by the address it listens on, or a loopback name."""
         named = urlsplit(f"//{self.headers.get('Host', '')}").hostname
-        bound = str(self.server.socket.getsockname()[0])
-        everywhere = bound in ("0.0.0.0", "::")
-        return everywhere or named == bound or (bound in LOOPBACK and named in LOOPBACK)
+        everywhere = self._host in ("0.0.0.0", "::", "")
+        return everywhere or named == self._host or (self._host in LOOPBACK and named in LOOPBACK)
 
     def _file(self) -> Path | None:
         """Return the file that the address names, inside the folder and not hidden."""

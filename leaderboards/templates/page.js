@@ -95,7 +95,8 @@ if (source) {
     const value = row[kind.key];
     if (kind.key === "model") {
       const head = make("th", null, { scope: "row" });
-      const name = make("bdi", row.name);
+      const name = make("bdi");
+      row.name.split(/(?<=[+.])/).forEach((part, i) => name.append(...(i ? [make("wbr")] : []), part)); // may break after + and .
       if (row.page) { const link = make("a", null, { href: `models/${row.page}` }); link.append(name); head.append(link); } else head.append(name);
       const facts = [row.kind === "model" && row.objective, row.augmentation, row.kind === "model" && !state.fold && row.seed !== null && `seed ${row.seed}`].filter(Boolean);
       if (facts.length) head.append(make("small", facts.join(" · ")));

@@ -25,15 +25,16 @@ def _entries(*records):
     return entries_of(board)
 
 
-def test_the_interval_is_the_t_interval_of_each_animals_mean_over_seeds(make_record):
+def test_the_interval_joins_the_t_intervals_over_animals_and_over_seeds(make_record):
     values = np.random.default_rng(0).normal(0.6, 0.1, size=(3, 5))  # seed, animal
     (entry,) = _entries(*(_run(make_record("net"), seed, list(row)) for seed, row in enumerate(values)))
-    means = values.mean(axis=0)
-    low, high = stats.t.interval(0.95, 4, means.mean(), stats.sem(means))
-    assert (entry.interval.low, entry.interval.high) == (pytest.approx(low), pytest.approx(high))
+    halves = [stats.t.ppf(0.975, len(means) - 1) * stats.sem(means) for means in (values.mean(0), values.mean(1))]
+    half = math.hypot(*halves)
+    assert entry.interval.low == pytest.approx(values.mean() - half)
+    assert entry.interval.high == pytest.approx(values.mean() + half)
     assert entry.value == pytest.approx(values.mean())
     assert entry.spread == pytest.approx(values.mean(axis=1).std(ddof=1))
-    assert entry.interval.method == "t over 5 animals, each the mean of 3 seeds"
+    assert entry.interval.method == "t over 5 animals and 3 seeds, added in squares"
 
 
 def test_a_single_record_keeps_its_own_interval(make_record):
@@ -78,6 +79,17 @@ def test_one_seed_without_a_trusted_score_keeps_the_entry_from_being_ranked(make
     assert entry.status == "unreliable"
     assert entry.rank == "–"
     assert entry.unranked_because
+
+
+def test_the_interval_covers_the_architectures_mean_under_both_kinds_of_chance():
+    from leaderboards.entries import _half
+
+    rng = np.random.default_rng(1)
+    covered = 0
+    for _ in range(1000):
+        values = rng.normal(0, 0.1, (5, 1)) + rng.normal(0, 0.1, (1, 6)) + rng.normal(0, 0.05, (5, 6))
+        covered += abs(values.mean()) <= math.hypot(_half(list(values.mean(0))), _half(list(values.mean(1))))
+    assert 0.94 < covered / 1000 < 0.995
 
 
 def test_the_page_keeps_its_address_when_a_seed_is_added(make_record):
