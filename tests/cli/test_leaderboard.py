@@ -113,6 +113,14 @@ def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, file
     result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--json")
     assert sorted(item["state"] for item in json.loads(result.out)["results"]) == ["known", "scored"]
     assert len(list(to.glob("*.json"))) == 2
+    Path(files["model"].partition(":")[0]).write_text(
+        Path(files["model"].partition(":")[0]).read_text().replace("GRU(8, 6", "GRU(8, 5")
+    )
+    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--prune", "--json")
+    results = json.loads(result.out)["results"]
+    assert [item["state"] for item in results] == ["scored", "scored"]
+    assert all("replaces" in item["note"] for item in results)
+    assert {path.name for path in to.glob("*.json")} == {item["record"] for item in results}
 
 
 def test_nothing_to_add_is_an_error(run):

@@ -37,6 +37,10 @@ def add(
     keep_both: Annotated[
         bool, typer.Option("--keep-both", help="Take in a record although one there states other numbers.")
     ] = False,
+    prune: Annotated[
+        bool,
+        typer.Option("--prune", help="Remove records that a new score of the same model, seed and settings replaces."),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Add records to a folder: files that somebody sends, or scores computed now.
@@ -66,7 +70,7 @@ def add(
     if not records and not model and batch is None:
         raise UsageError("Name record files to take in, or models to score with --model or --batch.")
     done = [_take_in(path, to, keep_both=keep_both) for path in _files(records or [])]
-    done += _score(jobs, to)
+    done += _score(jobs, to, prune=prune)
     states = [item["state"] for item in done]
     summary = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states)) or "nothing to do"
     lines = [f"{item['state']:9} {item['record'] or item['model']}{item['note']}" for item in done]
@@ -124,7 +128,20 @@ def _present(to: Path) -> list[Any]:
     return [item for item in read_records(to) if item.record is not None]
 
 
-def _score(jobs: list[Job], to: Path) -> list[dict[str, Any]]:
+def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
+    """Tell whether two records answer the same question, the old one with what has since changed."""
+    settings = ("weights_seed", "metric", "estimator", "time", "whiskers", "stimuli", "layers")
+
+    def question(record: ResultRecord) -> tuple[Any, ...]:
+        said = record.score.provenance
+        stated = said.get("settings") or {}
+        source = (said.get("recordings") or {}).get("source")
+        return (record.score.name, source, *(stated.get(name) for name in settings))
+
+    return question(new) == question(old)
+
+
+def _score(jobs: list[Job], to: Path, *, prune: bool) -> list[dict[str, Any]]:
     from brainbench.cli.leaderboard._scoring import missing
     from brainbench.scoring import score_record
     from leaderboards.store import write_record
@@ -133,8 +150,8 @@ def _score(jobs: list[Job], to: Path) -> list[dict[str, Any]]:
         return []
     done: list[dict[str, Any]] = []
     with progress_bar() as progress:
-        present: list[ResultRecord] = [item.record for item in _present(to)]
-        open_jobs = missing(jobs, present, options=jobs[0].options)
+        present = _present(to)
+        open_jobs = missing(jobs, [item.record for item in present], options=jobs[0].options)
         done += [
             {"state": "known", "record": None, "model": f"{job.model} seed {job.weights_seed}", "note": ""}
             for job in jobs
@@ -144,5 +161,9 @@ def _score(jobs: list[Job], to: Path) -> list[dict[str, Any]]:
             progress(index, len(open_jobs), "models scored")
             record = score_record(job.model, weights_seed=job.weights_seed, command=job.command, **job.options)
             path = write_record(record, to)
-            done.append({"state": "scored", "record": path.name, "model": job.model, "note": ""})
+            replaced = [item for item in present if prune and item.path != path and _replaces(record, item.record)]
+            for item in replaced:
+                item.path.unlink(missing_ok=True)
+            note = "".join(f"\n          replaces {item.path.name}" for item in replaced)
+            done.append({"state": "scored", "record": path.name, "model": job.model, "note": note})
     return done

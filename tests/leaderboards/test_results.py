@@ -1,0 +1,73 @@
+"""The leaderboard that the repository ships is intact, large enough, and can be made again."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import leaderboards
+from leaderboards import rank, read_records
+from leaderboards.audit import remarks
+from leaderboards.entries import entries_of
+from tests.leaderboards.test_schema import VALIDATOR
+
+RESULTS = Path(leaderboards.__file__).parent / "results"
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return read_records(RESULTS)
+
+
+def test_every_shipped_record_is_intact_and_none_contradicts_another(stored):
+    assert [item.problem for item in stored if item.problem] == []
+    assert [text for doubts in remarks(stored).values() for text in doubts if text.startswith("conflict")] == []
+
+
+def test_shipped_records_fit_the_published_schema(stored):
+    for item in stored[:5]:
+        VALIDATOR.validate(json.loads(item.path.read_text(encoding="utf-8")))
+
+
+def test_there_are_at_least_24_entries_with_twins_over_5_seeds_and_their_spread(stored):
+    (board,) = rank(item.record for item in stored if item.record)
+    entries = entries_of(board)
+    assert len(entries) >= 24
+    assert board.synthetic
+    seeds = Counter(entry.seeds for entry in entries if not entry.trained)
+    assert seeds[5] >= 12
+    assert all(entry.spread > 0 for entry in entries if entry.seeds == 5)
+    assert {item.name for item in board.baselines} == {"animal-to-animal", "raw input", "random features"}
+    assert [item.notes for item in board.baselines] == [()] * 3  # one brain side and one seed of the statistics
+    full = [entry for entry in entries if "-small" not in entry.name]
+    assert len(full) >= 12
+
+
+def test_every_shipped_record_says_how_to_make_it_and_draws_its_architecture(stored):
+    for item in stored:
+        assert item.record is not None
+        command = item.record.score.provenance["command"]
+        assert command.startswith(f"brainbench score {item.record.score.name}")
+        assert item.record.card is not None
+        assert item.record.card.graph is not None
+        assert item.record.card.encoder
+
+
+def test_the_batch_file_names_what_is_shipped(stored):
+    batch = tomllib.loads((RESULTS / "batch.toml").read_text(encoding="utf-8"))
+    wanted = {name for entry in batch["entries"] for name in entry["models"] if "*" not in name}
+    assert wanted == {item.record.score.name for item in stored if item.record and "." not in item.record.score.name}
+
+
+@pytest.mark.slow
+def test_a_shipped_record_is_confirmed_by_scoring_it_again(stored):
+    from brainbench.cli.leaderboard._scoring import score_again
+    from leaderboards.changes import differences
+
+    record = next(item.record for item in stored if item.record and item.record.score.name == "s4-small")
+    # The demo recordings are made anew on this machine; their last digits may differ, their statistics may not.
+    assert differences(record, score_again(record)) == []
