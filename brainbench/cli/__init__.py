@@ -14,7 +14,19 @@ from typing import Annotated
 import typer
 
 from brainbench import __version__
-from brainbench.cli import doctor, export, leaderboard, models, power, recordings, score, stimuli, tradeoff, train
+from brainbench.cli import (
+    doctor,
+    export,
+    leaderboard,
+    models,
+    power,
+    recordings,
+    score,
+    stimuli,
+    tactile,
+    tradeoff,
+    train,
+)
 from brainbench.errors import BrainbenchError
 
 app = typer.Typer(
@@ -33,6 +45,7 @@ app.command("doctor")(doctor.doctor)
 app.add_typer(models.app, name="models")
 app.add_typer(recordings.app, name="recordings")
 app.add_typer(stimuli.app, name="stimuli")
+app.add_typer(tactile.app, name="tactile")
 app.add_typer(tradeoff.app, name="tradeoff")
 app.add_typer(leaderboard.app, name="leaderboard")
 

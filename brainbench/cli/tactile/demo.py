@@ -1,0 +1,43 @@
+"""``brainbench tactile demo``: pictures of what a hand feels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path("tactile-demo"),
+    hand: Annotated[str, typer.Option(help="xhand1, sharpa, or a URDF or MJCF file.")] = "xhand1",
+    resolution: Annotated[str, typer.Option(help="low, med or high.")] = "high",
+    noisy: Annotated[bool, typer.Option("--noisy", help="Draw measured readings with the published noise.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Let a hand close around a warm ball and draw what it feels.
+
+    Four pictures: forces on the taxels, marker motion of an elastomer, temperature of the finger tips, and the sound
+    of a ball on wood, metal and glass.
+    """
+    from brainbench.cli.tactile import _demo
+
+    jobs = {
+        "forces": lambda path: _demo.forces(path, hand, resolution, noisy=noisy),
+        "markers": lambda path: _demo.markers(path, noisy=noisy),
+        "temperature": lambda path: _demo.temperature(path, hand),
+        "sound": _demo.sound,
+    }
+    made: dict[str, Any] = {}
+    rows = []
+    with progress_bar() as progress:
+        for index, (name, job) in enumerate(jobs.items()):
+            progress(index, len(jobs), f"drawing {name}")
+            path = out / f"tactile-{name}.png"
+            facts = job(path)
+            made[name] = {"picture": path, **facts}
+            rows.append([str(path), ", ".join(f"{key} {value:.3g}" for key, value in facts.items())])
+        progress(len(jobs), len(jobs), "drawing")
+    emit(made, table("", ["picture", "shows"], rows), as_json=as_json)

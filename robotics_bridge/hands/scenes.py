@@ -1,0 +1,92 @@
+"""A hand with the palm up and an object on it: the smallest scene in which every sensor has something to read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from robotics_bridge.hands._mujoco import engine
+from robotics_bridge.hands.hand import Hand, palmar_directions
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+OBJECT = "object"
+"""Name of the free body and of its geometry."""
+
+
+def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: float = 0.002, reach: float = 0.6) -> Any:
+    """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm.
+
+    Args:
+        hand: Any hand.
+        radius: Of the ball [m].
+        mass: Of the ball [kg].
+        timestep: Of the engine [s].
+        reach: Place of the ball between the middle of the palm (0) and the roots of the fingers (1).
+
+    Raises:
+        UsageError: the palm's side is unknown, or radius or mass are not positive.
+    """
+    mujoco = engine()
+    if not (radius > 0 and mass > 0):
+        raise UsageError(f"A ball has a positive radius (m) and mass (kg); received {radius!r} and {mass!r}.")
+    facing = palmar_directions(hand.model, hand.palm, hand.fingers)
+    if hand.palm not in facing:
+        raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")
+    up = facing[hand.palm]
+    pad = hand.layout("low", "palm").get(hand.palm)
+    surface = pad.position[pad.active].mean(axis=0) if pad is not None else np.zeros(3)
+    # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
+    surface = surface + reach * _towards_fingers(hand, surface, up)
+    spec = hand.mjspec()
+    spec.option.timestep = timestep
+    palm = spec.body(hand.palm)
+    turn = _onto_z(up)
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, turn)
+    palm.quat, palm.pos = turn, -matrix.reshape(3, 3) @ surface
+    ball = spec.worldbody.add_body(name=OBJECT, pos=(0.0, 0.0, radius + 1e-3))
+    ball.add_freejoint()
+    ball.add_geom(
+        name=OBJECT, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=mass, condim=4,
+        friction=(1.0, 0.01, 1e-4),
+    )  # fmt: skip
+    return spec.compile()
+
+
+def closing(hand: Hand, share: float) -> NDArray[np.float64]:
+    """Return servo targets [joints] (rad) at which every joint is flexed by a share of its range from 0."""
+    model = hand.model
+    joints = model.actuator_trnid[:, 0] if model.nu else np.arange(model.njnt)
+    low, high = model.jnt_range[joints].T
+    target = np.where(np.abs(high) >= np.abs(low), high, low) * share
+    # Joints that spread the fingers stay in their middle.
+    return np.where(np.abs(high + low) < 0.5 * np.ptp(model.jnt_range[joints], axis=1), 0.0, target)
+
+
+def _towards_fingers(hand: Hand, surface: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the step [3] (m, palm frame) along the palm from a point to the mean root of the fingers."""
+    mujoco = engine()
+    data = mujoco.MjData(hand.model)
+    mujoco.mj_kinematics(hand.model, data)
+    palm = hand.model.body(hand.palm).id
+    turn, place = data.xmat[palm].reshape(3, 3), data.xpos[palm]
+    roots = np.array([data.xpos[hand.model.body(chain[0]).id] for chain in hand.fingers.values()])
+    local = (roots - place) @ turn
+    # The thumb's root lies apart from the others.
+    middle = np.median(local, axis=0)
+    step = middle - surface
+    return step - up * (step @ up)
+
+
+def _onto_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quaternion (w, x, y, z) of the shortest turn of a unit vector onto z."""
+    z = np.array([0.0, 0.0, 1.0])
+    axis, cosine = np.cross(direction, z), float(direction @ z)
+    if cosine < -0.999999:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    quaternion = np.array([1.0 + cosine, *axis])
+    return quaternion / np.linalg.norm(quaternion)

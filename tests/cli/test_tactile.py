@@ -1,0 +1,89 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+
+
+def test_layouts_prints_the_counts_of_the_published_table(run):
+    found = json.loads(run("tactile", "layouts", "sharpa", "--json").out)
+    assert found["counts"]["med"] == {"hand": 206, "tips": 70, "fingers": 190, "palm": 16}
+    assert len(found["joints"]) == 22
+    text = run("tactile", "layouts", "--links")
+    assert text.status == 0
+    assert "667" in text.out
+    assert "right_hand_thumb_rota_link2" in text.out
+
+
+def test_layouts_writes_probe_files_and_reads_them_back(run, tmp_path):
+    assert run("tactile", "layouts", "xhand1", "--out", str(tmp_path)).status == 0
+    found = run("tactile", "layouts", "xhand1", "--probes", str(tmp_path / "xhand1_low.json"), "--json")
+    assert json.loads(found.out)["counts"]["custom"]["hand"] == 90
+
+
+def test_an_unknown_hand_is_explained(run):
+    found = run("tactile", "layouts", "xhand")
+    assert found.status == 2
+    assert "did you mean 'xhand1'" in found.err
+
+
+def test_check_compares_this_machine_with_closed_forms(run):
+    found = run("tactile", "check", "--json")
+    assert found.status == 0, found.out
+    checks = json.loads(found.out)["checks"]
+    assert len(checks) == 9
+    assert all(item["passed"] for item in checks)
+
+
+def test_check_fails_where_a_truth_is_missed(run, monkeypatch):
+    from brainbench.cli.tactile import _checks
+
+    monkeypatch.setattr(_checks, "CHECKS", {"planted": lambda device: (1.1, 1.0, 0.05)})
+    found = run("tactile", "check")
+    assert found.status == 1
+    assert "OFF" in found.out
+
+
+def test_calibrate_prints_intervals_and_writes_a_preset(run, tmp_path):
+    from robotics_bridge.sensors import Noise
+
+    rng = np.random.default_rng(0)
+    log, preset = tmp_path / "log.csv", tmp_path / "preset.json"
+    with log.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["time", "a", "b"])
+        writer.writerows([[k * 0.01, *(0.3 + 0.05 * rng.normal(size=2))] for k in range(400)])
+    found = run("tactile", "calibrate", str(log), "--out", str(preset))
+    assert found.status == 0, found.err
+    assert "95 % interval" in found.out
+    assert "Without a column 'reference'" in found.out
+    noise = Noise.load(preset)
+    assert noise.white == pytest.approx(0.05, rel=0.1)
+    assert noise.bias == pytest.approx(0.3, abs=0.01)
+    data = json.loads(run("tactile", "calibrate", str(log), "--json").out)
+    assert data["estimates"]["white"]["low"] < 0.05 < data["estimates"]["white"]["high"]
+    assert run("tactile", "calibrate", str(tmp_path / "none.csv")).status == 2
+
+
+@pytest.mark.slow
+def test_bench_times_every_sensor_class(run):
+    found = json.loads(run("tactile", "bench", "--envs", "4", "--repeats", "2", "--resolution", "low", "--json").out)
+    assert {item["sensor"] for item in found["results"]} >= {"KinematicTaxel", "ElastomerTaxel", "TemperatureGrid"}
+    assert all(item["seconds"] > 0 and item["state_bytes"] > 0 for item in found["results"])
+
+
+def test_bench_refuses_an_empty_batch(run):
+    found = run("tactile", "bench", "--envs", "0")
+    assert found.status == 2
+    assert "at least 1" in found.err
+
+
+@pytest.mark.slow
+def test_demo_writes_four_pictures_of_a_hand_that_feels_something(run, tmp_path):
+    found = run("tactile", "demo", "--out", str(tmp_path), "--resolution", "low", "--json")
+    assert found.status == 0, found.err
+    made = json.loads(found.out)
+    assert made["forces"]["in contact"] > 3
+    assert made["temperature"]["aluminium (°C)"] > made["temperature"]["wood (°C)"] > 22
+    for name in ("forces", "markers", "temperature", "sound"):
+        assert (tmp_path / f"tactile-{name}.png").stat().st_size > 10_000

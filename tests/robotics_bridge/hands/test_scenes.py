@@ -1,0 +1,46 @@
+"""A hand that holds a ball: the ball starts on the palm, and closing brings fingers to it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from brainbench.errors import UsageError
+from robotics_bridge import hands
+from robotics_bridge.hands.scenes import OBJECT, closing, holding
+
+
+@pytest.mark.parametrize("name", hands.list_hands())
+def test_fingers_close_around_the_ball(name):
+    hand = hands.load(name)
+    model = holding(hand, radius=0.028, reach=0.9)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ball = model.geom(OBJECT).id
+    assert not any(ball in contact.geom for contact in data.contact)
+    target = closing(hand, 0.72)
+    for step in range(400):
+        data.ctrl[:] = target * min(step / 200, 1)
+        mujoco.mj_step(model, data)
+    touching = {
+        model.body(model.geom_bodyid[geom]).name
+        for contact in data.contact
+        if ball in contact.geom
+        for geom in contact.geom
+    }
+    assert len(touching - {OBJECT}) >= 2
+    assert np.linalg.norm(data.xpos[model.body(OBJECT).id]) < 0.12
+
+
+def test_spreading_joints_stay_in_their_middle():
+    hand = hands.load("sharpa")
+    target = closing(hand, 0.5)
+    names = [hand.model.actuator(index).name for index in range(hand.model.nu)]
+    assert target[names.index("right_index_MCP_AA")] == 0
+    assert target[names.index("right_index_PIP")] == pytest.approx(0.5 * 1.7453)
+
+
+def test_an_impossible_ball_is_refused():
+    with pytest.raises(UsageError, match="positive radius"):
+        holding(hands.load("xhand1"), radius=0.0)
