@@ -223,6 +223,28 @@ def time_one(options: argparse.Namespace, device: torch.device) -> tuple[float, 
     return first, seconds, spent, memory
 
 
+def forward_part(options: argparse.Namespace, device: torch.device) -> str:
+    x = sweeps(options.batch, device)
+    model = load_model(options.model).to(device)
+    operations = 2 * describe_model(options.model).multiply_adds * STEPS * options.batch
+    rows = []
+    for precision, dtype in (("float32", torch.float32), ("bf16", torch.bfloat16)):
+        with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16"):
+            model(x[:8])
+            pairs = []
+            for _ in range(options.repeats):
+                # Taken in turns, since others use the machine too.
+                before = ceiling(device, dtype)
+                seconds = clock(device, lambda: model(x), 1, warm=0)
+                pairs.append((operations / seconds, max(before, ceiling(device, dtype))))
+        rate, most = sorted(pairs)[len(pairs) // 2]
+        cells = [f"{options.batch * rate / operations:.2f}", f"{rate / 1e9:.0f}", f"{most / 1e9:.0f}"]
+        rows.append([precision, *cells, f"{rate / most:.0%}"])
+        print(rows[-1], flush=True)
+    head = ["precision", "sweeps/s", "GFLOP/s", "matrix ceiling GFLOP/s", "of ceiling"]
+    return f"Forward pass of {options.model}, batch {options.batch} × {STEPS} steps.\n\n{table(head, rows)}"
+
+
 def bandwidth() -> float:
     """Return the rate at which one thread reads memory [bytes/s]."""
     a = torch.ones(64 * 2**20)
@@ -298,7 +320,7 @@ def length_part(options: argparse.Namespace, device: torch.device) -> str:
     return table(["model", "steps", "s", "µs per step"], rows)
 
 
-PARTS = {"train": train_part, "stream": stream_part, "length": length_part}
+PARTS = {"train": train_part, "forward": forward_part, "stream": stream_part, "length": length_part}
 
 
 def main() -> None:
@@ -327,8 +349,13 @@ def main() -> None:
     print(f"\n{body}")
     if options.write:
         command = f"PYTHONPATH=. python benchmarks/training_step.py --part {options.part} --model {options.model}"
-        command += f" --batch {options.batch}" if options.part == "train" else ""
-        title = {"train": "Training step", "stream": "Streaming step", "length": "Long sweeps"}[options.part]
+        command += f" --batch {options.batch}" if options.part in ("train", "forward") else ""
+        title = {
+            "train": "Training step",
+            "forward": "Forward pass",
+            "stream": "Streaming step",
+            "length": "Long sweeps",
+        }[options.part]
         write_section(f"{title} ({options.model}, {device.type})", command, body)
 
 
