@@ -6,9 +6,11 @@ Letters: K stimulus, T time step, F feature.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +36,14 @@ class Activations(dict[str, np.ndarray]):
         """Number of NaN and infinite values of each layer that has any."""
 
 
-def extract(model: nn.Module, stimuli: Any, *, layers: Collection[str] | None = None, chunk: int = 16) -> Activations:
+def extract(
+    model: nn.Module,
+    stimuli: Any,
+    *,
+    layers: Collection[str] | None = None,
+    chunk: int = 16,
+    folder: str | os.PathLike[str] | None = None,
+) -> Activations:
     """Return the activations of a model's layers.
 
     A model with ``layers`` and ``activations`` (all of ours) gives its named layers. Any other module is
@@ -44,13 +53,16 @@ def extract(model: nn.Module, stimuli: Any, *, layers: Collection[str] | None = 
     shape: ``name[0]``, ``name[1]``, …). Of a tuple or mapping the first tensor counts.
 
     The model runs in evaluation mode without gradients; modes are put back and no hook stays. Memory
-    beyond the result is that of ``chunk`` stimuli.
+    beyond the result is that of ``chunk`` stimuli; with ``folder`` the result lies on disk, and so may the
+    stimuli (``numpy.load(…, mmap_mode="r")``).
 
     Args:
         model: Maps [B, T, C, H, W] to anything.
         stimuli: Array or tensor [K, T, C, H, W], or an object whose ``input`` is one.
         layers: Layers wanted; for a module without named layers any of its submodules. None: all.
         chunk: Stimuli processed at once.
+        folder: Keep every layer as ``<folder>/<layer>.npy``, which replaces an earlier one, and return them mapped
+            into memory.
 
     Raises:
         UsageError: a layer does not exist or gives nothing per stimulus, or the model cannot process
@@ -59,7 +71,7 @@ def extract(model: nn.Module, stimuli: Any, *, layers: Collection[str] | None = 
     import torch
 
     given = getattr(stimuli, "input", stimuli)
-    values = given if isinstance(given, torch.Tensor) else torch.from_numpy(np.ascontiguousarray(given))
+    values: Any = given if isinstance(given, torch.Tensor) else np.asanyarray(given)
     if values.ndim < 2 or len(values) < 1 or chunk < 1:
         raise UsageError(
             f"Extraction needs stimuli [stimulus, time, ...] and a chunk of at least 1; received stimuli of shape "
@@ -70,11 +82,11 @@ def extract(model: nn.Module, stimuli: Any, *, layers: Collection[str] | None = 
     result = Activations()
     with evaluating(model), torch.no_grad():
         for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
-            part = values[start:stop].to(device=like.device, dtype=like.dtype)
+            part = torch.as_tensor(_writable(values[start:stop])).to(device=like.device, dtype=like.dtype)
             for name, activity in _run(reader, part, model, values).items():
                 rows = activity.detach().to("cpu", dtype=torch.float32).flatten(2).numpy()
                 if name not in result:
-                    result[name] = np.empty((len(values), *rows.shape[1:]), np.float32)
+                    result[name] = _room(name, (len(values), *rows.shape[1:]), folder)
                 elif result[name].shape[1:] != rows.shape[1:]:
                     raise UsageError(
                         f"Layer {name!r} changed its shape between stimuli, from {list(result[name].shape[1:])} to "
@@ -82,11 +94,29 @@ def extract(model: nn.Module, stimuli: Any, *, layers: Collection[str] | None = 
                     )
                 result[name][start:stop] = rows
     for name, activity in result.items():
-        count = activity.size - int(np.isfinite(activity).sum())
+        if isinstance(activity, np.memmap):
+            activity.flush()
+        count = sum(part.size - int(np.isfinite(part).sum()) for part in np.array_split(activity, len(activity)))
         if count:
             result.nonfinite[name] = count
             _log.warning("%d of %d activations of layer %r are not finite.", count, activity.size, name)
     return result
+
+
+def _writable(values: Any) -> Any:
+    """Return stimuli that PyTorch may read in place: its tensors cannot be read-only."""
+    if isinstance(values, np.ndarray):
+        return np.array(values) if not values.flags.writeable else np.ascontiguousarray(values)
+    return values
+
+
+def _room(name: str, shape: tuple[int, ...], folder: str | os.PathLike[str] | None) -> np.ndarray:
+    """Return where a layer's activations go: memory, or a file."""
+    if folder is None:
+        return np.empty(shape, np.float32)
+    path = Path(folder) / f"{name.replace('/', '-')}.npy"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
 
 
 @contextmanager

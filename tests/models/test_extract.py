@@ -1,4 +1,5 @@
 import logging
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -228,3 +229,27 @@ def test_nothing_to_extract_from_is_an_error(x, chunk):
 def test_a_sweep_too_long_for_the_attender_says_so(stimuli):
     with pytest.raises(UsageError, match="at most 32 steps"):
         extract(load_model("zhuang-small+gpt"), np.zeros((1, 33, 30, 5, 7), np.float32))
+
+
+def test_activations_and_stimuli_may_lie_on_disk(stimuli, tmp_path):
+    model = load_model("zhuang-small", classes=5)
+    np.save(tmp_path / "stimuli.npy", np.asarray(stimuli))
+    mapped = np.load(tmp_path / "stimuli.npy", mmap_mode="r")
+    found = extract(model, mapped, chunk=2, folder=tmp_path / "layers")
+    assert all(isinstance(value, np.memmap) for value in found.values())
+    for name, expected in extract(model, stimuli).items():
+        np.testing.assert_allclose(np.load(tmp_path / "layers" / f"{name}.npy"), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_on_disk_memory_stays_that_of_a_chunk(tmp_path):
+    count, features = 400, 10_000
+    stimuli = np.lib.format.open_memmap(tmp_path / "x.npy", mode="w+", dtype=np.float32, shape=(count, 2, 6, 1, 1))
+    model = nn.Sequential(nn.Flatten(2), nn.Linear(6, features))
+    peaks = []
+    for folder in (None, tmp_path / "layers"):
+        tracemalloc.start()
+        found = extract(model, stimuli, layers=["1"], chunk=8, folder=folder)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert found["1"].nbytes == count * 2 * features * 4  # 32 MB
+    assert peaks[0] > found["1"].nbytes > 8 * peaks[1]

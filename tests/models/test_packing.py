@@ -37,5 +37,5 @@ def test_packing_leaves_the_network_and_larger_batches_as_they_were():
 
 
 def test_an_unknown_precision_is_named():
-    with pytest.raises(UsageError, match="int4.*bf16"):
+    with pytest.raises(UsageError, match=r"int4.*bf16"):
         packed(load_model("s4-small"), precision="int4")
