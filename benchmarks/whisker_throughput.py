@@ -15,6 +15,7 @@ import numpy as np
 
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.backends.rod._device import to_struct, warp
+from brainbench.stimuli.backends.rod._limits import DOUBTFUL
 from brainbench.stimuli.backends.rod._pack import Shapes, Tracks, still_knots
 from brainbench.stimuli.backends.rod.fast import BLOCK, SweepLauncher
 from brainbench.stimuli.collections import resolve_objects
@@ -73,7 +74,7 @@ def free(
     out.wrench = wp.zeros((1, 1, 1, 6), dtype=real, device=device)
     out.contact = wp.zeros((1, 1, 1), dtype=real, device=device)
     out.points = wp.zeros((1, 1, 1), dtype=kernels.vec3, device=device)
-    out.depth, out.failed = (wp.zeros(lanes, dtype=real, device=device) for _ in range(2))
+    out.depth, out.failed, out.miss, out.load = (wp.zeros(lanes, dtype=real, device=device) for _ in range(4))
     for name in ("status", "steps", "touching", "crowded", "unsolved"):
         setattr(out, name, wp.zeros(lanes, dtype=wp.int32, device=device))
     options = kernels.Options()
@@ -88,6 +89,7 @@ def free(
         options,
         readings,
         out,
+        kernels.Paused(),
     ]
     seconds = timed(
         wp, device, lambda: wp.launch(kernels.run, lanes, inputs, device=device, block_dim=block, max_blocks=most)
@@ -102,12 +104,14 @@ def free(
     )
 
 
-def sweep(device_name: str, recipe: str, words: list[str], fidelity: Fidelity, sweeps: int) -> None:
+def sweep(
+    device_name: str, recipe: str, words: list[str], fidelity: Fidelity, sweeps: int, sliced: bool | None = None
+) -> None:
     """Sweeps of a recipe over procedural objects: steps, sweeps per second, and what that means for whole sets."""
     wp = warp()
     objects = resolve_objects(words, surfaces=True)
     scenes = SweepScenes(GRIDS[recipe], {name: item.load for name, item in objects.items()})
-    launcher = SweepLauncher(scenes, fidelity, device_name)
+    launcher = SweepLauncher(scenes, fidelity, device_name, sliced=sliced)
     started = time.perf_counter()
     groups = [(name, scenes.grid.sweeps(name)[: max(1, sweeps // len(objects))]) for name in scenes.objects]
     launcher.launch(groups[:1])
@@ -127,6 +131,7 @@ def sweep(device_name: str, recipe: str, words: list[str], fidelity: Fidelity, s
         f"{result.touching.sum() / max(steps, 1):.1%} of those in contact; {count / seconds:.0f} sweeps/s; "
         f"failed {int((result.status != 0).sum())}, unsolved steps {int(result.unsolved.sum())}; "
         f"159,696 sweeps in {159696 / count * seconds:.0f} s, 2,076,048 in {2076048 / count * seconds / 60:.1f} min; "
+        f"{launcher.slices} slices, most steps {result.steps.max()}; doubtful {int((result.doubt > DOUBTFUL).sum())}; "
         f"phases { ({k: round(v, 3) for k, v in launcher.seconds.items()}) }",
         flush=True,
     )
@@ -141,6 +146,10 @@ def main() -> None:
     parser.add_argument("--bounds", default="0", help="CUDA launch bounds such as 64x6, several by commas; 0 = none")
     parser.add_argument("--objects", default="procedural-24:2")
     parser.add_argument("--sweeps", type=int, default=768)
+    parser.add_argument("--sliced", action=argparse.BooleanOptionalAction, help="pause whiskers for looks at meshes")
+    parser.add_argument("--links", type=int, default=12)
+    parser.add_argument("--recipes", default="thesis-low,thesis-high")
+    parser.add_argument("--steps", default="2e-4,5e-4,1e-3", help="time steps of the sweeps (s)")
     args = parser.parse_args()
     small = args.device == "cpu"
     chosen = args.only.split(",")
@@ -152,12 +161,10 @@ def main() -> None:
                     bounds = None if words == "0" else tuple(map(int, words.split("x")))
                     free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, most, bounds)
     if "sweep" in chosen:
-        for recipe, fidelity in (
-            ("thesis-low", Fidelity(links=20, time_step=2e-4)),
-            ("thesis-low", Fidelity(links=10, time_step=1e-3)),
-            ("thesis-high", Fidelity(links=10, time_step=1e-3)),
-        ):
-            sweep(args.device, recipe, args.objects.split(","), fidelity, args.sweeps)
+        for step in map(float, args.steps.split(",")):
+            fidelity = Fidelity(links=args.links, time_step=step)
+            for recipe in args.recipes.split(","):
+                sweep(args.device, recipe, args.objects.split(","), fidelity, args.sweeps, args.sliced)
 
 
 if __name__ == "__main__":

@@ -163,3 +163,22 @@ def test_an_unknown_device_is_refused_in_words():
 def test_more_precision_than_there_is_is_refused_in_words():
     with pytest.raises(UsageError, match=r"precision .* 'single', 'double'"):
         Fidelity(precision="quad")
+
+
+def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same():
+    from brainbench.stimuli.backends.rod.fast import SweepLauncher
+
+    objects = resolve_objects(["torus-1", "gear-0"], surfaces=True)
+    grid = SweepGrid(speed=(0.06,), rotation=(0.0, 0.4), distance=(0.005,), size=(0.04,))
+    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()})
+    results = []
+    for sliced in (False, True):
+        launcher = SweepLauncher(scenes, COARSE, sliced=sliced)
+        results.append(launcher.launch([(name, grid.sweeps(name)) for name in scenes.objects]))
+        assert (launcher.slices > 1) == sliced
+    whole, parts = results
+    assert whole.touching.sum() > 100
+    for name in ("wrench", "contact"):
+        np.testing.assert_array_equal(getattr(whole, name).numpy(), getattr(parts, name).numpy())
+    for name in ("steps", "touching", "unsolved", "crowded", "depth", "doubt", "status"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))

@@ -8,7 +8,7 @@ ROUNDS = 4
 """Times that contacts are added to a step because the others press the whisker onto them."""
 CLOSED = 1e-3
 """Overlap (mm) at the end of a step from which a place counts as pressed upon."""
-SWEEPS = 20
+SWEEPS = 8
 """Most Gauss-Seidel sweeps over the contacts of one step."""
 LARGEST_BEND = 1.5
 """Bend of one joint (rad) beyond which a chain means nothing."""
@@ -17,8 +17,11 @@ FOLD = 1.2
 them double; what reaches the base through them is nothing."""
 STOP = 1e3
 """Stiffness beyond :data:`FOLD` over that of the joint."""
-DOUBTFUL = 0.02
-"""Share of the steps whose contact forces may fail to converge before a result counts as unstable."""
+DOUBTFUL = 0.05
+"""What the last iterations still changed in the contact forces (root mean square, of the forces themselves) from which
+a result counts as unstable. Whiskers below it are within a few per cent of the converged solution (docs/stimuli.md)."""
+CROWDED = 0.02
+"""Share of the steps with more contacts than :data:`CONTACTS` from which a result counts as unstable."""
 REST = 1e-6
 """Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
 FAR = 3.0
@@ -33,6 +36,9 @@ WIDEST = 0.8
 """Widest search for contacts (mm)."""
 CREVICE = 0.02
 """Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
+
+WARP = 32
+"""Threads of a GPU that run in step."""
 
 NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 """What whiskers may touch: a kernel holds only the code that its scenes need."""

@@ -40,7 +40,7 @@ class Tracks:
 
     def add(self, knots: NDArray[np.float64], start: float, spacing: float) -> int:
         """Append a track and return its index; ``start`` and ``spacing`` in ms."""
-        self.first.append(sum(self.count))
+        self.first.append(self.first[-1] + self.count[-1] if self.first else 0)
         self.count.append(len(knots))
         self.start.append(start)
         self.spacing.append(spacing)

@@ -31,6 +31,7 @@ from brainbench.stimuli.backends.rod._limits import (
     STOP,
     SWEEPS,
     TRAVEL,
+    WARP,
     WIDEST,
 )
 from brainbench.stimuli.backends.rod._shapes import MESH, distances
@@ -38,7 +39,9 @@ from brainbench.stimuli.backends.rod._tracks import tracks
 
 
 @cache
-def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, int] | None = None) -> SimpleNamespace:
+def solver(
+    real: type, capacity: int, against: int = MESHES, bounds: tuple[int, int] | None = None, sliced: bool = False
+) -> SimpleNamespace:
     """Return the structures and the kernel for chains of at most ``capacity`` links in one precision.
 
     Args:
@@ -46,6 +49,9 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         capacity: links that fit; a module is compiled for each.
         against: what there is to touch, :data:`NOTHING`, :data:`PRIMITIVES` or :data:`MESHES`.
         bounds: threads per block and blocks per multiprocessor that the CUDA compiler aims at.
+        sliced: whether a whisker pauses wherever it must look at a mesh, so that all such looks of all whiskers are
+            made by a kernel of their own and the threads of a block do alike work; results are the same. One shape a
+            scene.
     """
     import warp as wp
 
@@ -58,7 +64,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
     track = tracks(real)
     segment_primitive, primitive = shape.segment_primitive, shape.primitive
     segment_triangle, point_triangle = shape.segment_triangle, shape.point_triangle
-    Tracks, pose_at = track.Tracks, track.pose_at
+    Tracks, Pose, pose_at = track.Tracks, track.Pose, track.pose_at
     single = real is wp.float32
     rows = 3 * CONTACTS
 
@@ -166,6 +172,10 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         """[lane] steps in which a contact found no place."""
         unsolved: wp.array(dtype=wp.int32)
         """[lane] steps whose contact forces did not converge."""
+        miss: wp.array(dtype=real)
+        """[lane] sum over the steps of the square of what the last iteration changed in the forces (mN²)."""
+        load: wp.array(dtype=real)
+        """[lane] sum over the steps of the square of the contact forces (mN²)."""
 
     @wp.func
     def sym(a: vec6, x: vec3) -> vec3:
@@ -270,6 +280,8 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         end_normal: vec3
         clear: real
         """Lower bound of the distance of the link's axis from the surface."""
+        close: wp.int32
+        """Whether triangles were near."""
 
     @wp.func
     def corner_point(bodies: Bodies, face: int, v: real, w: real) -> vec3:
@@ -394,11 +406,134 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, look: real) -> Touch:
             return Touch()
 
+    @wp.func
+    def look_at(
+        bodies: Bodies, s: int, body: Pose, a_world: vec3, b_world: vec3, taper: vec4, margin: real, close: int
+    ) -> Touch:
+        """How near a link comes to a shape, in lengths of the scene but directions of the shape."""
+        turn_s = bodies.turn[s]
+        scale = bodies.scale[s]
+        local = unrotate(body.turn, a_world - body.place) - bodies.place[s]
+        a = unrotate(turn_s, local) / scale
+        local = unrotate(body.turn, b_world - body.place) - bodies.place[s]
+        b = unrotate(turn_s, local) / scale
+        ra = taper[0] / scale
+        rb = taper[1] / scale
+        touch = Touch()
+        touch.close = close
+        if bodies.kind[s] == wp.static(MESH):
+            # A link that was near is looked at among its triangles at once.
+            touch.clear = real(0.0)
+            if close == 0:
+                touch = far_mesh(bodies, s, a, b, ra, rb, real(wp.static(FAR)) / scale)
+            if touch.between == 0 and touch.clear * scale <= margin + taper[0]:
+                touch = near_mesh(bodies, s, a, b, ra, rb, (margin + real(wp.static(NEAR))) / scale)
+                touch.close = touch.end
+        else:
+            found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
+            touch.clear = found[1] + wp.min(ra, rb)
+            touch.share = found[0]
+            touch.gap = found[1]
+            touch.normal = vec3(found[2], found[3], found[4])
+            touch.between = 0
+            if found[0] > real(1e-3) and found[0] < real(1.0 - 1e-3):
+                touch.between = 1
+            tip = primitive(bodies.kind[s], bodies.size[s] / scale, b)
+            touch.end = 1
+            touch.end_gap = tip[3] - rb
+            touch.end_normal = vec3(tip[0], tip[1], tip[2])
+        touch.clear = touch.clear * scale
+        touch.gap = touch.gap * scale
+        touch.end_gap = touch.end_gap * scale
+        return touch
+
+    @wp.struct
+    class Paused:
+        """Whiskers between two slices, and the looks that they wait for."""
+
+        budget: wp.int32
+        """Steps of one slice."""
+        queue: wp.array(dtype=wp.int32)
+        """[lane] whiskers to go on with: those that got an answer from the front, the others from the back."""
+        after: wp.array(dtype=wp.int32)
+        """[lane] the same for the next slice."""
+        size: wp.array(dtype=wp.int32)
+        """[3] whiskers at the front, at the back, looks."""
+        tally: wp.array(dtype=wp.int32)
+        """[3] the same for the next slice."""
+        joints: wp.array2d(dtype=vec4)
+        """[link, lane] angles and rates."""
+        ways: wp.array2d(dtype=vec2)
+        """[link, lane] lower bound of the distance, and whether triangles were near."""
+        held: wp.array2d(dtype=vec4)
+        """[contact, lane] arc and force of the last step."""
+        times: wp.array2d(dtype=real)
+        """[7, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look."""
+        counts: wp.array2d(dtype=wp.int32)
+        """[7, lane] reading, reading to write, held contacts, near, resting, waiting, first look."""
+        look_lane: wp.array(dtype=wp.int32)
+        """[look]"""
+        look_link: wp.array(dtype=wp.int32)
+        """[look]"""
+        look_ends: wp.array2d(dtype=vec3)
+        """[look, 2]"""
+        found: wp.array2d(dtype=vec4)
+        """[look, 3] direction and gap between the ends; at the far end; share, bound, and what there was."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def turn_over(on: Paused, looks: int):
+        for d in range(3):
+            on.size[d] = on.tally[d]
+            on.tally[d] = 0
+        on.size[2] = wp.min(on.size[2], looks)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def look_all(ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, on: Paused):
+        """Answer the looks of all waiting whiskers, one each."""
+        which = wp.tid()
+        if which < on.size[2]:
+            lane = on.look_lane[which]
+            i = on.look_link[which]
+            s = bodies.first[ln.scene[lane]]
+            now = on.times[5, lane]
+            margin = on.times[6, lane]
+            body = pose_at(tr, bodies.track[s], now)
+            touch = look_at(
+                bodies,
+                s,
+                body,
+                on.look_ends[which, 0],
+                on.look_ends[which, 1],
+                ch.taper[i, ln.whisker[lane]],
+                margin,
+                int(on.ways[i, lane][1]),
+            )
+            on.found[which, 0] = vec4(touch.normal[0], touch.normal[1], touch.normal[2], touch.gap)
+            on.found[which, 1] = vec4(touch.end_normal[0], touch.end_normal[1], touch.end_normal[2], touch.end_gap)
+            on.found[which, 2] = vec4(touch.share, touch.clear, real(touch.between + 2 * touch.end), real(touch.close))
+
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds)
     def run(
-        ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, opt: Options, readings: wp.array(dtype=real), out: Results
+        ch: Chains,
+        tr: Tracks,
+        bodies: Bodies,
+        ln: Lanes,
+        opt: Options,
+        readings: wp.array(dtype=real),
+        out: Results,
+        on: Paused,
     ):
         lane = wp.tid()
+        if wp.static(sliced):
+            # Those at the back begin with a block of their own.
+            front = on.size[0]
+            back_from = ((front + wp.static(WARP - 1)) // wp.static(WARP)) * wp.static(WARP)
+            if lane < front:
+                lane = on.queue[lane]
+            elif lane >= back_from and lane - back_from < on.size[1]:
+                lane = on.queue[on.queue.shape[0] - 1 - (lane - back_from)]
+            else:
+                return
         zero = real(0.0)
         one = real(1.0)
         none = vec3(zero, zero, zero)
@@ -474,18 +609,19 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         quickest = zero
         # Counts that the compiler does not know keep it from writing loops out.
         slip_tries = int(8) + wp.min(0, lane)
-        guess_tries = int(3 * wp.static(CONTACTS)) + wp.min(0, lane)
-        look_near = real(wp.static(NEAR))
+        guess_tries = int(10) + wp.min(0, lane)
         rounds_most = int(wp.static(ROUNDS)) + wp.min(0, lane)
         object_speed = zero
         for s in range(shapes_from, shapes_to):
             object_speed = wp.max(object_speed, bodies.speed[s])
         jump = zero
-        deepest = zero
-        steps = int(0)
-        touching = int(0)
-        crowded = int(0)
-        unsolved = int(0)
+        deepest = out.depth[lane]
+        steps = out.steps[lane]
+        touching = out.touching[lane]
+        crowded = out.crowded[lane]
+        unsolved = out.unsolved[lane]
+        miss = out.miss[lane]
+        load = out.load[lane]
         status = int(0)
         failed = zero
         before = opt.start
@@ -493,7 +629,37 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         idle = opt.start
         # A reading takes the wrench of the step that begins at its time, so one more step follows the last.
         pending = int(-1)
-        for reading in range(readings.shape[0] + 1):
+        first_reading = int(0)
+        rest_of_frame = zero
+        waiting = int(0)
+        look_first = int(0)
+        used = int(0)
+        if wp.static(sliced) and on.counts[5, lane] != 0:
+            first_reading = on.counts[0, lane]
+            pending = on.counts[1, lane]
+            held_count = on.counts[2, lane]
+            near = on.counts[3, lane]
+            resting = on.counts[4, lane]
+            waiting = on.counts[5, lane]
+            look_first = on.counts[6, lane]
+            before = on.times[0, lane]
+            rest_of_frame = on.times[1, lane]
+            idle = on.times[2, lane]
+            jump = on.times[3, lane]
+            quickest = on.times[4, lane]
+            for i in range(links):
+                both4 = on.joints[i, lane]
+                q[i] = vec2(both4[0], both4[1])
+                qd[i] = vec2(both4[2], both4[3])
+                way2 = on.ways[i, lane]
+                clear[i] = way2[0]
+                close[i] = int(way2[1])
+            for c in range(held_count):
+                grip = on.held[c, lane]
+                held_arc[c] = grip[0]
+                held_force[c] = vec3(grip[1], grip[2], grip[3])
+        paused = int(0)
+        for reading in range(first_reading, readings.shape[0] + 1):
             upto = before + longest
             if reading < readings.shape[0]:
                 upto = readings[reading]
@@ -502,7 +668,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                 # A reading at the very start.
                 pending = reading
                 continue
-            if resting == 1 and upto > idle:
+            if resting == 1 and upto > idle and rest_of_frame == zero:
                 # When may an object come near at the earliest? The whisker stands straight out of its base.
                 idle = real(1e30)
                 if object_speed > zero or before == opt.start:
@@ -539,7 +705,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                             elif object_speed > zero:
                                 idle = wp.min(idle, before + slack / (real(1.02) * object_speed))
                         at = ahead_at
-            if resting == 1 and upto <= idle:
+            if resting == 1 and upto <= idle and rest_of_frame == zero:
                 # At rest, and nothing can have come near: the wrench stays zero.
                 for i in range(links):
                     clear[i] = zero
@@ -550,8 +716,17 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                 pending = int(-1)
                 continue
             left = span
+            if rest_of_frame > zero:
+                left = rest_of_frame
+                rest_of_frame = zero
             last = int(0)
             while last == 0:
+                if wp.static(sliced):
+                    rest_of_frame = left
+                    if used >= on.budget:
+                        paused = 2
+                        break
+                    used = used + 1
                 now = upto - left
                 # Where something is near, a step moves no point of the whisker further than a contact search looks.
                 wanted = longest
@@ -603,19 +778,48 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                     at = at + x * b4[0]
                     fastest = wp.max(fastest, wp.length_sq(vv + wp.cross(vw, at)))
                 node[links] = at
+                was_quickest = quickest
                 quickest = wp.sqrt(fastest)
                 # Contacts that may close within this step.
                 contacts = int(0)
                 seen = int(0)
                 travel = h * (quickest + object_speed)
                 margin = wp.min(real(1.5) * travel + h * jump + real(0.001), real(wp.static(WIDEST)))
+                was_near = near
                 near = int(0)
+                nigh = int(0)
+                if wp.static(against > NOTHING):
+                    for i in range(links):
+                        if clear[i] - real(1.02) * travel <= margin + ch.taper[i, who][0]:
+                            near = 1
+                            nigh = nigh + 1
+                if wp.static(sliced):
+                    if near == 1 and waiting != 1:
+                        # Ask for looks, and wait; when there is no room for more, try again.
+                        paused = 2
+                        look_first = wp.atomic_add(on.tally, 2, nigh)
+                        if look_first + nigh <= on.look_lane.shape[0]:
+                            paused = 1
+                            asked_for = look_first
+                            for i in range(links):
+                                if clear[i] - real(1.02) * travel <= margin + ch.taper[i, who][0]:
+                                    on.look_lane[asked_for] = lane
+                                    on.look_link[asked_for] = i
+                                    on.look_ends[asked_for, 0] = node[i] + origin
+                                    on.look_ends[asked_for, 1] = node[i + 1] + origin
+                                    asked_for = asked_for + 1
+                            on.times[5, lane] = now
+                            on.times[6, lane] = margin
+                        near = was_near
+                        quickest = was_quickest
+                        break
+                    waiting = 0
+                    rest_of_frame = zero
                 if wp.static(against > NOTHING):
                     for i in range(links):
                         clear[i] = clear[i] - real(1.02) * travel
-                        if clear[i] <= margin + ch.taper[i, who][0]:
-                            near = 1
                 if wp.static(against > NOTHING) and near == 1:
+                    answer = look_first
                     cvw = bw
                     cvv = bv
                     for i in range(links):
@@ -629,48 +833,37 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                             for s in range(shapes_from, shapes_to):
                                 body = pose_at(tr, bodies.track[s], now)
                                 turn_s = bodies.turn[s]
-                                scale = bodies.scale[s]
-                                local = unrotate(body.turn, node[i] + origin - body.place) - bodies.place[s]
-                                a = unrotate(turn_s, local) / scale
-                                local = unrotate(body.turn, node[i + 1] + origin - body.place) - bodies.place[s]
-                                b = unrotate(turn_s, local) / scale
-                                ra = taper[0] / scale
-                                rb = taper[1] / scale
                                 touch = Touch()
-                                if bodies.kind[s] == wp.static(MESH):
-                                    # A link that was near is looked at among its triangles at once.
-                                    touch.clear = zero
-                                    if close[i] == 0:
-                                        touch = far_mesh(bodies, s, a, b, ra, rb, real(wp.static(FAR)) / scale)
-                                    if touch.between == 0 and touch.clear * scale <= margin + taper[0]:
-                                        touch = near_mesh(bodies, s, a, b, ra, rb, (margin + look_near) / scale)
-                                        if touch.end == 0:
-                                            close[i] = 0
-                                        else:
-                                            close[i] = 1
+                                if wp.static(sliced):
+                                    f0 = on.found[answer, 0]
+                                    f1_ = on.found[answer, 1]
+                                    f2_ = on.found[answer, 2]
+                                    answer = answer + 1
+                                    what = int(f2_[2])
+                                    touch.normal = vec3(f0[0], f0[1], f0[2])
+                                    touch.gap = f0[3]
+                                    touch.end_normal = vec3(f1_[0], f1_[1], f1_[2])
+                                    touch.end_gap = f1_[3]
+                                    touch.share = f2_[0]
+                                    touch.clear = f2_[1]
+                                    touch.between = what % 2
+                                    touch.end = what // 2
+                                    touch.close = int(f2_[3])
                                 else:
-                                    found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
-                                    touch.clear = found[1] + wp.min(ra, rb)
-                                    touch.share = found[0]
-                                    touch.gap = found[1]
-                                    touch.normal = vec3(found[2], found[3], found[4])
-                                    touch.between = 0
-                                    if found[0] > real(1e-3) and found[0] < real(1.0 - 1e-3):
-                                        touch.between = 1
-                                    tip = primitive(bodies.kind[s], bodies.size[s] / scale, b)
-                                    touch.end = 1
-                                    touch.end_gap = tip[3] - rb
-                                    touch.end_normal = vec3(tip[0], tip[1], tip[2])
-                                closest = wp.min(closest, touch.clear * scale)
+                                    touch = look_at(
+                                        bodies, s, body, node[i] + origin, node[i + 1] + origin, taper, margin, close[i]
+                                    )
+                                close[i] = touch.close
+                                closest = wp.min(closest, touch.clear)
                                 for which in range(2):
                                     offered = touch.between
                                     share = touch.share
-                                    gap = touch.gap * scale
+                                    gap = touch.gap
                                     way = touch.normal
                                     if which == 1:
                                         offered = touch.end
                                         share = one
-                                        gap = touch.end_gap * scale
+                                        gap = touch.end_gap
                                         way = touch.end_normal
                                     if offered == 1 and gap < margin:
                                         deepest = wp.max(deepest, -gap)
@@ -747,10 +940,10 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                     pw = pw + wp.cross(vw, spin) + wp.cross(vv, momentum)
                     pv = pv + wp.cross(vw, momentum)
                     if loads_to > loads_from:
-                        for load in range(loads_from, loads_to):
-                            if ln.load_link[load] == i and now < ln.load_stop[load]:
-                                pull = ln.load_force[load]
-                                pw = pw - wp.cross(at + xa * (b4[0] * ln.load_share[load]), pull)
+                        for given in range(loads_from, loads_to):
+                            if ln.load_link[given] == i and now < ln.load_stop[given]:
+                                pull = ln.load_force[given]
+                                pw = pw - wp.cross(at + xa * (b4[0] * ln.load_share[given]), pull)
                                 pv = pv - pull
                     angle = q[i]
                     s2 = e2[i]
@@ -866,6 +1059,7 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                 # Contact where the whisker would close a gap if it moved freely, or was held in the last step; then
                 # wherever these contacts press it onto something else.
                 more = int(0)
+                solved = int(0)
                 for j in range(seen):
                     k_taken[j] = int(0)
                     k_ahead[j] = k_gap[j] + h * wp.dot(k_normal[j], k_free[j])
@@ -904,11 +1098,13 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                         free[3 * contacts + d] = wp.dot(axis[3 * contacts + d], k_free[slot])
                                     contacts = contacts + 1
                         top = int(0)
+                        begun = solved
+                        solved = contacts
                         for c in range(contacts):
                             top = wp.max(top, c_link[c])
                         rows_used = 3 * contacts
-                        # The forces of the last step are a good first guess.
-                        for c in range(contacts):
+                        # The forces of the last step, then of the last round, are a good first guess.
+                        for c in range(begun, contacts):
                             guess = none
                             for e in range(held_count):
                                 apart = wp.abs(held_arc[e] - c_arc[c])
@@ -954,9 +1150,13 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                         # Forces of rigid contacts with Coulomb friction: projected Gauss-Seidel, one contact at a time.
                         settled = int(0)
                         change = zero
-                        for _ in range(wp.static(SWEEPS)):
+                        moved_force = zero
+                        whole_force = zero
+                        for sweep in range(wp.static(SWEEPS)):
                             if settled == 0:
                                 change = zero
+                                moved_force = zero
+                                whole_force = zero
                                 for c in range(contacts):
                                     r = 3 * c
                                     n0 = force[r]
@@ -1035,9 +1235,11 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                                         missed = wp.min(missed, zero)
                                     slipped = c11 * wp.abs(f1 - p0) + c22 * wp.abs(f2 - q0)
                                     change = wp.max(change, h * (wp.abs(missed) + slipped))
-                                if change <= real(1e-4):
+                                    moved_force += wp.abs(fn - n0) + wp.abs(f1 - p0) + wp.abs(f2 - q0)
+                                    whole_force += fn
+                                if change <= real(1e-4) or moved_force <= real(1e-4) * whole_force:
                                     settled = 1
-                                if settled == 0 and contacts > 1:
+                                if settled == 0 and contacts > 1 and sweep % 2 == 1:
                                     # Neighbouring contacts share a load in ways that Gauss-Seidel finds slowly: solve
                                     # for all normal forces at once, those of sliding contacts with their friction.
                                     for c in range(contacts):
@@ -1180,8 +1382,10 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                             more = int(0)
                             crowded = crowded + 1
                         if more == 0:
-                            if settled == 0 and change > real(1e-2):
+                            if settled == 0 and change > real(1e-2) and moved_force > real(1e-2) * whole_force:
                                 unsolved = unsolved + 1
+                                miss = miss + moved_force * moved_force
+                            load = load + whole_force * whole_force
                             reaction_w = reaction_w - tw
                             reaction_v = reaction_v - tv
                             tip_push = tip_push + av + wp.cross(aw, node[links])
@@ -1246,10 +1450,36 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
                     idle = zero
                 if status != 0:
                     break
+            if paused != 0:
+                first_reading = reading
+                break
             before = upto
             pending = reading
             if status != 0:
                 break
+        if wp.static(sliced) and paused != 0:
+            on.counts[0, lane] = first_reading
+            on.counts[1, lane] = pending
+            on.counts[2, lane] = held_count
+            on.counts[3, lane] = near
+            on.counts[4, lane] = resting
+            on.counts[5, lane] = paused
+            on.counts[6, lane] = look_first
+            on.times[0, lane] = before
+            on.times[1, lane] = rest_of_frame
+            on.times[2, lane] = idle
+            on.times[3, lane] = jump
+            on.times[4, lane] = quickest
+            for i in range(links):
+                on.joints[i, lane] = vec4(q[i][0], q[i][1], qd[i][0], qd[i][1])
+                on.ways[i, lane] = vec2(clear[i], real(close[i]))
+            for c in range(held_count):
+                grip_f = held_force[c]
+                on.held[c, lane] = vec4(held_arc[c], grip_f[0], grip_f[1], grip_f[2])
+            if paused == 1:
+                on.after[wp.atomic_add(on.tally, 0, 1)] = lane
+            else:
+                on.after[on.after.shape[0] - 1 - wp.atomic_add(on.tally, 1, 1)] = lane
         out.depth[lane] = deepest
         out.status[lane] = status
         out.failed[lane] = failed
@@ -1257,9 +1487,14 @@ def solver(real: type, capacity: int, against: int = MESHES, bounds: tuple[int, 
         out.touching[lane] = touching
         out.crowded[lane] = crowded
         out.unsolved[lane] = unsolved
+        out.miss[lane] = miss
+        out.load[lane] = load
 
     return SimpleNamespace(
         run=run,
+        turn_over=turn_over,
+        look_all=look_all,
+        Paused=Paused,
         Chains=Chains,
         Bodies=Bodies,
         Lanes=Lanes,

@@ -16,7 +16,7 @@ from brainbench.stimuli.backends._engines import MILLI, step_travel, strongest_f
 from brainbench.stimuli.backends._reach import Reach, reachable
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
-from brainbench.stimuli.backends.rod._limits import DOUBTFUL, FINEST, LOST, OK, WIDEST
+from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, FINEST, LOST, OK, WIDEST
 from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
 from brainbench.stimuli.chain import build_chain
 
@@ -98,6 +98,11 @@ class RodBackend:
 def _processors() -> int:
     """Processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_NUMBERS = ("depth", "failed", "miss", "load")
+_COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
+"""What a kernel leaves of each lane besides its readings."""
 
 
 @dataclass
@@ -185,8 +190,9 @@ def _simulate(
     out.wrench = empty(count, frames, 1, 6)
     out.contact = empty(count, frames, 1, fill=-1.0)
     out.points = empty(*((frames, capacity + 1, count) if record_shape else (1, 1, 1)), kind=kernels.vec3)
-    out.depth, out.failed = empty(count), empty(count)
-    for name in ("status", "steps", "touching", "crowded", "unsolved"):
+    for name in _NUMBERS:
+        setattr(out, name, empty(count))
+    for name in _COUNTS:
         setattr(out, name, empty(count, kind=wp.int32))
     options = kernels.Options()
     options.start = first.start * MILLI
@@ -196,14 +202,17 @@ def _simulate(
     wp.launch(
         kernels.run,
         dim=count,
-        inputs=[*batch_structs(batch, kernels, device), options, wp.array(readings, dtype=real, device=device), out],
+        inputs=[
+            *batch_structs(batch, kernels, device),
+            options,
+            wp.array(readings, dtype=real, device=device),
+            out,
+            kernels.Paused(),
+        ],
         device=device,
     )
     spent = time.thread_time() - started
-    results = {
-        name: getattr(out, name).numpy()
-        for name in ("wrench", "contact", "depth", "status", "failed", "steps", "touching", "crowded", "unsolved")
-    }
+    results = {name: getattr(out, name).numpy() for name in (*_NUMBERS, *_COUNTS, "wrench", "contact")}
     points = out.points.numpy() if record_shape else None
     for lane, (index, job, chain, missed) in enumerate(lanes):
         shape = None if points is None else points[:, : chain.links + 1, lane].astype(float) / MILLI
@@ -284,7 +293,7 @@ def _trace(
     missed: tuple[float, str],
     seconds: float,
 ) -> Trace:
-    steps, unsolved, crowded = (int(results[name][lane]) for name in ("steps", "unsolved", "crowded"))
+    steps, crowded = (int(results[name][lane]) for name in ("steps", "crowded"))
     wrench = results["wrench"][lane, :, 0].astype(float)
     arc = results["contact"][lane, :, 0].astype(float)
     end, reason = _end(int(results["status"][lane]), float(results["failed"][lane]) / MILLI)
@@ -298,9 +307,11 @@ def _trace(
         )
     if missed[0] < end:
         end, reason = missed
-    if not reason and unsolved > DOUBTFUL * steps:
-        end, reason = -np.inf, f"the contact forces of {unsolved} of {steps} steps did not converge"
-    if not reason and crowded > DOUBTFUL * steps:
+    doubt = float(np.sqrt(results["miss"][lane] / max(float(results["load"][lane]), 1e-30)))
+    if not reason and not doubt <= DOUBTFUL:
+        end = -np.inf
+        reason = f"contact forces missed by {doubt:.0%} (root mean square); choose a smaller time step"
+    if not reason and crowded > CROWDED * steps:
         end, reason = -np.inf, f"more contacts than can be solved together in {crowded} of {steps} steps"
     good = job.times < end - 1e-9
     touching = (arc >= 0) & good

@@ -16,9 +16,10 @@ import numpy as np
 from brainbench.errors import UsageError
 from brainbench.stimuli.backends._engines import MILLI
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
-from brainbench.stimuli.backends.rod._limits import DOUBTFUL
+from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, MESHES
 from brainbench.stimuli.backends.rod._pack import Chains, Shapes, Tracks, capacity_for, quaternions, still_knots
 from brainbench.stimuli.backends.rod._shapes import MESH
+from brainbench.stimuli.backends.rod._slices import Slices
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.objects import euler_matrix
 
@@ -46,9 +47,13 @@ class SweepResult:
     touching: NDArray[np.int32]
     """[sweep, whisker] steps with contact."""
     unsolved: NDArray[np.int32]
-    """[sweep, whisker] steps whose contact forces did not converge, or for whose contacts there was no room."""
+    """[sweep, whisker] steps whose contact forces did not converge."""
+    crowded: NDArray[np.int32]
+    """[sweep, whisker] steps for some of whose contacts there was no room."""
     depth: NDArray[np.floating]
     """[sweep, whisker] deepest overlap (mm)."""
+    doubt: NDArray[np.floating]
+    """[sweep, whisker] how much the last iterations still changed the contact forces, of their root mean square."""
     steps_in_full: int
     """Steps that every whisker takes from start to end."""
 
@@ -67,8 +72,8 @@ class SweepLauncher:
         device: str = "cpu",
         against: int | None = None,
         bounds: tuple[int, int] | None = None,
+        sliced: bool | None = None,
     ) -> None:
-        from brainbench.stimuli.backends.rod._limits import MESHES
         from brainbench.stimuli.backends.rod._solver import solver
 
         against = MESHES if against is None else against
@@ -78,6 +83,8 @@ class SweepLauncher:
             raise UsageError("Only sweeps whose object moves go through the fast path; received mover='head'.")
         wp = warp()
         self.device = pick_device(device)
+        self.sliced = against == MESHES and self.device.is_cuda if sliced is None else sliced
+        self.slices = 0
         self.scenes, self.grid, self.fidelity = scenes, grid, fidelity
         self.seconds: dict[str, float] = {}
         """What the last launch spent on placing objects, uploading, and computing."""
@@ -87,7 +94,9 @@ class SweepLauncher:
         chains = [build_chain(m.whisker, fidelity.link_count(m.whisker.arc_length)) for m in mounts]
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.real = wp.float32 if fidelity.precision == "single" else wp.float64
-        self.kernels = solver(self.real, self.capacity, against, BOUNDS if bounds is None else bounds)
+        self.kernels = solver(
+            self.real, self.capacity, against, BOUNDS if bounds is None else bounds, sliced=self.sliced
+        )
         self._chains = to_struct(self.kernels.Chains, Chains(self.capacity, chains).arrays(), self.device)
         self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in chains])
         self.readings = grid.frames.readings * MILLI
@@ -132,7 +141,7 @@ class SweepLauncher:
         out.wrench = wp.zeros((count, frames, whiskers, 6), dtype=real, device=device)
         out.contact = wp.full((count, frames, whiskers), -1.0, dtype=real, device=device)
         out.points = wp.zeros((1, 1, 1), dtype=kernels.vec3, device=device)
-        out.depth, out.failed = (wp.zeros(len(row), dtype=real, device=device) for _ in range(2))
+        out.depth, out.failed, out.miss, out.load = (wp.zeros(len(row), dtype=real, device=device) for _ in range(4))
         names = ("status", "steps", "touching", "crowded", "unsolved")
         for name in names:
             setattr(out, name, wp.zeros(len(row), dtype=wp.int32, device=device))
@@ -149,7 +158,10 @@ class SweepLauncher:
         ]
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
-        wp.launch(kernels.run, dim=len(row), inputs=inputs, device=device, block_dim=BLOCK)
+        if self.sliced:
+            self.slices = Slices(kernels, real, self.capacity, len(row), device).run(inputs, BLOCK)
+        else:
+            wp.launch(kernels.run, len(row), [*inputs, kernels.Paused()], device=device, block_dim=BLOCK)
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
         self.seconds = dict(zip(("objects", "upload", "kernel"), np.diff(clock).tolist(), strict=True))
@@ -160,8 +172,10 @@ class SweepLauncher:
             status=found["status"],
             steps=found["steps"],
             touching=found["touching"],
-            unsolved=found["unsolved"] + found["crowded"],
+            unsolved=found["unsolved"],
+            crowded=found["crowded"],
             depth=out.depth.numpy().reshape(whiskers, count).T,
+            doubt=np.sqrt(out.miss.numpy() / np.maximum(out.load.numpy(), 1e-30)).reshape(whiskers, count).T,
             steps_in_full=int(self.steps_each.sum()) * count,
         )
 
@@ -180,8 +194,8 @@ class SweepLauncher:
             moved = np.moveaxis(wrench, 1, 0)
             wrench = np.moveaxis(frames.reduce(moved.astype(float)), 0, 1).astype(np.float32)
             contact = np.asarray(frames.split(np.moveaxis(contact, 1, 0)).any(axis=1)).swapaxes(0, 1)
-        doubtful = result.unsolved > DOUBTFUL * np.maximum(result.steps, 1)
-        unstable = (result.status != 0) | doubtful
+        crowded = result.crowded > CROWDED * np.maximum(result.steps, 1)
+        unstable = (result.status != 0) | crowded | ~(result.doubt <= DOUBTFUL)
         names = [mount.name for mount in self.scenes.array]
         reasons = [""] * len(unstable)
         for row in np.flatnonzero(unstable.any(axis=1)):
@@ -208,16 +222,17 @@ class SweepLauncher:
         diagonal = solid.diagonal
         mesh, face = shapes.add_mesh(surface.vertices * MILLI, surface.faces)
         radius = float(np.linalg.norm(surface.vertices, axis=1).max()) * MILLI
-        lows: dict[float, NDArray] = {}
+        turned: dict[float, tuple[NDArray, NDArray]] = {}
         for sweep in sweeps:
-            turn = euler_matrix((0.0, 0.0, sweep.rotation))
-            if sweep.rotation not in lows:
-                lows[sweep.rotation] = (surface.vertices @ turn.T).min(axis=0)
+            if sweep.rotation not in turned:
+                turn = euler_matrix((0.0, 0.0, sweep.rotation))
+                turned[sweep.rotation] = (surface.vertices @ turn.T).min(axis=0), quaternions((head.T @ turn)[None])[0]
             scale = sweep.size / diagonal
-            low = lows[sweep.rotation] * scale
+            low, quaternion = turned[sweep.rotation]
+            low = low * scale
             y = grid.start - low[1] if grid.placing == "clear" else grid.start + low[1]
             place = head.T @ (np.array([sweep.distance - low[0], y, sweep.height]) - self._origin)
-            knot = still_knots(place, quaternions((head.T @ turn)[None])[0])
+            knot = still_knots(place, quaternion)
             knot[0, 3:6] = head.T @ np.array([0.0, -sweep.speed, 0.0])
             shapes.rows.append(
                 {
