@@ -55,9 +55,10 @@ def fit_per_model(board: Board, entries: Sequence[Entry]) -> Figure:
     if not rows:
         return Figure(key, title, "", None, "no record has a defined score")
     many, rows = len(rows), rows[:SHOWN]
-    marks = [(e.name, e, e.value, e.interval) for e in rows]
-    scale = score_scale([value for *_, value, _ in marks], [i for *_, i in marks], 250, WIDTH - 20)
     base = [item for item in board.baselines if math.isfinite(item.score.value)]
+    values = [entry.value for entry in rows] + [item.score.value for item in base]
+    intervals = [entry.interval for entry in rows] + [item.score.interval for item in base]
+    scale = score_scale(values, intervals, 250, WIDTH - 20)
     drawing = Drawing(WIDTH, 44 + 19 * (len(rows) + len(base)), f"{title}: {len(rows)} models, best first")
     draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
     animals = next((b.score for b in base if b.kind == "animals" and known(b.score.interval)), None)

@@ -1,0 +1,30 @@
+"""What docs/leaderboards.md shows, works."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).parents[2] / "docs" / "leaderboards.md"
+
+
+def test_the_records_of_the_page_become_a_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    made: dict[str, object] = {}
+    exec(compile(block, PAGE.name, "exec"), made)
+    assert (tmp_path / "site" / "index.html").is_file()
+    assert [item.problem for item in made["stored"]] == [None, None]  # type: ignore[union-attr]
+    assert len(list((tmp_path / "site" / "models").iterdir())) == 2
+
+
+def test_links_of_the_page_lead_somewhere_and_its_commands_exist():
+    from typer.testing import CliRunner
+
+    from brainbench.cli import app
+
+    text = PAGE.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (PAGE.parent / target).exists(), target
+    shown = CliRunner().invoke(app, ["leaderboard", "--help"]).output
+    assert set(re.findall(r"brainbench leaderboard ([a-z]+)", text)) <= set(re.findall(r"[a-z]+", shown))
