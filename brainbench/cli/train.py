@@ -37,7 +37,7 @@ def train(
     learning_rate: Annotated[float | None, typer.Option(help="Initial learning rate.")] = None,
     augmentation: Annotated[str | None, typer.Option(help="none, physical, thesis or image.")] = None,
     masking: Annotated[float | None, typer.Option(help="Share of masked time steps (published with 0.75).")] = None,
-    precision: Annotated[str | None, typer.Option(help="bf16 (mixed) or float32.")] = None,
+    precision: Annotated[str | None, typer.Option(help="bf16 (mixed), float32, or auto: bf16 on CUDA.")] = None,
     compile: Annotated[
         str | None, typer.Option(help="off, parts (of the network), default (the whole) or graphs (whole steps as CUDA graphs).")
     ] = None,

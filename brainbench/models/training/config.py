@@ -13,7 +13,7 @@ from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unkn
 from brainbench.models.checkpoints import DTYPES
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, Setting, recipe_for
 
-PRECISIONS = ("float32", "bf16")
+PRECISIONS = ("auto", "float32", "bf16")
 COMPILE = ("off", "parts", "default", "graphs")
 AUGMENTATIONS = ("none", "physical", "thesis", "image")
 
@@ -41,8 +41,9 @@ class TrainingConfig:
     """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.augment`)."""
     masking: float = 0.0
     """Share of masked time steps."""
-    precision: str = "bf16"
-    """``float32``, or ``bf16``: mixed precision with float32 weights."""
+    precision: str = "auto"
+    """``float32``, ``bf16`` (mixed precision with float32 weights), or ``auto``: bf16 on CUDA and float32 on the CPU,
+    where PyTorch's half-precision gradients of small convolutions are slower and now and then not finite."""
     compile: str = "off"
     """``off``, ``parts`` (torch.compile of cells and blocks, each once: quick to compile), ``default`` (of the whole
     unrolled step) or ``graphs`` (cells fused, and on CUDA the whole step recorded as a CUDA graph: the fastest)."""

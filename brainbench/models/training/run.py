@@ -13,7 +13,7 @@ import logging
 import math
 import time
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -113,6 +113,8 @@ class _Run:
     def __init__(
         self, config: TrainingConfig, data: Data, out: Path, where: Processes, progress: Progress | None
     ) -> None:
+        if config.precision == "auto":
+            config = replace(config, precision="bf16" if where.device.type == "cuda" else "float32")
         self.config, self.data, self.out, self.where = config, data, out, where
         self.progress = progress if progress is not None and where.first else (lambda done, total, what: None)
         self.started = self.saved = time.monotonic()

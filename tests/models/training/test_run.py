@@ -62,6 +62,11 @@ def test_a_run_learns_what_can_be_learned_and_leaves_a_model_to_load(tmp_path):
     assert losses[-1] < losses[0]
 
 
+def test_on_the_cpu_precision_is_single_unless_asked_otherwise(tmp_path):
+    train(_config(precision="auto", epochs=1), tiny(), out=tmp_path, device="cpu")
+    assert json.loads((tmp_path / "run.json").read_text())["run"]["precision"] == "float32"
+
+
 @pytest.mark.parametrize("objective", ["simclr", pytest.param("simsiam", marks=pytest.mark.slow), "ae"])
 def test_self_supervised_runs_end_with_a_linear_probe(objective, tmp_path):
     result = train(_config(objective, augmentation="physical"), tiny(), out=tmp_path, device="cpu")
