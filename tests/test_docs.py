@@ -1,6 +1,10 @@
 """What the documentation shows, works."""
 
+import importlib.util
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +47,16 @@ def test_the_data_set_of_the_datasets_page_can_be_made_and_read(tmp_path: Path, 
     assert made["manifest"]["sweeps"] == WhiskingDataset("mine", split="all").sweeps == 6
 
 
-@pytest.mark.parametrize(
-    "page", ["README.md", "CONTRIBUTING.md", "docs/recordings.md", "docs/stimuli.md", "docs/datasets.md"]
-)
+PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.md"))
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", *PAGES])
 def test_links_between_pages_lead_somewhere(page: str):
     text = (ROOT / page).read_text(encoding="utf-8")
-    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+        # Pages that the site makes of other files.
+        if Path(target).name in ("results.md", "from-simulation-to-leaderboard.md"):
+            continue
         assert ((ROOT / page).parent / target).exists(), f"{page} links to {target}, which does not exist"
 
 
@@ -69,6 +77,79 @@ def run_help():
     from brainbench.cli import app
 
     return lambda *words: CliRunner().invoke(app, [*words, "--help"]).output
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        "docs/score.md",
+        "docs/add-a-model.md",
+        "docs/fidelity.md",
+        "docs/policies.md",
+        "docs/index.md",
+        pytest.param("docs/tactile.md", marks=pytest.mark.slow),
+    ],
+)
+def test_the_code_of_a_page_runs_from_top_to_bottom(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registry
+):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    blocks = _blocks(page, "python")
+    assert blocks
+    for block in blocks:
+        exec(compile(block, page, "exec"), names)
+    if page == "docs/score.md":
+        assert names["record"].score.layer == "rotated"
+        assert names["record"].score.p < 0.05
+
+
+@pytest.fixture
+def registry(monkeypatch: pytest.MonkeyPatch):
+    from brainbench import list_models
+    from brainbench.models import registry
+
+    list_models()
+    monkeypatch.setattr(registry, "_records", dict(registry._records))
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_asks_nothing_of_the_network(tmp_path: Path):
+    pytest.importorskip("material")
+    pytest.importorskip("mkdocstrings_handlers.python")
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for page in tmp_path.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r'<(?:script|img|iframe)[^>]*\ssrc="(https?:[^"]+)', text)
+        loaded += re.findall(r'<link[^>]*rel="(?:stylesheet|preconnect|preload)"[^>]*href="(https?:[^"]+)', text)
+        assert not loaded, f"{page.name} loads {loaded[0]}"
+    assert "permuted" in (tmp_path / "api" / "metrics.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_gives_what_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    nbformat = pytest.importorskip("nbformat")
+    spec = importlib.util.spec_from_file_location("build_notebook", ROOT / "docs" / "notebooks" / "build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    build = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build)
+    shown = nbformat.read(build.NOTEBOOK, as_version=4)
+    sources = [(cell.cell_type, cell.source) for cell in shown.cells]
+    assert sources == list(build.CELLS), "run docs/notebooks/build.py anew"
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    made = build.make(tmp_path)
+    for old, new in zip(shown.cells, made.cells, strict=True):
+        if new.cell_type == "code":
+            kinds = [
+                [output.output_type for output in cell.outputs if output.get("name") != "stderr"] for cell in (old, new)
+            ]
+            assert kinds[0] == kinds[1]
 
 
 def test_the_metric_of_the_statistics_page_scores(tmp_path: Path):

@@ -4,6 +4,7 @@ The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`spli
 :func:`noise_corrected`; :func:`noise_ceiling`; :func:`permutation_test`; :func:`subject_rdm`,
 :func:`score_rdms` and :func:`score_animals`, which join them. Beyond one score: :func:`bootstrap_score`,
 :func:`compare_models`, :func:`layer_tests`, :func:`turing_test`. Beyond RSA: :func:`get_metric`.
+:class:`RDM` names and draws one.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from brainbench.metrics.animal_to_animal import pairwise_consistency, score_anim
 from brainbench.metrics.bootstrap import DRAWS, Bootstrap, bootstrap_ceiling, bootstrap_comparisons, bootstrap_score
 from brainbench.metrics.ceiling import NoiseCeiling, noise_ceiling
 from brainbench.metrics.compare import COMPARISONS, compare
+from brainbench.metrics.display import RDM
 from brainbench.metrics.equivalence import EquivalenceTest, equivalence_test, turing_test
 from brainbench.metrics.inference import PermutationTest, permutation_test
 from brainbench.metrics.movies import rdm_movie
@@ -30,6 +32,7 @@ __all__ = [
     "COMPARISONS",
     "DRAWS",
     "ESTIMATORS",
+    "RDM",
     "RDM_METHODS",
     "RELIABILITY_GATE",
     "SUBJECT_METHODS",
