@@ -286,3 +286,28 @@ def test_balls_on_wood_metal_and_glass_are_told_apart_by_a_linear_classifier_at_
     for train in (slow, ~slow):
         rule = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000)).fit(x[train], y[train])
         assert rule.score(x[~train], y[~train]) >= 0.95
+
+
+@pytest.mark.gpu
+def test_cpu_and_cuda_agree():
+    heard = {}
+    for device in ("cpu", "cuda"):
+        sensors = {
+            "contact": ContactAudio(link="box", modes=MODES, samples=K),
+            "drives": ActuationAudio(link="box", joints=3, samples=K, hum=0.01),
+        }
+        suite, state = SensorSuite(_scene(), sensors, num_envs=4, device=device), HandState.empty(4, 3, 16, device)
+        listener = Microphone(position=(0.5, 0.0, 0.2)).build(suite)
+        velocity = np.zeros((4, 3, 6))
+        velocity[:, 2, 0] = 0.1
+        state.set_velocity(velocity)
+        joint_drive(suite, "drives")[1].fill_(7.0)
+        blocks = []
+        for block in range(6):
+            if block == 1:
+                _touch(state, 10.0, envs=(0, 2))
+            suite.update(state, DT)
+            listener.update(state, DT)
+            blocks.append(np.concatenate([listener.read().cpu().numpy(), suite.read("contact")[:, 0].cpu().numpy()]))
+        heard[device] = np.stack(blocks)
+    assert heard["cuda"] == pytest.approx(heard["cpu"], abs=float(2e-4 * np.abs(heard["cpu"]).max()))

@@ -28,7 +28,7 @@ def _presses(steps: int, seed: int = 0) -> np.ndarray:
     return signal
 
 
-def _log(noise: Noise, steps: int = 4000, probes: int = 40, seed: int = 0) -> Log:
+def _log(noise: Noise, steps: int = 2500, probes: int = 40, seed: int = 0) -> Log:
     x = _presses(steps, seed)
     y = simulate(noise, np.broadcast_to(x[:, None, None, None], (steps, 1, probes, 1)), dt=DT, seed=seed)
     return Log(np.arange(steps) * DT, y[:, 0, :, 0].astype(float), x)

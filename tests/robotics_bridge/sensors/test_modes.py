@@ -43,6 +43,7 @@ def test_a_free_ball_has_lambs_frequencies():
     assert number[5:] == pytest.approx(np.full(5, 2.640), rel=0.02)
 
 
+@pytest.mark.slow
 def test_any_closed_mesh_is_filled_and_sounds_nearly_like_its_primitive():
     import trimesh
 
@@ -81,6 +82,7 @@ def test_shapes_are_normalised_by_mass_and_normals_point_outward():
     assert 0.1 < np.sqrt(np.mean(normal**2, axis=0)).max() * math.sqrt(mass) < 5
 
 
+@pytest.mark.slow
 def test_a_point_of_rest_does_not_excite_a_mode():
     solid = Solid("box", (0.1, 0.005, 0.004))
     ends = find_modes(solid, STEEL, count=1, cells=40, strike=(0.1, 0, 0.004), hear=(0.1, 0, 0.004))

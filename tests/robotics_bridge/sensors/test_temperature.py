@@ -322,3 +322,22 @@ def test_a_grid_needs_finite_geometry_or_corners():
     suite, _state = _make()
     with pytest.raises(UsageError, match="Unknown temperature grid 'gird'; did you mean 'grid'"):
         link_temperature(suite, "gird")
+
+
+@pytest.mark.gpu
+def test_cpu_and_cuda_agree():
+    read = {}
+    for device in ("cpu", "cuda"):
+        geometries = (
+            Geometry(name="pad", link="pad", kind="box", size=(0.01, 0.02, 0.03)),
+            Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
+        )
+        grid = TemperatureGrid(link="pad", cells=(4, 5, 6), bodies={"object": Body("steel", 60.0)}, tau=0.1)
+        suite = SensorSuite(Scene(("world", "pad", "object"), geometries), {"grid": grid}, num_envs=8, device=device)
+        state = HandState.empty(8, 3, 32, device)
+        _face(state, 0.008, envs=tuple(range(8)), depth=1e-3)
+        for _ in range(100):
+            suite.update(state, 0.01)
+        read[device] = suite.read("grid").cpu().numpy()
+    assert read["cuda"] == pytest.approx(read["cpu"], abs=1e-3)
+    assert read["cpu"].max() > 22.05
