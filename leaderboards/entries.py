@@ -3,7 +3,8 @@
 Networks that differ only in the seed of their weights are one **entry**. Its value is the mean over seeds.
 Its interval crosses animals and seeds: the half widths of the t intervals of each animal's mean over seeds and
 of each seed's mean over animals, added in squares (a little too wide, since both hold the residual). The
-spread over seeds stands beside it. Entries are ranked as records are (:mod:`leaderboards.ranking`): where intervals overlap, models are tied and ranks are ranges.
+spread over seeds stands beside it. Entries are ranked as records are (:mod:`leaderboards.ranking`): models that are
+not told apart are tied, and ranks are ranges.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from brainbench.files import content_hash
 from brainbench.types import Interval, ModelCard, Score, Status
 from leaderboards import _origin
 from leaderboards._figures import known
-from leaderboards.ranking import Board, RankedRecord, rank_ranges
+from leaderboards.ranking import Board, RankedRecord, animals_of, rank_ranges
 from leaderboards.store import record_name
 
 _SEVERITY: tuple[Status, ...] = ("ok", "unreliable", "undefined")
@@ -122,7 +123,8 @@ def entries_of(board: Board, remarks: Mapping[str, Sequence[str]] | None = None)
         groups[*kind, copy].append(row)
     entries = [_entry(board, key, rows, remarks or {}) for key, rows in groups.items()]
     ranked = [entry for entry in entries if all(not row.unranked_because for row in entry.rows) and entry.interval]
-    ranges = rank_ranges([entry.interval for entry in ranked if entry.interval])
+    intervals = [entry.interval for entry in ranked if entry.interval]
+    ranges = rank_ranges(intervals, [_animals(entry) for entry in ranked], [_chance(entry) for entry in ranked])
     placed = {id(entry): span for entry, span in zip(ranked, ranges, strict=True)}
     found = [
         replace(entry, first=placed[id(entry)][0], last=placed[id(entry)][1]) if id(entry) in placed else entry
@@ -134,6 +136,17 @@ def entries_of(board: Board, remarks: Mapping[str, Sequence[str]] | None = None)
 def twins(entries: Sequence[Entry]) -> dict[str, Entry]:
     """Return the untrained entries by the architecture's name."""
     return {entry.architecture: entry for entry in reversed(entries) if not entry.trained}
+
+
+def _animals(entry: Entry) -> dict[str, float]:
+    """Return each animal's mean over seeds, of the animals that every seed was scored on."""
+    found = [animals_of(row.record.score) for row in entry.rows]
+    return {name: _mean([one[name] for one in found]) for name in found[0] if all(name in one for one in found)}
+
+
+def _chance(entry: Entry) -> float:
+    """Return the variance of the mean over seeds."""
+    return entry.spread**2 / entry.seeds if entry.seeds > 1 and math.isfinite(entry.spread) else 0.0
 
 
 def _kind(row: RankedRecord) -> tuple[object, ...]:

@@ -149,7 +149,7 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     significance = re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method)
     text += f" Significance: {significance}." if significance else ""
     text += f" Noise ceiling: {score.ceiling.method}." if score.ceiling and score.ceiling.method else ""
-    text += " Ranks are ranges: models whose intervals overlap are tied."
+    text += f" Ranks are ranges. {board.ties}"
     text += f" Computed with brainbench {', '.join(versions)}." if versions else ""
     text += f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
     text += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""

@@ -2,26 +2,37 @@
 
 Scores are comparable only within a **board**: same recordings, same stimuli, same estimator, same
 metric, same use of the time axis. Within a board only scores of status ``ok`` that carry an
-interval are ranked. Two models whose intervals overlap are not told apart, so every model has a
-range of ranks: from one more than the number of models whose interval lies wholly above its own, to
-the number of ranked models less those whose interval lies wholly below. The rule is conservative
-(the models share the animals, so a paired comparison could separate more of them) and needs nothing
-that a record does not hold.
+interval are ranked. Models that are not told apart are tied, so every model has a range of ranks: from
+one more than the number of models told apart above it, to the number of ranked models less those told
+apart below.
+
+Two models that were scored on at least five animals in common are told apart by a paired t test over
+these animals, at a false discovery rate of 5 % over all pairs of the board (Benjamini & Hochberg 1995):
+they share the animals, so their difference is known better than either. With fewer animals, where no such
+test is to be trusted, they are told apart when their intervals do not overlap.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from brainbench.types import Interval, ResultRecord, Score
 from leaderboards import _origin
 from leaderboards._figures import known
 from leaderboards.store import record_name
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PAIRED_ANIMALS = 5
+"""Fewest animals in common for a paired test; coverage of t intervals was verified from five up."""
+FALSE_DISCOVERY_RATE = 0.05
 
 
 @dataclass(frozen=True)
@@ -80,6 +91,8 @@ class Board:
     synthetic: bool
     rows: tuple[RankedRecord, ...]
     baselines: tuple[Baseline, ...] = field(default=())
+    ties: str = ""
+    """By which rule its models are told apart, in words."""
 
     @property
     def comparable(self) -> bool:
@@ -98,19 +111,76 @@ def rank(records: Iterable[ResultRecord]) -> list[Board]:
     return sorted(boards, key=lambda board: (-len(board.rows), board.recordings, board.estimator, board.metric))
 
 
-def rank_ranges(intervals: list[Interval]) -> list[tuple[int, int]]:
-    """Return the best and the worst rank that each interval allows among all of them.
+def rank_ranges(
+    intervals: Sequence[Interval],
+    animals: Sequence[Mapping[str, float]] | None = None,
+    chance: Sequence[float] | None = None,
+) -> list[tuple[int, int]]:
+    """Return the best and the worst rank that each model may have among all of them.
+
+    Args:
+        intervals: One per model.
+        animals: Score of each animal, per model; pairs with :data:`PAIRED_ANIMALS` in common are compared on them.
+        chance: Variance of each model's score beside that of the animals (its seeds'); 0 if not given.
 
     >>> rank_ranges([Interval(0.7, 0.9), Interval(0.6, 0.8), Interval(0.1, 0.3)])
     [(1, 2), (1, 2), (3, 3)]
     """
-    lows = sorted(interval.low for interval in intervals)
-    highs = sorted(interval.high for interval in intervals)
-    count = len(intervals)
-    return [
-        (1 + count - bisect_right(lows, interval.high), count - bisect_left(highs, interval.low))
-        for interval in intervals
-    ]
+    if not intervals:
+        return []
+    low = np.array([interval.low for interval in intervals])
+    high = np.array([interval.high for interval in intervals])
+    above = low[None, :] > high[:, None]  # [i, j]: j is told apart above i
+    if animals is not None:
+        _compare_pairs(above, animals, np.zeros(len(low)) if chance is None else np.array(chance))
+    best, worst = 1 + above.sum(axis=1), len(low) - above.sum(axis=0)
+    return [(int(first), int(last)) for first, last in zip(best, worst, strict=True)]
+
+
+def animals_of(score: Score) -> dict[str, float]:
+    """Return the score of each animal that has one."""
+    return {item.subject: item.value for item in score.subjects if math.isfinite(item.value)}
+
+
+def pairs_rule(animals: Sequence[Mapping[str, float]]) -> str:
+    """Return by which rule models with these animals are told apart, in words."""
+    most = max((len(set(one)) for one in animals), default=0)
+    if most >= PAIRED_ANIMALS:
+        return (
+            "Models are tied unless a paired t test over the animals tells them apart, at a false discovery rate of "
+            "5 % over all pairs."
+        )
+    return (
+        f"Models whose intervals overlap are tied (with fewer than {PAIRED_ANIMALS} animals no paired test is trusted)."
+    )
+
+
+def _compare_pairs(
+    above: NDArray[np.bool_], animals: Sequence[Mapping[str, float]], chance: NDArray[np.float64]
+) -> None:
+    """Overwrite ``above`` [N, N] for the pairs that a paired test can compare."""
+    from scipy.special import stdtr
+
+    names = sorted({name for values in animals for name in values})
+    table = np.array([[values.get(name, math.nan) for name in names] for values in animals]).reshape(len(animals), -1)
+    p = np.full(above.shape, math.nan)
+    higher = np.zeros_like(above)
+    for i, row in enumerate(table):
+        difference = table - row
+        shared = np.isfinite(difference).sum(axis=1)
+        tested = np.flatnonzero((shared >= PAIRED_ANIMALS) & (np.arange(len(table)) != i))
+        if not len(tested):
+            continue
+        mean, spread = np.nanmean(difference[tested], axis=1), np.nanvar(difference[tested], axis=1, ddof=1)
+        error = np.sqrt(spread / shared[tested] + chance[tested] + chance[i])
+        t = np.divide(np.abs(mean), error, out=np.where(mean == 0, 0.0, math.inf), where=error > 0)
+        p[i, tested] = 2 * stdtr(shared[tested] - 1.0, -t)
+        higher[i, tested] = mean > 0
+    known = np.isfinite(p)
+    values = np.sort(p[np.triu(known, 1)])
+    passed = np.flatnonzero(values <= FALSE_DISCOVERY_RATE * np.arange(1, len(values) + 1) / max(len(values), 1))
+    limit = values[passed[-1]] if len(passed) else -1.0
+    above[known] = ((p <= limit) & higher)[known]
 
 
 def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
@@ -118,7 +188,8 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
     repeats = Counter(_model(record) for record in records)
     reasons = [_unranked(record, recordings_hash is not None) for record in records]
     ranked = [record for record, reason in zip(records, reasons, strict=True) if not reason]
-    ranges = iter(rank_ranges([record.score.interval for record in ranked if record.score.interval]))
+    animals = [animals_of(record.score) for record in ranked]
+    ranges = iter(rank_ranges([record.score.interval for record in ranked if record.score.interval], animals))
     rows = []
     for record, reason in zip(records, reasons, strict=True):
         first, last = (None, None) if reason else next(ranges)
@@ -138,6 +209,7 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
         synthetic=any(record.synthetic for record in records),
         rows=tuple(rows),
         baselines=tuple(_baselines([row.record for row in rows])),
+        ties=pairs_rule(animals),
     )
 
 

@@ -84,6 +84,7 @@ def build_leaderboard(
             count_sentence=_count(listed),
             boards=boards,
             synthetic=synthetic,
+            tie_rules=list(dict.fromkeys(board.ties for board in boards)),
             problems=[item for item in stored if item.record is None],
             downloads=_downloads(root),
             data=script_json({"boards": compact(listed), "columns": COLUMNS, "page": PAGE, "margin": MARGIN}),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 from brainbench.types import Interval
-from leaderboards.ranking import rank, rank_ranges
+from leaderboards.ranking import PAIRED_ANIMALS, rank, rank_ranges
 
 INTERVALS = st.lists(
     st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1)).map(
@@ -143,3 +145,51 @@ def test_a_model_scored_twice_is_pointed_out(make_record):
     (board,) = rank([make_record("a", 0.5), make_record("a", 0.6), make_record("b", 0.4)])
     assert [bool(row.notes) for row in board.rows] == [True, True, False]
     assert "scored 2 times" in board.rows[0].notes[0]
+
+
+def _paired(values, chance=None):
+    """Rank models by the scores [model, animal] under intervals that all overlap."""
+    animals = [{f"animal-{i}": float(value) for i, value in enumerate(row)} for row in values]
+    return rank_ranges([Interval(0.0, 1.0)] * len(values), animals, chance)
+
+
+def test_models_that_share_animals_are_told_apart_by_their_paired_difference():
+    animal = np.random.default_rng(0).normal(0.5, 0.2, 11)
+    noise = np.random.default_rng(1).normal(0, 0.02, (3, 11))
+    assert _paired(animal + noise + np.array([[0.2], [0.1], [0.0]])) == [(1, 1), (2, 2), (3, 3)]
+
+
+def test_too_few_animals_leave_the_decision_to_the_intervals():
+    values = np.array([[0.9], [0.1]]) + np.linspace(0, 0.01, PAIRED_ANIMALS - 1)
+    assert _paired(values) == [(1, 2), (1, 2)]
+
+
+def test_paired_ranks_equal_scipys_tests_with_benjamini_and_hochberg():
+    rng = np.random.default_rng(2)
+    values = rng.normal(0, 0.1, (8, 9)) + np.linspace(0, 0.3, 8)[:, None]
+    pairs = [(i, j) for i in range(8) for j in range(i)]
+    p = stats.false_discovery_control([stats.ttest_rel(values[i], values[j]).pvalue for i, j in pairs], method="bh")
+    apart = {pair for pair, value in zip(pairs, p, strict=True) if value <= 0.05}
+    above = [sum(values[j].mean() > values[i].mean() for j in range(8) if {(i, j), (j, i)} & apart) for i in range(8)]
+    below = [sum(values[j].mean() < values[i].mean() for j in range(8) if {(i, j), (j, i)} & apart) for i in range(8)]
+    assert 0 < len(apart) < len(pairs)
+    assert _paired(values) == [(1 + a, 8 - b) for a, b in zip(above, below, strict=True)]
+
+
+def test_equal_models_are_rarely_told_apart():
+    rng = np.random.default_rng(3)
+    split = sum(_paired(rng.normal(0, 0.1, (6, 8))) != [(1, 6)] * 6 for _ in range(300))
+    assert split / 300 < 0.08
+
+
+def test_the_chance_of_seeds_widens_the_ties():
+    animal = np.random.default_rng(0).normal(0.5, 0.2, 11)
+    noise = np.random.default_rng(1).normal(0, 0.02, (2, 11))
+    values = animal + noise + np.array([[0.1], [0.0]])
+    assert _paired(values) == [(1, 1), (2, 2)]
+    assert _paired(values, [0.01, 0.01]) == [(1, 2), (1, 2)]
+
+
+def test_the_rule_that_was_used_is_said(make_record):
+    (board,) = rank([make_record("a"), make_record("b")])
+    assert board.ties.startswith("Models whose intervals overlap are tied")
