@@ -27,16 +27,21 @@ from leaderboards.ranking import Board, rank
 from leaderboards.store import StoredRecord
 
 FORMATS = ("md", "html", "pdf")
+_WORDY = ("model", "baseline", "animal", "statement", "value", "layer", "status")
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts; columns from ``right`` on are numbers."""
+    """A table of texts."""
 
     caption: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    right: int = 1
+
+    @property
+    def numbers(self) -> tuple[bool, ...]:
+        """Whether each column holds numbers, which are set flush right."""
+        return tuple(name not in _WORDY for name in self.columns)
 
 
 @dataclass(frozen=True)
@@ -204,7 +209,9 @@ def _models(entries: Sequence[Entry]) -> Table:
         )
         for entry in entries
     ]
-    return Table("Models, best first.", columns, tuple(rows))
+    used = [i for i in range(len(columns)) if any(row[i] for row in rows)]
+    kept = tuple(tuple(row[i] for i in used) for row in rows)
+    return Table("Models, best first.", tuple(columns[i] for i in used), kept)
 
 
 def _baselines(board: Board) -> Table:
@@ -229,7 +236,7 @@ def _animals(entry: Entry) -> Table:
 
 def _card(entry: Entry) -> Table:
     rows = (*_words.card_rows(entry.card), *_words.training_rows(entry.card))
-    return Table("The model.", ("statement", "value"), tuple(rows), right=9)
+    return Table("The model.", ("statement", "value"), tuple(rows))
 
 
 def _inline(figure: Figure) -> str:
@@ -292,7 +299,7 @@ def _markdown(paper: Paper, path: Path) -> str:
 
 
 def _rows(table: Table) -> list[str]:
-    ends = ["---" if i < table.right else "---:" for i in range(len(table.columns))]
+    ends = ["---:" if number else "---" for number in table.numbers]
     lines = [table.columns, ends, *([_escape(cell) for cell in row] for row in table.rows)]
     return ["| " + " | ".join(line) + " |" for line in lines]
 
