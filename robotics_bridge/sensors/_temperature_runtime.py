@@ -54,7 +54,8 @@ class TemperatureRuntime(ReadoutRuntime):
         """Warp array [B, L] (°C) of the bodies that may be touched."""
         shape = (context.num_envs, self.count)
         many = (context.num_envs, len(structures))
-        self._number = wp.zeros(many, dtype=wp.int32, device=device)
+        self.found_contacts = wp.zeros(many, dtype=wp.int32, device=device)
+        """Warp array [B, S]: contacts of each grid at the last update."""
         self._kept = wp.zeros((*many, CAPACITY), dtype=wp.int32, device=device)
         fields = [wp.zeros(shape, dtype=wp.float64, device=device) for _ in range(4)]
         self._field, self._first, self._second, self._element = fields
@@ -119,14 +120,14 @@ class TemperatureRuntime(ReadoutRuntime):
         def run(kernel: Any, dim: Any, *inputs: Any) -> None:
             wp.launch(kernel, dim=dim, inputs=inputs, device=c.device)
 
-        self._number.zero_()
+        self.found_contacts.zero_()
         run(
             k.collect, state.contact_env.shape[0], state.contact_count, state.contact_env, state.contact_geom,
-            self._link_of, self._structures, self._number, self._kept,
+            self._link_of, self._structures, self.found_contacts, self._kept,
         )  # fmt: skip
         run(
-            k.conduct, self._number.shape, state.contact_geom, state.contact_distance, state.contact_position,
-            state.contact_normal, self._link_of, self._structures, self._number, self._kept, state.status, state.pose,
+            k.conduct, self.found_contacts.shape, state.contact_geom, state.contact_distance, state.contact_position,
+            state.contact_normal, self._link_of, self._structures, self.found_contacts, self._kept, state.status, state.pose,
             self._conductivity, self._diffusivity, self.link_temperature, self._touched, dt, self._g, self._inflow,
         )  # fmt: skip
         age = c.clock.age

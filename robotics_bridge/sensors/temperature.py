@@ -138,13 +138,30 @@ def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
     Raises:
         UsageError: the suite has no such temperature grid.
     """
+    return warp().to_torch(_runtime(suite, name).link_temperature)
+
+
+def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
+    """Return how many contacts [B] of the last update a grid had no room for (it looks at 48).
+
+    Raises:
+        UsageError: the suite has no such temperature grid.
+    """
+    from robotics_bridge.sensors._temperature_kernels import CAPACITY
+
+    runtime = _runtime(suite, name)
+    column = list(runtime.places).index(name)
+    return (warp().to_torch(runtime.found_contacts)[:, column] - CAPACITY).clamp(min=0)
+
+
+def _runtime(suite: SensorSuite, name: str) -> TemperatureRuntime:
     from robotics_bridge.sensors._temperature_runtime import TemperatureRuntime
 
-    runtime = next((r for r in suite.runtimes if isinstance(r, TemperatureRuntime) and name in r.places), None)
-    if runtime is None:
-        grids = [n for r in suite.runtimes if isinstance(r, TemperatureRuntime) for n in r.places]
-        raise unknown_name("temperature grid", name, grids)
-    return warp().to_torch(runtime.link_temperature)
+    served = [runtime for runtime in suite.runtimes if isinstance(runtime, TemperatureRuntime)]
+    for runtime in served:
+        if name in runtime.places:
+            return runtime
+    raise unknown_name("temperature grid", name, [key for runtime in served for key in runtime.places])
 
 
 def _bounds(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

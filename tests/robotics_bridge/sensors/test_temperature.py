@@ -19,7 +19,7 @@ from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors._temperature_runtime import diffusion
 from robotics_bridge.sensors.noise import Noise
 from robotics_bridge.sensors.suite import SensorSuite
-from robotics_bridge.sensors.temperature import TemperatureGrid, link_temperature
+from robotics_bridge.sensors.temperature import TemperatureGrid, link_temperature, lost_contacts
 from robotics_bridge.sensors.thermal_materials import MATERIALS, Body, ThermalMaterial, material
 
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
@@ -322,6 +322,17 @@ def test_a_grid_needs_finite_geometry_or_corners():
     suite, _state = _make()
     with pytest.raises(UsageError, match="Unknown temperature grid 'gird'; did you mean 'grid'"):
         link_temperature(suite, "gird")
+
+
+def test_contacts_without_room_are_counted():
+    suite, state = _make(contacts=60, bodies={"object": Body("steel", 60.0)})
+    state.set_contacts(
+        np.zeros(60), np.tile([[0, 1]], (60, 1)), distance=np.full(60, -1e-4),
+        position=np.random.default_rng(0).normal(size=(60, 3)) * 0.01, normal=np.tile([0.0, 0, 1], (60, 1)),
+    )  # fmt: skip
+    suite.update(state, 0.01)
+    assert lost_contacts(suite, "grid").tolist() == [12]
+    assert float(suite.read("grid").max()) > 22
 
 
 @pytest.mark.gpu
