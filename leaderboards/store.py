@@ -87,8 +87,8 @@ def _read(path: Path) -> tuple[ResultRecord, int]:
         raise DataError(f"{os.fspath(path)!r} cannot be read as UTF-8 text ({error}).") from error
     try:
         record, data = _parse(text, path)
-        # The hash is that of the layout on disk, which for an earlier version is not the record's own.
-        identity = record.identity if data["schema"] == RECORD_SCHEMA else record_identity(data)
+        # The hash is that of what the file says: a field that an earlier writer did not know is not in it.
+        identity = record_identity(data)
     except RecursionError as error:
         raise DataError(f"{path.name!r} is nested too deeply to be a result record.") from error
     named = path.stem.rpartition("--")[2]

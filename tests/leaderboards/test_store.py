@@ -209,3 +209,12 @@ def test_a_record_of_the_first_schema_is_read_by_its_own_hash_and_known_as_old(m
     path.write_text(json.dumps({**data, "synthetic": False}))
     with pytest.raises(DataError, match="was edited or renamed"):
         read_record(path)
+
+
+def test_a_record_that_lacks_a_later_optional_field_is_read_by_the_hash_of_what_it_says(make_record, tmp_path):
+    record = make_record()
+    data = json.loads(record.to_json())
+    del data["card"]["citation"]
+    path = tmp_path / f"zhuang--{record_identity(data)}.json"
+    path.write_text(json.dumps(data))
+    assert read_record(path) == record
