@@ -3,6 +3,7 @@ import torch
 from torch.nn import functional
 
 from brainbench.errors import UsageError
+from brainbench.models.attenders import mamba
 from brainbench.models.attenders.mamba import MambaAttender
 
 
@@ -60,3 +61,33 @@ def test_activations_are_the_blocks_and_the_norm():
 def test_sizes_are_positive():
     with pytest.raises(UsageError, match="positive sizes; received features 12, blocks 0"):
         MambaAttender(12, blocks=0)
+
+
+def _selective_scan(u, delta, A, B, C, D, *, z, delta_bias, delta_softplus):
+    """What mamba_ssm documents its kernel to compute: u, delta, z [B, D, L], A [D, N], B and C [B, N, L], D [D]."""
+    assert delta_softplus
+    size = functional.softplus(delta + delta_bias[:, None])
+    state, outputs = u.new_zeros(*u.shape[:2], A.shape[1]), []
+    for t in range(u.shape[2]):
+        state = torch.exp(size[:, :, t, None] * A) * state + (size * u)[:, :, t, None] * B[:, None, :, t]
+        outputs.append((state * C[:, None, :, t]).sum(-1))
+    return (torch.stack(outputs, 2) + D[:, None] * u) * functional.silu(z)
+
+
+def test_a_kernel_that_does_what_mamba_ssm_documents_changes_neither_answers_nor_gradients(monkeypatch):
+    attender, x = _attender(), torch.randn(2, 7, 12)
+
+    def results():
+        attender.zero_grad()
+        y = attender(x)
+        y.square().sum().backward()
+        return [y.detach(), *(parameter.grad.clone() for parameter in attender.parameters())]
+
+    plain = results()
+    monkeypatch.setattr(mamba, "_fused_scan", lambda x: _selective_scan)
+    torch.testing.assert_close(results(), plain, atol=1e-4, rtol=1e-4)
+
+
+def test_without_cuda_no_kernel_is_looked_for(monkeypatch):
+    monkeypatch.setattr(mamba, "_selective_scan", lambda: pytest.fail("asked for a CUDA kernel"))
+    _attender()(torch.randn(1, 3, 12))

@@ -1,6 +1,7 @@
 """Selective state spaces over the encoder's features (Mamba).
 
-Gu & Dao 2023, in plain PyTorch: a sweep is solved by a parallel scan, a stream by the recurrence. Pre-norm
+Gu & Dao 2023, in plain PyTorch: a sweep is solved by a parallel scan (on CUDA by the kernel of ``mamba_ssm`` where
+that package is installed, with equal results), a stream by the recurrence. Pre-norm
 residual blocks and a final norm. 6,784,000 parameters at width 512.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
+from functools import cache
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -33,6 +35,24 @@ class MambaMemory(NamedTuple):
 
 MambaState = tuple[MambaMemory, ...]
 """One memory per block."""
+
+
+def _fused_scan(x: torch.Tensor) -> Any:
+    """Return the kernel of the package ``mamba_ssm`` for tensors on CUDA, None where it cannot be used."""
+    if not x.is_cuda or torch.compiler.is_compiling() or torch.compiler.is_exporting():
+        return None
+    return _selective_scan()
+
+
+@cache
+def _selective_scan() -> Any:
+    try:
+        from mamba_ssm.ops.selective_scan_interface import (  # pyright: ignore[reportMissingImports]
+            selective_scan_fn,
+        )
+    except ImportError:
+        return None
+    return selective_scan_fn
 
 
 class MambaBlock(nn.Module):
@@ -71,6 +91,8 @@ class MambaBlock(nn.Module):
         u, gate = self.expand(self.norm(x)).chunk(2, -1)
         padded = functional.pad(u.transpose(1, 2), (self.convolution.kernel_size[0] - 1, 0))
         u = functional.silu(self.convolution(padded).transpose(1, 2))
+        if (fused := _fused_scan(u)) is not None:
+            return self._scanned(fused, x, u, gate)
         decay, drive, readout = self._selected(u)
         h = linear_scan(decay, drive)
         return self._out(x, (h * readout[..., None, :]).sum(-1), u, gate)
@@ -93,6 +115,22 @@ class MambaBlock(nn.Module):
         size = functional.softplus(self.step_size(size)).to(exact)
         decay = torch.exp(size[..., None] * -torch.exp(self.log_decay.to(exact)))
         return decay, (size * u.to(exact))[..., None] * drive.to(exact)[..., None, :], readout.to(exact)
+
+    def _scanned(self, scan: Any, x: torch.Tensor, u: torch.Tensor, gate: torch.Tensor) -> torch.Tensor:
+        """Answer by a kernel that scans, reads out and gates in one pass; it takes [B, channel, T]."""
+        size, drive, readout = self.select(u).split((self.rank, self.states, self.states), -1)
+        y = scan(
+            u.transpose(1, 2).contiguous(),
+            (size @ self.step_size.weight.to(size.dtype).T).transpose(1, 2).contiguous(),
+            -torch.exp(self.log_decay.float()),
+            drive.transpose(1, 2).contiguous(),
+            readout.transpose(1, 2).contiguous(),
+            self.skip.float(),
+            z=gate.transpose(1, 2).contiguous(),
+            delta_bias=self.step_size.bias.float(),
+            delta_softplus=True,
+        )
+        return x + self.project(y.transpose(1, 2)).to(x.dtype)
 
     def _out(self, x: torch.Tensor, y: torch.Tensor, u: torch.Tensor, gate: torch.Tensor) -> torch.Tensor:
         return x + self.project((y.to(u.dtype) + self.skip * u) * functional.silu(gate)).to(x.dtype)
