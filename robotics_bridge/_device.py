@@ -1,8 +1,9 @@
-"""Warp, loaded late and quietly, and its devices."""
+"""Warp and MuJoCo, loaded late, and their devices."""
 
 from __future__ import annotations
 
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 from brainbench.errors import MissingDependencyError, UsageError
@@ -26,6 +27,11 @@ def warp() -> Any:
     wp.config.enable_backward = False
     wp.init()
     return wp
+
+
+def mujoco_module() -> Any:
+    """Return the module ``mujoco``, loaded late; its names are made at run time."""
+    return import_module("mujoco")
 
 
 def pick_device(name: Any) -> Any:

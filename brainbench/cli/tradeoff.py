@@ -176,6 +176,32 @@ def model(
     emit(results, table(f"{name}, batch 1:", columns, rows, right=tuple(range(2, 9))), as_json=as_json)
 
 
+@app.command("tactile")
+def tactile(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Table (.json).")] = Path("tactile-tradeoff.json"),
+    plot: Annotated[Path | None, typer.Option(help="Also draw error against cost (.png, .svg, .pdf).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure error and cost of tactile queries over backend, resolution, surface points and taxels.
+
+    The table that ships with the package (robotics_bridge/sensors/fidelity_table.json) is made by this command.
+    """
+    from robotics_bridge.sensors import tradeoff
+
+    with progress_bar() as progress:
+        points = tradeoff.measure_tradeoff(out, progress=progress)
+    if plot is not None:
+        tradeoff.plot_tradeoff(points, plot)
+    rows = []
+    for point in points:
+        setting = point.get("points") or point.get("taxels") or point["query"]
+        detail = f"{point['resolution']} cells" if point.get("resolution") else ""
+        rows.append([point["part"], str(setting), detail, f"{point['error']:.2e}", f"{point['cost']:.2f}"])
+    columns = ["part", "setting", "resolution", "error", "µs / environment"]
+    text = table("relative force errors against double precision", columns, rows, right=(1, 3, 4))
+    emit({"points": points, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)
+
+
 def _items(text: str) -> list[str]:
     return [item.strip() for item in text.split(",") if item.strip()]
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from robotics_bridge._device import mujoco_module
+
 EDGE = 0.25
 """Edge of a box (m)."""
 SPACING = 0.999
@@ -20,7 +22,7 @@ def pyramid() -> Any:
     Numbers run up each leaning column, so that ``box1`` rests on ``box0`` (and on its neighbour), as published.
     The boxes start one thousandth of an edge into one another, so that the published warm-up settles them.
     """
-    import mujoco
+    mujoco = mujoco_module()
 
     half, pitch = EDGE / 2, EDGE * SPACING
     boxes = []

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError
+from robotics_bridge._device import mujoco_module
 from robotics_bridge.physics._fields import check_fields
 from robotics_bridge.physics.scene import Scene
 from robotics_bridge.physics.state import HandState
@@ -47,7 +48,7 @@ class MujocoEngine:
         assignment: Sequence[int] = (),
         contacts: int = 64,
     ) -> None:
-        import mujoco
+        mujoco = mujoco_module()
 
         if num_envs < 1:
             raise UsageError(f"An engine needs at least one environment; received {num_envs}.")
@@ -107,19 +108,19 @@ class MujocoEngine:
 
     def step(self, steps: int = 1) -> None:
         """Advance every environment and refresh the state."""
-        import mujoco
+        mujoco = mujoco_module()
 
         self._each(lambda env: mujoco.mj_step(self._models[env], self._data[env], steps))
 
     def forward(self) -> None:
         """Refresh the state at the current positions and velocities, without advancing."""
-        import mujoco
+        mujoco = mujoco_module()
 
         self._each(lambda env: mujoco.mj_forward(self._models[env], self._data[env]))
 
     def reset(self, env_ids: Sequence[int] | NDArray[np.int64] | None = None) -> None:
         """Put environments (all by default) back to the model's start and refresh the state."""
-        import mujoco
+        mujoco = mujoco_module()
 
         for env in range(self.num_envs) if env_ids is None else np.asarray(env_ids, dtype=int).reshape(-1).tolist():
             mujoco.mj_resetData(self._models[env], self._data[env])
@@ -153,7 +154,7 @@ class _Gatherer:
         self._com = np.zeros((count, bodies, 3))
         self._root = np.asarray(model.body_rootid)
         self._views = [(d.xpos, d.xquat, d.cvel, d.subtree_com) for d in data]
-        self._contacts: list[tuple] = [()] * count
+        self._contacts: list[tuple[NDArray[Any], ...]] = [()] * count
         self._model = model
 
     def gather(self, env: int) -> None:
@@ -191,12 +192,13 @@ class _Gatherer:
         self._velocity[..., :3] = self._twist[..., 3:] + np.cross(omega, lever)
         self._velocity[..., 3:] = omega
         state = self._state
-        found = [(env, *parts) for env, parts in enumerate(self._contacts) if parts]
+        owners = [env for env, parts in enumerate(self._contacts) if parts]
+        found = [self._contacts[env] for env in owners]
         total = sum(len(parts[1]) for parts in found)
         room = state.contact_env.shape[0]
         if found:
-            env = np.repeat([parts[0] for parts in found], [len(parts[1]) for parts in found])
-            columns = [np.concatenate(column)[:room] for column in zip(*(parts[1:] for parts in found), strict=True)]
+            env = np.repeat(owners, [len(parts[1]) for parts in found])
+            columns = [np.concatenate(list(column))[:room] for column in zip(*found, strict=True)]
             keep = len(columns[0])
             state.contact_env.numpy()[:keep] = env[:keep]
             names = ("geom", "distance", "position", "normal", "force")
@@ -208,7 +210,7 @@ class _Gatherer:
 def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:
     import copy
 
-    import mujoco
+    mujoco = mujoco_module()
 
     varied = copy.copy(model)
     for name, value in values.items():

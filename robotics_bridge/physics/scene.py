@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
+from robotics_bridge._device import mujoco_module
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -205,13 +206,13 @@ class Scene:
 
 
 def _name(model: Any, what: int, index: int) -> str:
-    import mujoco
+    mujoco = mujoco_module()
 
     return mujoco.mj_id2name(model, what, index) or f"{'link' if what == 1 else 'geometry'}{index}"
 
 
 def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
-    import mujoco
+    mujoco = mujoco_module()
 
     found = []
     meshes: dict[int, Mesh] = {}
@@ -262,7 +263,7 @@ def _differs(first: Geometry, second: Geometry) -> bool:
 
 def _never(model: Any) -> frozenset[tuple[int, int]]:
     """Pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
-    import mujoco
+    mujoco = mujoco_module()
 
     pairs = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in model.exclude_signature}
     weld, parent = model.body_weldid, model.body_parentid

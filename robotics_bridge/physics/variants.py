@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from brainbench.errors import UsageError, unknown_name
+from robotics_bridge._device import mujoco_module
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import Geometry
@@ -27,7 +28,7 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
     Raises:
         UsageError: the spec has no such geometry, or a kind cannot be an object.
     """
-    import mujoco
+    mujoco = mujoco_module()
 
     kinds = {"sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
     models = []

@@ -7,6 +7,7 @@ from robotics_bridge.sensors.audio import ActuationAudio, ContactAudio, joint_dr
 from robotics_bridge.sensors.audio_materials import Modes
 from robotics_bridge.sensors.audio_microphone import Microphone
 from robotics_bridge.sensors.elastomer import ElastomerTaxel, Layer
+from robotics_bridge.sensors.fidelity import Fidelity
 from robotics_bridge.sensors.filters import AfferentFilter, Band
 from robotics_bridge.sensors.kinematic import KinematicTaxel
 from robotics_bridge.sensors.modes import Solid, find_modes
@@ -27,6 +28,7 @@ __all__ = [
     "ContactDepthProbe",
     "ContactProbe",
     "ElastomerTaxel",
+    "Fidelity",
     "KinematicTaxel",
     "Layer",
     "Microphone",

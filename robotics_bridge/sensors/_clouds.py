@@ -11,7 +11,7 @@ import numpy as np
 from robotics_bridge._device import warp
 from robotics_bridge.sensors._cloud_kernels import BLOCK, cloud_structs
 from robotics_bridge.sensors._solids import tessellate
-from robotics_bridge.sensors.placement import spread_over
+from robotics_bridge.sensors.placement import cover_evenly
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,12 +31,12 @@ class Cloud:
     """Points [R] per variant row."""
 
 
-def surface_points(geometry: Geometry, count: int, seed: int = 0) -> NDArray[np.float64]:
+def surface_points(geometry: Geometry, count: int) -> NDArray[np.float64]:
     """Return evenly spread points [count, 3] on the surface of a geometry (m, its own frame)."""
     mesh = tessellate(geometry)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    return spread_over(corners, area, count, seed)[0]
+    return cover_evenly(corners, area, count)
 
 
 def sample_cloud(scene: Scene, geometries: Sequence[int], points: int, rows: int, device: Any) -> Cloud:

@@ -194,7 +194,7 @@ def field_function() -> Any:
 
 @cache
 def triangle_function() -> Any:
-    """Return ``triangles(mesh, x, reach) -> (normal, distance)``: the nearest triangle of a closed mesh, by its tree."""
+    """Return ``triangles(mesh, x, reach) -> (normal, distance)``: the nearest triangle of a closed mesh."""
     import warp as wp
 
     @wp.func
@@ -205,7 +205,8 @@ def triangle_function() -> Any:
         away = x - wp.mesh_eval_position(mesh, found.face, found.u, found.v)
         far = wp.length(away)
         normal = wp.mesh_eval_face_normal(mesh, found.face)
-        if far > 1.0e-9:
+        # Nearer than rounding can tell a direction, the face knows it.
+        if far > 1.2e-4 * wp.length(x):
             normal = away * (found.sign / far)
         return wp.vec4f(normal[0], normal[1], normal[2], found.sign * far)
 

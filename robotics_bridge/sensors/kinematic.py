@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -94,7 +94,9 @@ class KinematicRuntime(ProbeRuntime):
             laws.append(law)
         wp = warp()
         self._laws = wp.array(laws, dtype=kind, device=context.device)
-        self._loads = wp.zeros((len(laws), context.num_envs), dtype=wp.vec3f, device=context.device) if scaled else None
+        self._loads: Any = (
+            wp.zeros((len(laws), context.num_envs), dtype=wp.vec3f, device=context.device) if scaled else None
+        )
         self._scales = wp.zeros((len(laws), context.num_envs), dtype=wp.float32, device=context.device)
         slots = self.probes.slot.numpy()
         spans = np.array([(p.start, p.start + p.count, slots[p.start]) for p in self.places.values()], np.int32)

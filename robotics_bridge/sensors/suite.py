@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.physics.scene import Scene
+    from robotics_bridge.sensors.fidelity import Fidelity
 
 
 class SensorSuite:
@@ -38,7 +39,8 @@ class SensorSuite:
         device: ``cpu`` or ``cuda``.
         seed: of the noise, together with each sensor's name.
         env_offset: number of environment 0 in the whole experiment, so that shards draw different noise.
-        resolution: cells of distance fields along a mesh's longest edge.
+        resolution: cells of distance fields along a mesh's longest edge; 64 by default.
+        fidelity: query, resolution and surface points for all sensors, in place of their own.
 
     Raises:
         UsageError: a sensor is no sensor, or names a link that the scene does not have.
@@ -60,9 +62,13 @@ class SensorSuite:
         device: Any = "cpu",
         seed: int = 0,
         env_offset: int = 0,
-        resolution: int = 64,
+        resolution: int | None = None,
+        fidelity: Fidelity | None = None,
     ) -> None:
         wp = warp()
+        if fidelity is not None:
+            sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
+        resolution = resolution or 64
         if num_envs < 1:
             raise UsageError(f"A suite serves at least one environment; received {num_envs}.")
         self.scene, self.sensors = scene, dict(sensors)

@@ -89,8 +89,13 @@ def test_radius_noise_leaves_the_truth_alone() -> None:
 
 
 def test_points_cover_a_surface_evenly() -> None:
-    points = surface_points(Geometry(name="b", link="b", kind="sphere", size=(1.0,)), 400)
-    gaps = np.linalg.norm(points[:, None] - points[None], axis=2) + 9 * np.eye(400)
-    # Perfectly even points would lie about 0.19 apart; random ones leave gaps below 0.01.
-    assert gaps.min() > 0.08
-    np.testing.assert_allclose(points.mean(axis=0), 0, atol=0.03)
+    box = Geometry(name="b", link="b", kind="box", size=(1.0, 1.0, 0.5))
+    points = surface_points(box, 2000)
+    assert (np.abs(np.abs(points) / [1.0, 1.0, 0.5]).max(axis=1) > 1 - 1e-9).all()
+    top = points[points[:, 2] > 0.5 - 1e-9]
+    assert len(top) == pytest.approx(2000 * 4 / 16, rel=0.02)
+    # Random points would leave one cell of 100 without any in half of all draws, and 15 % of scatter in quarters.
+    cells = np.histogram2d(top[:, 0], top[:, 1], bins=10, range=[[-1, 1], [-1, 1]])[0]
+    assert cells.min() >= 2
+    quarters = cells.reshape(2, 5, 2, 5).sum(axis=(1, 3))
+    assert quarters.max() / quarters.min() < 1.1

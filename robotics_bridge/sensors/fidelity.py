@@ -1,0 +1,93 @@
+"""How exactly sensors ask their questions: query, resolution of distance fields, surface points. Measured, not guessed.
+
+The shipped table is made by ``brainbench tradeoff tactile`` (:mod:`robotics_bridge.sensors.tradeoff`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from brainbench.errors import UsageError, unknown_name
+from brainbench.fidelity import TradeoffPoint, cheapest
+from robotics_bridge.sensors._base import Sensor
+
+TABLE = Path(__file__).with_name("fidelity_table.json")
+"""The measured settings that ship with the package."""
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """Settings that trade exactness for speed; the rest of a sensor is its own.
+
+    Raises:
+        UsageError: a setting lies outside its range.
+    """
+
+    query: Literal["sdf", "raycast"] = "sdf"
+    """How meshes are asked for their distance: sampled fields, or the nearest triangle."""
+    resolution: int = 64
+    """Cells of a distance field along the longest edge of its mesh."""
+    points: int = 2000
+    """Surface points of tracked objects, for proximity and elastomer taxels."""
+
+    def __post_init__(self) -> None:
+        if self.query not in ("sdf", "raycast"):
+            raise unknown_name("query", self.query, ("sdf", "raycast"))
+        if not 4 <= self.resolution <= 512 or self.points < 1:
+            raise UsageError(
+                f"A field has 4 to 512 cells and a surface at least one point; received resolution={self.resolution} "
+                f"and points={self.points}."
+            )
+
+    @classmethod
+    def preset(cls, name: str) -> Fidelity:
+        """Return ``fast``, ``balanced`` or ``accurate``; an unknown name raises UsageError."""
+        if name not in PRESETS:
+            raise unknown_name("tactile fidelity", name, PRESETS)
+        return PRESETS[name]
+
+    @classmethod
+    def auto(cls, error: float) -> Fidelity:
+        """Return the cheapest measured settings whose relative force errors are at most ``error``.
+
+        Raises:
+            UsageError: no measured setting is that accurate.
+        """
+        meshes = cheapest(_points("mesh"), error).settings
+        points = cheapest(_points("points"), error).settings
+        return cls(meshes["query"], meshes["resolution"] or 64, points["points"])
+
+    def apply(self, sensors: Mapping[str, Sensor]) -> dict[str, Sensor]:
+        """Return the sensors with these settings in place of their own, where they have them."""
+        out = {}
+        for name, sensor in sensors.items():
+            own = {field.name for field in fields(sensor)}
+            # An elastomer without points has been told to leave shear out.
+            wanted = {"query": self.query} | ({"points": self.points} if getattr(sensor, "points", 0) else {})
+            changed = {key: value for key, value in wanted.items() if key in own}
+            out[name] = replace(sensor, **changed) if changed else sensor
+        return out
+
+
+PRESETS: dict[str, Fidelity] = {
+    "fast": Fidelity("sdf", 32, 500),
+    "balanced": Fidelity("sdf", 64, 2000),
+    "accurate": Fidelity("raycast", 128, 16_000),
+}
+"""Named settings; the table says what each costs and errs."""
+
+
+@cache
+def _table() -> dict[str, Any]:
+    from brainbench.files import read_json
+
+    return read_json(TABLE)
+
+
+def _points(part: str) -> list[TradeoffPoint]:
+    rows = [row for row in _table()["points"] if row["part"] == part]
+    return [TradeoffPoint(row["error"], row["cost"], row) for row in rows]

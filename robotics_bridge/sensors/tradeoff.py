@@ -1,0 +1,280 @@
+"""Measure error and cost of tactile queries over their settings: the data behind ``Fidelity.auto``.
+
+Three parts, each against a reference in double precision:
+
+- ``mesh``: a force field of 20 × 20 kinematic taxels on a torus of 4,608 triangles, over query and resolution,
+  against exact distances to all triangles; ``primitive`` is a sphere, whose error is that of single precision alone;
+- ``points``: the force on 6 × 6 proximity taxels over the number of surface points, against 200,000 points;
+- ``taxels``: the total force on a pad over its number of taxels (stiffness per area kept), against the integral.
+
+``error`` is the relative root-mean-square error over poses, ``cost`` microseconds per environment and update on
+the processor that measured.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from brainbench.files import write_json
+from robotics_bridge.physics import Geometry, HandState, Scene
+from robotics_bridge.sensors._base import Sensor
+from robotics_bridge.sensors._clouds import surface_points
+from robotics_bridge.sensors.fidelity import Fidelity
+from robotics_bridge.sensors.kinematic import KinematicTaxel
+from robotics_bridge.sensors.placement import Probes
+from robotics_bridge.sensors.proximity import ProximityTaxel
+from robotics_bridge.sensors.suite import SensorSuite
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from brainbench.geometry import Mesh
+    from brainbench.types import Progress
+
+RESOLUTIONS = (16, 32, 64, 128)
+POINTS = (250, 500, 1000, 2000, 4000, 16_000)
+TAXELS = (5, 10, 20, 40, 80)
+_POSES = 12
+_CYLINDER = Geometry(name="o", link="object", kind="cylinder", size=(0.008, 0.012))
+_PAD = Geometry(name="pad", link="hand", kind="box", size=(0.03, 0.03, 0.005))
+
+
+def measure_tradeoff(path: Path | None = None, *, progress: Progress | None = None) -> list[dict[str, Any]]:
+    """Measure every setting; with ``path`` write them as a table (JSON).
+
+    Returns:
+        One row per setting: ``part``, what was set, ``error`` and ``cost``.
+    """
+    jobs: list[tuple[str, Any]] = [("mesh", ("sdf", n)) for n in RESOLUTIONS] + [
+        ("mesh", ("raycast", None)),
+        ("primitive", ("sdf", None)),
+    ]
+    jobs += [("points", n) for n in POINTS] + [("taxels", n) for n in TAXELS]
+    rows = []
+    for done, (part, setting) in enumerate(jobs):
+        if part in ("mesh", "primitive"):
+            rows.append(_mesh_point(part, *setting))
+        elif part == "points":
+            rows.append(_points_point(setting))
+        else:
+            rows.append(_taxels_point(setting))
+        if progress:
+            progress(done + 1, len(jobs), "settings")
+    if path is not None:
+        about = {
+            "error": "relative RMS of forces against double precision",
+            "cost": "microseconds per environment and update",
+            "machine": f"{platform.machine()}, {os.cpu_count()} processors",
+            "made_by": "brainbench tradeoff tactile",
+        }
+        write_json(path, {**about, "points": rows})
+    return rows
+
+
+def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return signed distance [n] and outward direction [n, 3] of points to a closed mesh, over all its triangles.
+
+    The inside is where the winding number exceeds one half.
+    """
+    from brainbench.geometry import winding_number
+
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    inside = winding_number(mesh, points) > 0.5
+    distance, direction = np.zeros(len(points)), np.zeros((len(points), 3))
+    for index, x in enumerate(points):
+        near = _closest(x, a, b, c)
+        away = x - near
+        length = np.linalg.norm(away, axis=1)
+        best = int(length.argmin())
+        sign = -1.0 if inside[index] else 1.0
+        distance[index] = sign * length[best]
+        direction[index] = sign * away[best] / max(length[best], 1e-15)
+    return distance, direction
+
+
+def _closest(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray:
+    """Closest points [F, 3] of triangles to one point: the projection if it falls inside, else on the nearest edge."""
+    normal = np.cross(b - a, c - a)
+    square = np.maximum((normal**2).sum(1), 1e-300)
+    flat = x - normal * (((x - a) * normal).sum(1) / square)[:, None]
+    inside = np.ones(len(a), dtype=bool)
+    best, least = flat, np.full(len(a), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        inside &= (np.cross(end - start, flat - start) * normal).sum(1) >= 0
+        edge = end - start
+        share = np.clip(((x - start) * edge).sum(1) / np.maximum((edge**2).sum(1), 1e-300), 0, 1)
+        point = start + share[:, None] * edge
+        far = ((x - point) ** 2).sum(1)
+        best = np.where((far < least)[:, None], point, best)
+        least = np.minimum(least, far)
+    return np.where(inside[:, None], flat, best)
+
+
+def _run(solid: Geometry, sensor: Sensor, places: NDArray, resolution: int = 64) -> tuple[NDArray, float]:
+    """Readings over places [n, 3] of an object, and the cost of an update per environment (µs)."""
+    scene = Scene(("world", "hand", "object"), (_PAD, solid))
+    count = len(places)
+    suite = SensorSuite(scene, {"s": sensor}, num_envs=count, resolution=resolution)
+    state = HandState.empty(count, 3, count)
+    pose = np.zeros((count, 3, 7))
+    pose[..., 6] = 1
+    pose[:, 2, :3] = places
+    state.set_pose(pose)
+    state.set_contacts(np.arange(count), [(0, 1)] * count)
+    suite.update(state)
+    seconds = []
+    for _ in range(15):
+        start = time.perf_counter()
+        suite.update(state)
+        seconds.append(time.perf_counter() - start)
+    return suite.read("s").numpy().astype(float).copy(), float(np.median(seconds)) / count * 1e6
+
+
+def _places(height: float) -> NDArray[np.float64]:
+    rng = np.random.default_rng(0)
+    return np.column_stack([rng.uniform(-4e-3, 4e-3, (_POSES, 2)), height - rng.uniform(0, 2e-3, _POSES)])
+
+
+def _error(read: NDArray, exact: NDArray) -> float:
+    return float(np.sqrt(((read - exact) ** 2).sum() / (exact**2).sum()))
+
+
+def _grid() -> Probes:
+    return Probes.grid(20, 20, size=(0.04, 0.04), center=(0, 0, 0.005), radius=0.003)
+
+
+@cache
+def _torus() -> Geometry:
+    import trimesh
+
+    from brainbench.geometry import Mesh
+
+    made = trimesh.creation.torus(0.012, 0.005, major_sections=72, minor_sections=32)
+    return Geometry(name="o", link="object", kind="mesh", mesh=Mesh(made.vertices, made.faces))
+
+
+@cache
+def _exact_field(part: str) -> NDArray[np.float64]:
+    """Forces [n, 400, 3] of the taxels in double precision."""
+    grid, places = _grid(), _mesh_places(part)
+    exact = np.zeros((len(places), len(grid), 3))
+    for row, place in zip(exact, places, strict=True):
+        local = np.array(grid.position) - place
+        if part == "primitive":
+            near = np.arange(len(local))
+            far = np.linalg.norm(local, axis=1)
+            distance, normal = far - 0.012, local / far[:, None]
+        else:
+            # Only taxels that can touch: the facets cut off less than a tenth of a millimetre.
+            smooth = np.hypot(np.hypot(local[:, 0], local[:, 1]) - 0.012, local[:, 2]) - 0.005
+            near = np.flatnonzero(smooth < 0.0032)
+            distance, normal = triangle_distance(cast("Mesh", _torus().mesh), local[near])
+        depth = np.maximum(0.003 - distance, 0)
+        row[near] = 500 * (depth**1.2)[:, None] * normal
+    return exact
+
+
+def _mesh_places(part: str) -> NDArray[np.float64]:
+    return _places(0.010 if part == "mesh" else 0.017)
+
+
+def _mesh_point(part: str, query: str, resolution: int | None) -> dict[str, Any]:
+    solid = _torus() if part == "mesh" else Geometry(name="o", link="object", kind="sphere", size=(0.012,))
+    taxel = KinematicTaxel(link="hand", probes=_grid(), query=query)  # type: ignore[arg-type]
+    read, cost = _run(solid, taxel, _mesh_places(part), resolution or 64)
+    exact = _exact_field(part)
+    error = _error(read[..., :3].reshape(exact.shape), exact)
+    return {"part": part, "query": query, "resolution": resolution, "error": error, "cost": cost}
+
+
+@cache
+def _exact_proximity() -> NDArray[np.float64]:
+    """Normal forces [n, 36] from 200,000 points in double precision."""
+    dense, places, grid = surface_points(_CYLINDER, 200_000), _places(0.019), _pads()
+    exact = np.zeros((len(places), len(grid)))
+    for row, place in zip(exact, places, strict=True):
+        for index, q in enumerate(np.array(grid.position) - place):
+            overlap = np.maximum(0.008 - np.linalg.norm(dense - q, axis=1), 0)
+            row[index] = -300 * 100 / len(dense) * overlap.sum()
+    return exact
+
+
+def _pads() -> Probes:
+    return Probes.grid(6, 6, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.008)
+
+
+def _points_point(points: int) -> dict[str, Any]:
+    read, cost = _run(_CYLINDER, ProximityTaxel(link="hand", probes=_pads(), points=points), _places(0.019))
+    exact = _exact_proximity()
+    return {"part": "points", "points": points, "error": _error(read[..., 2].reshape(exact.shape), exact), "cost": cost}
+
+
+def _taxels_point(side: int) -> dict[str, Any]:
+    solid = Geometry(name="o", link="object", kind="sphere", size=(0.012,))
+    places, pitch = _places(0.017), 0.03 / side
+    grid = Probes.grid(side, side, size=(0.03 - pitch, 0.03 - pitch), center=(0, 0, 0.005), radius=1e-6)
+    read, cost = _run(solid, KinematicTaxel(link="hand", probes=grid, stiffness=1e7 * pitch**2), places)
+    error = _error(read[..., 2].sum((1, 2)), _integral(places))
+    return {"part": "taxels", "taxels": side * side, "error": error, "cost": cost}
+
+
+def _integral(places: NDArray) -> NDArray[np.float64]:
+    """Total force of the continuous pad, by a rule of 600 × 600 points in double precision."""
+    side = (np.arange(600) + 0.5) / 600 * 0.03 - 0.015
+    x, y = np.meshgrid(side, side)
+    exact = []
+    for place in places:
+        away = np.stack([x - place[0], y - place[1], np.full_like(x, 0.005 - place[2])])
+        far = np.linalg.norm(away, axis=0)
+        exact.append((1e7 * (0.03 / 600) ** 2 * np.maximum(0.012 - far, 0) ** 1.2 * away[2] / far).sum())
+    return np.array(exact)
+
+
+def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Draw error against cost of every part.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    from brainbench.errors import missing_dependency
+
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise missing_dependency("matplotlib", extra="report", purpose="Drawing pictures") from error
+    figure = Figure(figsize=(9.6, 3.4), dpi=110, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    titles = {"mesh": "4,608 triangles: field or tree", "points": "proximity: surface points", "taxels": "pad: taxels"}
+    for number, (part, title) in enumerate(titles.items()):
+        axes = figure.add_subplot(1, 3, number + 1)
+        chosen = [row for row in rows if row["part"] == part]
+        axes.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", color="#c1440e", markersize=5)
+        for row in chosen:
+            label = (
+                row.get("points")
+                or row.get("taxels")
+                or (f"sdf {row['resolution']}" if row["resolution"] else "raycast")
+            )
+            axes.annotate(
+                f"{label}", (row["cost"], row["error"]), xytext=(5, 4), textcoords="offset points", fontsize=8
+            )
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("µs per environment and update")
+        axes.margins(0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+        if not number:
+            axes.set_ylabel("relative error")
+    figure.savefig(path)
+
+
+__all__ = ["Fidelity", "measure_tradeoff", "plot_tradeoff", "triangle_distance"]
