@@ -1,0 +1,52 @@
+"""What pages say of a model: how to load it, how it was trained."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from brainbench.types import Interval
+from leaderboards import _words, build_leaderboard
+from tests.leaderboards._page import Page
+
+
+def _with(record, name="net", **changes):
+    card = replace(record.card, **changes)
+    return replace(record, score=replace(record.score, name=name), card=card)
+
+
+def test_the_lines_that_load_a_model_run_for_every_kind(make_record):
+    import torch
+
+    twin = _with(make_record(), "s4-small", objective="untrained", seed=3, family="s4")
+    lines = _words.loading(twin)
+    assert len(lines.splitlines()) == 3
+    made: dict[str, torch.nn.Module] = {}
+    exec(lines, made)
+    from brainbench import load_model
+
+    for one, other in zip(made["model"].parameters(), load_model("s4-small", seed=3).parameters(), strict=True):
+        assert torch.equal(one, other)
+    trained = _with(make_record(), "s4-small.simclr", objective="simclr", family="s4", seed=1)
+    assert "load_model('s4-small.simclr')" in _words.loading(trained)
+    own = _with(make_record(), "a.py:Mine", family="user module", seed=0)
+    assert "load_user_model('a.py:Mine', seed=0)" in _words.loading(own)
+    assert "names no model to load" in _words.loading(_with(make_record(), family="features computed elsewhere"))
+
+
+def test_a_trained_models_page_shows_accuracy_and_training(make_record, tmp_path):
+    record = _with(
+        make_record(), "net.simclr", objective="simclr", augmentation="physical + 75% masking", top1=0.41, top5=0.72,
+        accuracy_interval=Interval(0.38, 0.44, method="Wilson score"), accuracy_data="abc123", twin="net",
+        training={"epochs": 20, "published_epochs": 100, "learning_rate": 0.01, "masking": 0.75, "clip": None},
+    )  # fmt: skip
+    (path,) = (build_leaderboard([record], tmp_path / "site").parent / "models").iterdir()
+    text = Page(path).text
+    for shown in ("0.410", "[0.380, 0.440]", "0.720", "abc123", "published epochs 100", "learning rate 0.01", "0.75"):
+        assert shown in text
+    assert "untrained twin net" in text
+    assert "clip" not in text
+
+
+def test_numbers_have_true_minus_signs_and_no_negative_zero():
+    assert _words.number(-0.1234) == "−0.123"
+    assert _words.number(-0.0001) == "0.000"
