@@ -1,0 +1,150 @@
+"""Tables and curves of what ``train_zoo.py`` brought back.
+
+PYTHONPATH=. python benchmarks/zoo_report.py FOLDER [FOLDER …] [--write]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from results import table, write_section
+
+ROOT = Path(__file__).resolve().parent.parent
+PICTURE = ROOT / "docs" / "images" / "training-curves.png"
+
+
+def read(folders: list[Path], name: str) -> list[dict[str, Any]]:
+    """Read the lines of a file of every folder; later folders replace jobs of earlier ones."""
+    lines: dict[Any, dict[str, Any]] = {}
+    for folder in folders:
+        path = folder / name
+        for text in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+            line = json.loads(text)
+            lines[line.get("name") or (line["job"], line["epoch"], line["kind"])] = line
+    return list(lines.values())
+
+
+def share(value: float) -> str:
+    return f"{100 * value:.1f}"
+
+
+def score_text(result: dict[str, Any] | None) -> str:
+    found = (result or {}).get("score") or {}
+    if found.get("value") is None:
+        return "–"
+    low, high = (found.get("interval") or {}).get("low"), (found.get("interval") or {}).get("high")
+    between = f" [{low:.2f}, {high:.2f}]" if low is not None and high is not None else ""
+    return f"{found['value']:.2f}{between}"
+
+
+def accuracy_table(results: list[dict[str, Any]]) -> str:
+    """One row per network and way of training, seeds together, beside its untrained twins."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
+    twins: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for result in results:
+        job = result["job"]
+        if job["objective"] == "untrained":
+            twins[job["model"]].append(result)
+        else:
+            key = (job["model"], job["objective"], job["augmentation"], job["masking"])
+            groups[key].append(result)
+    rows = []
+    for (model, objective, augmentation, masking), found in groups.items():
+        found.sort(key=lambda result: result["job"]["seed"])
+        first, others = found[0], twins.get(model, [])
+        low, high = (first["evaluation"]["interval"][end] for end in ("low", "high"))
+        seeds = ", ".join(share(result["evaluation"]["top1"]) for result in found[1:])
+        rows.append(
+            [
+                model,
+                objective,
+                augmentation + (f" + {masking:.0%} masked" if masking else ""),
+                "/".join(str(result["epochs"]) for result in found),
+                f"{share(first['evaluation']['top1'])} [{share(low)}, {share(high)}]",
+                seeds or "–",
+                share(mean(result["evaluation"]["top5"] for result in found)),
+                " / ".join(share(result["evaluation"]["top1"]) for result in others) or "–",
+                "yes" if any(result["evaluation"]["collapsed"] for result in found) else "no",
+                score_text(first),
+                score_text(next((item for item in others if item["job"]["seed"] == first["job"]["seed"]), None)),
+            ]
+        )
+    head = ["network", "objective", "augmentation", "epochs (published: 100)", "top-1 % of seed 0", "other seeds"]
+    head += ["top-5 %", "untrained twins, probed, %", "collapsed", "score", "score of the twin"]
+    return table(head, rows)
+
+
+def draw(curves: list[dict[str, Any]], path: Path) -> None:
+    """Draw loss and validation of the networks of seed 0 with the usual augmentation."""
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), constrained_layout=True)
+    series: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for line in curves:
+        if line["kind"] == "epoch" and line["job"].endswith(("supervised.seed0", "simclr.seed0")):
+            series[line["job"]].append(line)
+    colors: dict[str, str] = {}
+    for name, lines in sorted(series.items()):
+        model, objective = name.rsplit(".", 2)[:2]
+        axis = axes[objective == "simclr"]
+        color = colors.setdefault(model, f"C{len(colors)}")
+        lines.sort(key=lambda line: line["epoch"])
+        value = (lambda line: 100 * (1 - line["validation"])) if axis is axes[0] else (lambda line: line["validation"])
+        shown = [line for line in lines if line.get("validation") is not None]
+        style = "-" if "small" in model else "--"
+        axis.plot([line["epoch"] for line in shown], [value(line) for line in shown], style, color=color, label=model)
+    axes[0].set(title="Supervised", ylabel="validation top-1 [%]", xlabel="epoch")
+    axes[1].set(title="SimCLR", ylabel="validation loss", xlabel="epoch")
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+    handles = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, fontsize=7, frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", type=Path, nargs="+")
+    parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md and the picture")
+    parser.add_argument("--picture", type=Path, default=PICTURE)
+    parser.add_argument("--note", default="", help="a sentence for the section: the machine, how long")
+    args = parser.parse_args()
+    results, curves = read(args.folders, "results.jsonl"), read(args.folders, "curves.jsonl")
+    data = results[0]["data"]
+    text = (
+        f"{data['classes']} classes (chance {100 / data['classes']:.1f} %), data {data['hash']}: {data['train']:,} "
+        f"sweeps to train, {data['validation']:,} to validate, {data['test']:,} of other objects to test; "
+        f"{data['left_out']:,} unstable ones left out. {args.note}\n\n{accuracy_table(results)}\n\nSupervised "
+        "networks answer by their own decoder, others and twins through a linear probe. Intervals: accuracy Wilson "
+        "95 %, score over the animals of the (synthetic) demo recordings.\n\n"
+    )
+    speeds = [
+        [
+            result["name"],
+            result["precision"],
+            str(result["epochs"]),
+            f"{result['training_seconds']:.0f}",
+            f"{result['sweeps_per_second']:,.0f}",
+        ]
+        for result in results
+        if result.get("training_seconds")
+    ]
+    text += "Several jobs shared a GPU, so rates add up:\n\n" + table(
+        ["job", "precision", "epochs", "s", "sweeps/s"], speeds
+    )
+    print(text)
+    if args.write:
+        write_section("Trained models", "PYTHONPATH=. python benchmarks/train_zoo.py --out $OUT", text)
+        draw(curves, args.picture)
+
+
+if __name__ == "__main__":
+    main()
