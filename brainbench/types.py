@@ -178,7 +178,7 @@ class Score:
 
         rows = [
             ("score (noise-corrected)", _number(self.value) + (f" {_span(self.interval)}" if self.interval else "")),
-            ("status", f"{self.status} {'; '.join(self.reasons)}"),
+            ("status", ": ".join([self.status, *filter(None, ["; ".join(self.reasons)])])),
             ("raw r", _number(self.r)),
             ("reliability", _number(self.reliability)),
             ("permutation p", _number(self.p)),
