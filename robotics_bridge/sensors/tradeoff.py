@@ -54,11 +54,11 @@ def measure_tradeoff(path: Path | None = None, *, progress: Progress | None = No
     Returns:
         One row per setting: ``part``, what was set, ``error`` and ``cost``.
     """
-    jobs: list[tuple[str, Any]] = [("mesh", ("sdf", n)) for n in RESOLUTIONS] + [
-        ("mesh", ("raycast", None)),
-        ("primitive", ("sdf", None)),
-    ]
-    jobs += [("points", n) for n in POINTS] + [("taxels", n) for n in TAXELS]
+    jobs: list[tuple[str, Any]] = []
+    jobs += [("mesh", ("sdf", n)) for n in RESOLUTIONS]
+    jobs += [("mesh", ("raycast", None)), ("primitive", ("sdf", None))]
+    jobs += [("points", n) for n in POINTS]
+    jobs += [("taxels", n) for n in TAXELS]
     rows = []
     for done, (part, setting) in enumerate(jobs):
         if part in ("mesh", "primitive"):
@@ -260,17 +260,14 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
         chosen = [row for row in rows if row["part"] == part]
         axes.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", color="#c1440e", markersize=5)
         for row in chosen:
-            label = (
-                row.get("points")
-                or row.get("taxels")
-                or (f"sdf {row['resolution']}" if row["resolution"] else "raycast")
-            )
-            axes.annotate(
-                f"{label}", (row["cost"], row["error"]), xytext=(5, 4), textcoords="offset points", fontsize=8
-            )
+            query = f"sdf {row['resolution']}" if row.get("resolution") else "raycast"
+            label = str(row.get("points") or row.get("taxels") or query)
+            left = row.get("resolution") in RESOLUTIONS[::2]
+            offset = {"xytext": (-6 if left else 6, -3), "textcoords": "offset points"}
+            axes.annotate(label, (row["cost"], row["error"]), ha="right" if left else "left", fontsize=8, **offset)
         axes.set_title(title, fontsize=9)
         axes.set_xlabel("µs per environment and update")
-        axes.margins(0.25)
+        axes.margins(0.3)
         axes.spines[["top", "right"]].set_visible(False)
         if not number:
             axes.set_ylabel("relative error")
