@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.hands.layouts import Layout
+    from robotics_bridge.sensors import Sensor
 
 PATCH_FORCE_SCALE = 1e4
 """From summed depth (m) to the reading of the real finger tip (4.29)."""
@@ -61,6 +62,45 @@ def observation_type(name: str) -> ObservationType:
     if name not in OBSERVATIONS:
         raise unknown_name("observation type", name, OBSERVATIONS)
     return OBSERVATIONS[name]
+
+
+PROXIMITY_RADIUS = 0.01
+"""Sensing radius of proximity taxels (table 4.6) [m]."""
+
+
+def sensors_for(
+    name: str, layout: Layout, *, noisy: bool = False, track: tuple[str, ...] = (), **knobs: Any
+) -> dict[str, Sensor]:
+    """Return the sensors of an observation type, one per link and named by it, with the published parameters.
+
+    Args:
+        name: One of :data:`OBSERVATIONS`; ``none`` needs no sensors.
+        layout: Link → probes.
+        noisy: With the published imperfections of the type (table 4.12), the release threshold included.
+        track: Links that are looked at; empty means everything that may touch.
+        **knobs: Further settings of the sensor class, e.g. ``convention="thesis"`` or ``points=500``.
+
+    Raises:
+        UsageError: there is no such type, or a knob has a wrong value.
+    """
+    from robotics_bridge import sensors
+
+    kind = observation_type(name)
+    if kind.sensor is None:
+        return {}
+    settings: dict[str, Any] = {"track": track, **knobs}
+    if noisy:
+        settings["noise"] = sensors.Noise.preset(f"published-{name}")
+        if kind.sensor == "ContactProbe":
+            settings.setdefault("release", 2e-4)
+    if kind.sensor == "ElastomerTaxel" and any(not probes.active.all() for probes in layout.values()):
+        # A grid with fillers is no regular one; its sources are summed directly.
+        settings.setdefault("dilation", "direct")
+    found = {}
+    for link, probes in layout.items():
+        placed = probes.with_radius(PROXIMITY_RADIUS) if kind.sensor == "ProximityTaxel" else probes
+        found[link] = getattr(sensors, kind.sensor)(link=link, probes=placed, **settings)
+    return found
 
 
 def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> torch.Tensor:

@@ -103,3 +103,23 @@ class Modes:
             raise UsageError(f"A body is scaled by a positive factor; received {size!r}.")
         gain = tuple(value / size**3 for value in self.gain)
         return replace(self, frequency=tuple(value / size for value in self.frequency), gain=gain)
+
+
+def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16) -> Modes:
+    """Return hand-made modes for a body of a material that is known by ear only.
+
+    The frequencies are those of a free bar, (2n + 1)² / 9 times the lowest one, up to 20 kHz; decays follow the
+    material's damping, gains fall with 1/n and are 1/kg at first.
+
+    Raises:
+        UsageError: the lowest frequency lies outside the audible range, or the count is not positive.
+    """
+    chosen = elastic_material(material)
+    if not 20 <= lowest < 20_000 or count < 1:
+        raise UsageError(
+            f"A body rings between 20 and 20000 Hz in at least one mode; received {lowest!r} Hz, {count!r} modes."
+        )
+    every = [(n, lowest * (2 * n + 1) ** 2 / 9) for n in range(1, count + 1)]
+    heard = [(n, frequency) for n, frequency in every if frequency <= 20_000]
+    frequency = tuple(value for _n, value in heard)
+    return Modes(frequency, tuple(chosen.decay(value) for value in frequency), tuple(1 / n for n, _value in heard))

@@ -8,7 +8,10 @@ import torch
 
 from brainbench.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.hands.observations import OBSERVATIONS, observe, real_contact, repeat_slots
+from robotics_bridge.hands.observations import OBSERVATIONS, observe, real_contact, repeat_slots, sensors_for
+from robotics_bridge.hands.scenes import closing, holding
+from robotics_bridge.physics import MujocoEngine
+from robotics_bridge.sensors import Noise, SensorSuite
 from robotics_bridge.sensors.placement import Probes
 
 
@@ -65,3 +68,45 @@ def test_wrong_names_and_shapes_are_explained():
         observe("depth", {"b": torch.zeros(1, 3)}, _layout())
     with pytest.raises(UsageError, match="has shape \\(1, 5\\), but the link has 6 probes"):
         observe("depth", {"a": torch.zeros(1, 5), "b": torch.zeros(1, 3)}, _layout())
+
+
+@pytest.fixture(scope="module")
+def grip() -> MujocoEngine:
+    """Two hands that hold a ball."""
+    hand = hands.load("xhand1")
+    engine = MujocoEngine(holding(hand, radius=0.028, reach=0.9), 2, threads=1)
+    engine.set(ctrl=closing(hand, 0.72))
+    engine.step(300)
+    return engine
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("name", [name for name in OBSERVATIONS if name != "none"])
+def test_a_hand_that_holds_a_ball_is_observed_in_every_way(grip, name, noisy):
+    layout = hands.load("xhand1").layout("low")
+    knobs = {"points": 200} if name in ("elastomer", "proximity") else {}
+    sensors = sensors_for(name, layout, noisy=noisy, track=("object",), **knobs)
+    assert all(sensor.noise.active == noisy for sensor in sensors.values())
+    suite = SensorSuite(grip.scene, sensors, num_envs=2, seed=3)
+    for _ in range(2):
+        suite.update(grip.state, grip.timestep)
+    seen = observe(name, {link: suite.read(link) for link in layout}, layout)
+    kind = OBSERVATIONS[name]
+    assert seen.shape == (2, kind.channels * (len(layout) if kind.per_link else 90))
+    assert bool(seen.isfinite().all())
+    # Markers move where the ball dips below the skin, which so coarse a layout may miss.
+    assert float(seen.abs().max()) > 0 or name == "elastomer"
+    truth = observe(name, {link: suite.read_ground_truth(link) for link in layout}, layout)
+    assert np.array_equal(truth[0], truth[1])
+    assert np.array_equal(seen, truth) == (not noisy) or (name in ("bool", "agg_bool") and np.array_equal(seen, truth))
+
+
+def test_published_sensors_carry_the_published_parameters():
+    layout = hands.load("sharpa").layout("low", "tips")
+    noisy = sensors_for("bool", layout, noisy=True)["right_index_DP"]
+    assert (noisy.threshold, noisy.release, noisy.noise) == (5e-4, 2e-4, Noise.preset("published-bool"))
+    force = sensors_for("force", layout, convention="thesis")["right_thumb_DP"]
+    assert (force.stiffness, force.damping, force.exponent, force.shear, force.twist) == (500, 1, 1.2, 2, 2)
+    assert force.convention == "thesis"
+    assert set(sensors_for("proximity", layout)["right_thumb_DP"].probes.radius) == {0.01}
+    assert sensors_for("none", layout) == {}

@@ -9,7 +9,13 @@ import pytest
 
 from brainbench.errors import UsageError
 from brainbench.geometry import Mesh
-from robotics_bridge.sensors.audio_materials import ELASTIC_MATERIALS, ElasticMaterial, Modes, elastic_material
+from robotics_bridge.sensors.audio_materials import (
+    ELASTIC_MATERIALS,
+    ElasticMaterial,
+    Modes,
+    elastic_material,
+    preset_modes,
+)
 from robotics_bridge.sensors.modes import Solid, find_modes, solve
 
 STEEL = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
@@ -119,3 +125,13 @@ def test_modes_and_solids_outside_their_range_are_refused():
     with pytest.raises(UsageError, match="Poisson"):
         ElasticMaterial(1, 0.5, 1, 0, 0)
     assert Modes((1.0, 2.0, 3.0), (0.0,) * 3, (1.0, -5.0, 2.0)).strongest(2).frequency == (2.0, 3.0)
+
+
+def test_hand_made_modes_are_those_of_a_bar_and_decay_as_the_material_does():
+    wood, glass = preset_modes("wood", 400.0), preset_modes("glass", 400.0)
+    assert np.array(wood.frequency[:3]) / 400 == pytest.approx([1, 25 / 9, 49 / 9])
+    assert max(wood.frequency) <= 20_000
+    assert all(w > g for w, g in zip(wood.decay, glass.decay, strict=True))
+    assert len(preset_modes("steel", 15_000.0, 16).frequency) == 1
+    with pytest.raises(UsageError, match="between 20 and 20000 Hz"):
+        preset_modes("wood", 5.0)
