@@ -6,8 +6,32 @@ from types import SimpleNamespace
 
 @cache
 def state_kernels() -> SimpleNamespace:
-    """Return the kernel ``check``: which environments hold numbers that are not finite."""
+    """Return the kernel ``check`` and its function ``status_of``: which environments hold numbers that are no numbers."""
     import warp as wp
+
+    @wp.func
+    def status_of(
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+        env: int,
+        contacts: int,
+        room: int,
+    ) -> int:
+        total = float(0.0)
+        for link in range(pose.shape[1]):
+            at = pose[env, link]
+            speed = velocity[env, link]
+            # Adding zeros keeps a NaN and turns an infinity into one.
+            for k in range(7):
+                total += at[k] * 0.0
+            for k in range(6):
+                total += speed[k] * 0.0
+        bits = int(0)
+        if wp.isnan(total):
+            bits = 1
+        if contacts > room:
+            bits = bits + 2
+        return bits
 
     @wp.kernel(module="unique")
     def check(
@@ -18,23 +42,9 @@ def state_kernels() -> SimpleNamespace:
         status: wp.array(dtype=wp.int32),
     ):
         env = wp.tid()
-        bits = int(0)
-        total = float(0.0)
-        for link in range(pose.shape[1]):
-            at = pose[env, link]
-            speed = velocity[env, link]
-            # Adding zeros keeps a NaN and turns an infinity into one.
-            for k in range(7):
-                total += at[k] * 0.0
-            for k in range(6):
-                total += speed[k] * 0.0
-        if wp.isnan(total):
-            bits = 1
-        if count[0] > room:
-            bits = bits + 2
-        status[env] = bits
+        status[env] = status_of(pose, velocity, env, count[0], room)
 
-    return SimpleNamespace(check=check)
+    return SimpleNamespace(check=check, status_of=status_of)
 
 
 @cache

@@ -7,7 +7,9 @@ pose arithmetic of their own. Letters: B environment, S slot, P place in the lis
 
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
+from robotics_bridge.physics._state_kernels import state_kernels
 from robotics_bridge.sensors._query_kernels import PLANE, query_structs
 
 
@@ -62,11 +64,15 @@ def begin_kernel() -> SimpleNamespace:
 
 
 @cache
-def touch_kernel() -> SimpleNamespace:
-    """Return the kernel ``touch`` that marks who is in contact with whom. Dim [C]."""
+def start_kernel(contacts: bool) -> Any:
+    """Return the kernel ``start`` of an update: counts it, checks the state and marks who touches whom.
+
+    One launch for three small tasks, since launches are what small updates cost. Dim [max(B, C)], or [B] without
+    ``contacts``.
+    """
     import warp as wp
 
-    slots_type = pair_structs().Slots
+    slots_type, status_of = pair_structs().Slots, state_kernels().status_of
 
     @wp.func
     def mark(slots: slots_type, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
@@ -80,25 +86,31 @@ def touch_kernel() -> SimpleNamespace:
                         wp.atomic_or(bits, env, word, bit)
 
     @wp.kernel(module="unique")
-    def touch(
+    def start(
         slots: slots_type,
         link_of: wp.array(dtype=wp.int32),
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
         count: wp.array(dtype=wp.int32),
         geometry: wp.array(dtype=wp.vec2i),
-        env: wp.array(dtype=wp.int32),
+        owner: wp.array(dtype=wp.int32),
         words: int,
         bits: wp.array2d(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
+        age: wp.array(dtype=wp.int32),
     ):
-        c = wp.tid()
-        if c >= count[0]:
-            return
-        pair = geometry[c]
-        if pair[0] < 0 or pair[1] < 0:
-            return
-        mark(slots, env[c], link_of[pair[0]], pair[1], words, bits)
-        mark(slots, env[c], link_of[pair[1]], pair[0], words, bits)
+        tid = wp.tid()
+        if tid < pose.shape[0]:
+            age[tid] = age[tid] + 1
+            status[tid] = status_of(pose, velocity, tid, count[0], owner.shape[0])
+        if wp.static(contacts):
+            if tid < wp.min(count[0], owner.shape[0]):
+                pair = geometry[tid]
+                if pair[0] >= 0 and pair[1] >= 0:
+                    mark(slots, owner[tid], link_of[pair[0]], pair[1], words, bits)
+                    mark(slots, owner[tid], link_of[pair[1]], pair[0], words, bits)
 
-    return SimpleNamespace(touch=touch)
+    return start
 
 
 @cache

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotics_bridge._device import warp
-from robotics_bridge.sensors._pair_kernels import pair_kernel, pair_structs, touch_kernel
+from robotics_bridge.sensors._pair_kernels import pair_kernel, pair_structs, start_kernel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -109,14 +109,19 @@ class PairTable:
         self._bits = wp.zeros((self._num_envs, max(count, 1) * self._words), dtype=wp.int32, device=device)
         self.crowded = wp.zeros(self._num_envs, dtype=wp.int32, device=device)
 
+    def start(self, state: HandState, age: Any) -> None:
+        """Count an update, refresh the state's status and mark contacts."""
+        wp, contacts = warp(), self.contacts_needed
+        room = state.contact_env.shape[0]
+        inputs = [self.plan, self._solids.struct.link, state.pose, state.velocity, state.contact_count]
+        inputs += [state.contact_geom, state.contact_env, self._words, self._bits, state.status, age]
+        dim = max(self._num_envs, room) if contacts else self._num_envs
+        wp.launch(start_kernel(contacts), dim=dim, inputs=inputs, device=self._device)
+
     def update(self, state: HandState) -> None:
-        """List what every slot meets now."""
+        """List what every slot meets now; contacts were marked by :meth:`start`."""
         if not self._slots:
             return
         wp, solids = warp(), self._solids.struct
-        if self.contacts_needed:
-            inputs = [self.plan, solids.link, state.contact_count, state.contact_geom, state.contact_env]
-            inputs += [self._words, self._bits]
-            wp.launch(touch_kernel().touch, dim=state.contact_env.shape[0], inputs=inputs, device=self._device)
         inputs = [self.plan, solids, state.pose, state.velocity, self._words, self._bits, self.struct, self.crowded]
         wp.launch(pair_kernel().pairs, dim=(self._num_envs, len(self._slots)), inputs=inputs, device=self._device)

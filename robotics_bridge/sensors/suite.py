@@ -221,8 +221,7 @@ class SensorSuite:
 
     def _launch(self, state: HandState, dt: float) -> None:
         wp = warp()
-        wp.launch(begin_kernel().begin, dim=self.num_envs, inputs=[self.clock.age], device=self.device)
-        state.check()
+        self.pairs.start(state, self.clock.age)
         self.pairs.update(state)
         for runtime in self.runtimes:
             runtime.update(state, dt)
