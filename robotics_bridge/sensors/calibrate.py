@@ -142,7 +142,7 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         max_delay: Longest delay that is tried [s].
 
     Raises:
-        DataError: no probe is alive.
+        DataError: no probe is alive, or the reference never changes.
     """
     from robotics_bridge.sensors._calibrate_fit import Fit, find_dead, find_delay, find_quantum, fit_dynamics, segments
 
@@ -155,7 +155,12 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     if not living:
         raise DataError("Every probe of the log is stuck at one value, so nothing can be fitted.")
     if log.reference is not None:
-        _dead(np.concatenate(stuck), np.concatenate(values), knobs, estimates)
+        # Where nothing was applied, a living probe may well read the same all the time.
+        moved = [index for index, (x, _y) in enumerate(parts) if np.ptp(x) > 0]
+        if not moved:
+            raise DataError("The reference never changes; leave the column out for a device at rest.")
+        held, at = (np.concatenate([items[index] for index in moved]) for items in (stuck, values))
+        _dead(held, at, knobs, estimates)
     quantum = find_quantum(np.concatenate([y.ravel() for _x, y in living]))
     knobs["quantum"] = quantum
     estimates["quantum"] = Estimate(

@@ -142,3 +142,5 @@ def test_unusable_logs_are_explained(tmp_path):
         read_log(path)
     with pytest.raises(DataError, match="Every probe of the log is stuck"):
         calibrate(Log(np.arange(50) * 0.1, np.ones((50, 2)), np.arange(50.0)))
+    with pytest.raises(DataError, match="reference never changes"):
+        calibrate(Log(np.arange(50) * 0.1, np.random.default_rng(0).normal(size=(50, 2)), np.ones(50)))

@@ -364,6 +364,37 @@ def test_a_signal_with_other_axes_is_refused():
         simulate(Noise(), np.zeros((3, 4)), dt=0.01)
 
 
+def test_noise_in_the_sensors_kernel_and_in_stages_measures_alike():
+    from robotics_bridge.physics import Geometry, HandState, Scene
+    from robotics_bridge.sensors import KinematicTaxel, Probes, SensorSuite
+
+    shapes = (
+        Geometry(name="pad", link="pad", kind="box", size=(0.02, 0.02, 0.005), position=(0, 0, -0.005)),
+        Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
+    )
+    knobs = {
+        "white": 0.1, "walk": 0.02, "bias": 0.3, "gain": (0.8, 1.2), "dead_probability": 0.2, "dead_range": (1.0, 2.0),
+        "hysteresis": 0.5, "radius": 1e-3,
+    }  # fmt: skip
+    read = {}
+    for way, crosstalk in (("fused", 0.0), ("staged", 1e-12)):
+        probes = Probes.grid(4, 5, size=(0.02, 0.02), radius=0.004)
+        taxels = KinematicTaxel(link="pad", probes=probes, noise=Noise(**knobs, crosstalk=crosstalk))
+        suite = SensorSuite(Scene(("pad", "ball"), shapes), {"taxels": taxels}, num_envs=3, seed=5)
+        state = HandState.empty(3, 2, 3)
+        state.set_contacts([0, 1, 2], [[0, 1]] * 3)
+        pose = np.zeros((3, 2, 7))
+        pose[..., 6] = 1
+        pose[:, 1, 2] = [0.018, 0.019, 0.0195]
+        state.set_pose(pose)
+        for step in range(6):
+            if step == 3:
+                suite.reset([1])
+            suite.update(state, 0.01)
+        read[way] = suite.read("taxels").numpy().copy()
+    assert read["staged"] == pytest.approx(read["fused"], rel=1e-4, abs=1e-5)
+
+
 @pytest.mark.gpu
 def test_cpu_and_cuda_measure_the_same_bits():
     x = np.random.default_rng(1).normal(size=(20, 64, 12, 6)).astype(np.float32)
