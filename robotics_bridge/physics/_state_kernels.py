@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 @cache
 def state_kernels() -> SimpleNamespace:
-    """Return the kernel ``check`` and its function ``status_of``: which environments hold values that are not finite."""
+    """Return the kernel ``check`` and its function ``status_of``: which environments hold numbers not finite."""
     import warp as wp
 
     @wp.func
