@@ -67,6 +67,18 @@ def recordings_part(score: Score, name: str) -> Any:
     return _part(score, "recordings", name)
 
 
+def layer_p(score: Score) -> dict[str, float]:
+    """Return each layer's p, corrected for the number of layers where the record says so; empty if not stated."""
+    tests = _part(score, "statistics", "layer_tests")
+    found = {}
+    for item in tests if isinstance(tests, (list, tuple)) else ():
+        if isinstance(item, Mapping) and isinstance(item.get("layer"), str):
+            p = item.get("p_corrected", item.get("p"))
+            if isinstance(p, (int, float)) and not isinstance(p, bool):
+                found[item["layer"]] = float(p)
+    return found
+
+
 def command(score: Score) -> str:
     """Return the command that makes the score again; empty if not stated."""
     return _text(score.provenance.get("command")) or ""

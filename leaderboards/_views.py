@@ -42,6 +42,8 @@ class _LayerRow:
     note: str
     shape: str
     open: bool
+    p: float | None
+    """Corrected for the number of layers; None when the record states none."""
 
 
 def report_view(record: ResultRecord) -> dict[str, Any]:
@@ -90,6 +92,7 @@ def report_view(record: ResultRecord) -> dict[str, Any]:
 
 def _layer_rows(score: Score, axis: Axis) -> list[_LayerRow]:
     rows = []
+    tests = _origin.layer_p(score)
     for layer in score.layers:
         notes = ["chosen on held-out data"] if layer.layer == score.layer else []
         best = layer.layer == score.best_layer
@@ -97,7 +100,13 @@ def _layer_rows(score: Score, axis: Axis) -> list[_LayerRow]:
         kind = "chosen" if layer.layer == score.layer else "best" if best else "layer"
         rows.append(
             _LayerRow(
-                layer, axis.mark(layer.value), kind, "; ".join(notes), "diamond" if best else "dot", kind == "best"
+                layer,
+                axis.mark(layer.value, layer.interval),
+                kind,
+                "; ".join(notes),
+                "diamond" if best else "dot",
+                kind == "best",
+                tests.get(layer.layer),
             )
         )
     return rows

@@ -61,7 +61,7 @@ def test_missing_field_is_named(make_record):
     assert first_fault(data) == "score lacks 'status'"
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_our_check_agrees_with_jsonschema_on_damaged_records(make_record, data):
     record = json.loads(make_record().to_json())

@@ -50,3 +50,15 @@ def test_a_trained_models_page_shows_accuracy_and_training(make_record, tmp_path
 def test_numbers_have_true_minus_signs_and_no_negative_zero():
     assert _words.number(-0.1234) == "−0.123"
     assert _words.number(-0.0001) == "0.000"
+
+
+def test_layers_show_their_corrected_p_where_the_record_states_it(make_record, tmp_path):
+    from leaderboards import write_report
+
+    record = make_record()
+    tests = [{"layer": "conv3", "p": 0.01, "p_corrected": 0.0312}, {"layer": 4}, "nonsense"]
+    provenance = {**record.score.provenance, "statistics": {"layer_tests": tests}}
+    record = replace(record, score=replace(record.score, provenance=provenance))
+    text = Page(write_report(record, tmp_path / "r.html")).text
+    assert "p, corrected" in text
+    assert "0.031" in text
