@@ -138,3 +138,28 @@ def test_a_field_far_away_still_tells_the_distance_to_the_surface() -> None:
     suite = SensorSuite(scene, {"far": SurfaceDistanceProbe(link="hand", probes=probes)}, num_envs=1)
     suite.update(state_of(scene, np.tile([0, 0, 0, 0, 0, 0, 1.0], (1, 3, 1)), touch=False))
     np.testing.assert_allclose(suite.read("far")[0].numpy(), _exact("mesh", far), rtol=6e-3)
+
+
+@pytest.mark.parametrize("query", ["sdf", "raycast"])
+def test_a_box_of_triangles_presses_like_a_box(query: str) -> None:
+    from robotics_bridge.sensors import KinematicTaxel
+    from tests.robotics_bridge.scenes import poses_at
+
+    half = (0.006, 0.005, 0.004)
+    cube = trimesh.creation.box(2 * np.array(half))
+    shapes = {
+        "box": Geometry(name="o", link="o", kind="box", size=half),
+        "mesh": Geometry(name="o", link="o", kind="mesh", mesh=Mesh(cube.vertices, cube.faces)),
+    }
+    grid = Probes.grid(8, 8, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.002)
+    read = {}
+    for name, shape in shapes.items():
+        scene = pad_scene(shape)
+        taxel = KinematicTaxel(link="hand", probes=grid, query=query)  # type: ignore[arg-type]
+        suite = SensorSuite(scene, {"t": taxel}, num_envs=1, resolution=96)
+        suite.update(state_of(scene, poses_at(3, {2: (0.0003, -0.0004, 0.005 + 0.0035)})))
+        read[name] = suite.read("t").numpy()
+    error = np.linalg.norm(read["mesh"] - read["box"]) / np.linalg.norm(read["box"])
+    assert np.abs(read["box"]).max() > 0.3
+    # Samples round the edges off; triangles do not.
+    assert error < (0.03 if query == "sdf" else 1e-5)
