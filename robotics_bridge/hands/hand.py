@@ -206,39 +206,54 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
     """Return link → the direction [3] of its palmar side, in the link's frame.
 
     A link's palmar side is where it moves when its joint flexes (of two crossed joints, the one with more range
-    counts); the palm faces where the finger tips go, along the nearest axis of its frame.
+    counts). A joint that swings as far to both sides spreads or twists the finger and tells nothing: such links
+    face as the next one towards the tip does. The palm faces where the finger tips go, along the nearest axis of
+    its frame.
     """
     mujoco = engine()
-
-    from robotics_bridge.hands._surface import link_points
 
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     towards: dict[str, np.ndarray] = {}
     tips = []
     for chain in fingers.values():
-        for place, name in enumerate(chain):
-            body = model.body(name).id
-            own = link_points(model, body)
-            if not len(own):
-                continue
-            end = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
-            if end is None or np.linalg.norm(end - data.xpos[body]) < 1e-6:
-                end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ own.mean(axis=0)
-            joint = _flexion(model, body)
-            if joint < 0:
-                continue
-            axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
-            low, high = (float(value) for value in model.jnt_range[joint])
-            world = palm_side(axis, end - data.xpos[body], (low, high))
-            if np.any(world):
-                towards[name] = data.xmat[body].reshape(3, 3).T @ world
-                tips += [world] if place + 1 == len(chain) else []
+        known: np.ndarray | None = None
+        for place in reversed(range(len(chain))):
+            body = model.body(chain[place]).id
+            following = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
+            world = _flexed(model, data, body, following)
+            if world is None and known is None and place + 1 == len(chain):
+                world = _flexed(model, data, body, following, symmetric=True)
+            known = known if world is None else world
+            if known is not None:
+                towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ known
+                tips += [known] if place + 1 == len(chain) else []
     if tips and np.linalg.norm(np.mean(tips, axis=0)) > 0.1:
         turned = data.xmat[model.body(palm).id].reshape(3, 3).T @ np.mean(tips, axis=0)
         face = np.argmax(np.abs(turned))
         towards[palm] = np.sign(turned[face]) * np.eye(3)[face]
     return towards
+
+
+def _flexed(
+    model: Any, data: Any, body: int, following: np.ndarray | None, *, symmetric: bool = False
+) -> np.ndarray | None:
+    """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
+    from robotics_bridge.hands._surface import link_points
+
+    own = link_points(model, body)
+    joint = _flexion(model, body)
+    if joint < 0 or not len(own):
+        return None
+    low, high = (float(value) for value in model.jnt_range[joint])
+    if not symmetric and abs(high + low) < 0.2 * (high - low):
+        return None
+    end = following
+    if end is None or np.linalg.norm(end - data.xpos[body]) < 1e-6:
+        end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ own.mean(axis=0)
+    axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
+    world = palm_side(axis, end - data.xpos[body], (low, high))
+    return world if np.any(world) else None
 
 
 def _flexion(model: Any, body: int) -> int:

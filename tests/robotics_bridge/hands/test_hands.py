@@ -39,9 +39,12 @@ MENAGERIE_LIKE = """
       <geom type="cylinder" size="0.03 0.05"/>
       <body name="palm" pos="0 0 0.1"><joint name="wrist" range="-0.5 0.5"/>
         <geom name="palm_geom" type="box" size="0.02 0.04 0.04"/>
-        <body name="f1_near" pos="0 0.03 0.05"><joint name="f1_a" range="-0.1 1.6"/>
-          <geom fromto="0 0 0.01 0 0 0.04"/>
-          <body name="f1_far" pos="0 0 0.05"><joint name="f1_b" range="0 1.6"/><geom fromto="0 0 0.01 0 0 0.03"/></body>
+        <body name="f1_knuckle" pos="0 0.03 0.05"><joint name="f1_spread" axis="1 0 0" range="-0.3 0.3"/>
+          <geom fromto="0 0 0 0 0 0.004"/>
+          <body name="f1_near" pos="0 0 0.02"><joint name="f1_a" range="-0.1 1.6"/>
+            <geom fromto="0 0 0.01 0 0 0.04"/>
+            <body name="f1_far" pos="0 0 0.05"><joint name="f1_b" range="0 1.6"/><geom fromto="0 0 0.01 0 0 0.03"/></body>
+          </body>
         </body>
         <body name="f2_near" pos="0 -0.03 0.05"><joint name="f2_a" range="-0.1 1.6"/>
           <geom fromto="0 0 0.01 0 0 0.04"/>
@@ -170,7 +173,10 @@ def test_a_menagerie_like_file_becomes_a_hand_with_probes_on_its_palmar_sides(tm
     path.write_text(MENAGERIE_LIKE)
     hand = hands.load(path)
     assert (hand.palm, set(hand.fingers)) == ("palm", {"f1_far", "f2_far"})
-    assert hand.joints == ("wrist", "f1_a", "f1_b", "f2_a", "f2_b")
+    assert hand.joints == ("wrist", "f1_spread", "f1_a", "f1_b", "f2_a", "f2_b")
+    # A joint that spreads tells no side; its link faces as the finger does.
+    facing = palmar_directions(hand.model, hand.palm, hand.fingers)
+    assert facing["f1_knuckle"] == pytest.approx([1, 0, 0])
     layout = hand.layout("low", "tips")
     assert set(layout) == {"f1_far", "f2_far"}
     for probes in layout.values():
