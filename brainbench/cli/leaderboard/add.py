@@ -69,7 +69,7 @@ def add(
         jobs += read_batch(batch)
     if not records and not model and batch is None:
         raise UsageError("Name record files to take in, or models to score with --model or --batch.")
-    done = [_take_in(path, to, keep_both=keep_both) for path in _files(records or [])]
+    done = _take_in(_files(records or []), to, keep_both=keep_both)
     done += _score(jobs, to, prune=prune)
     states = [item["state"] for item in done]
     summary = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states)) or "nothing to do"
@@ -91,7 +91,13 @@ def _files(sources: list[Path]) -> list[Path]:
     return found
 
 
-def _take_in(path: Path, to: Path, *, keep_both: bool) -> dict[str, Any]:
+def _take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, Any]]:
+    """Take in files one after the other; what one brought counts for the next."""
+    present: dict[str, ResultRecord] = {item.record.identity: item.record for item in _present(to)} if paths else {}
+    return [_take_in_one(path, to, present, keep_both=keep_both) for path in paths]
+
+
+def _take_in_one(path: Path, to: Path, present: dict[str, ResultRecord], *, keep_both: bool) -> dict[str, Any]:
     from brainbench.errors import DataError
     from leaderboards.audit import conflicting, remarks
     from leaderboards.store import read_records, write_record
@@ -101,8 +107,8 @@ def _take_in(path: Path, to: Path, *, keep_both: bool) -> dict[str, Any]:
         (stored,) = read_records(path)
         if stored.record is None:
             return result | {"note": f": {stored.problem}"}
-        others = [item.record for item in _present(to) if item.record.identity != stored.record.identity]
-        rivals = conflicting(stored.record, others)
+        there = stored.record.identity in present
+        rivals = conflicting(stored.record, present.values())
         if rivals and not keep_both:
             return result | {
                 "model": stored.record.score.name,
@@ -110,8 +116,8 @@ def _take_in(path: Path, to: Path, *, keep_both: bool) -> dict[str, Any]:
                 f"({rivals[0].identity}) and {stored.record.score.value:.4f} here; see which holds with: "
                 f"brainbench leaderboard verify {path}",
             }
-        there = any(item.record.identity == stored.record.identity for item in _present(to))
         written = write_record(stored.record, to)
+        present[stored.record.identity] = stored.record
     except DataError as error:
         return result | {"note": f": {error}"}
     doubts = remarks([stored]).get(stored.record.identity, ())
