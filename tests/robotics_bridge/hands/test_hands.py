@@ -43,7 +43,8 @@ MENAGERIE_LIKE = """
           <geom fromto="0 0 0 0 0 0.004"/>
           <body name="f1_near" pos="0 0 0.02"><joint name="f1_a" range="-0.1 1.6"/>
             <geom fromto="0 0 0.01 0 0 0.04"/>
-            <body name="f1_far" pos="0 0 0.05"><joint name="f1_b" range="0 1.6"/><geom fromto="0 0 0.01 0 0 0.03"/></body>
+            <body name="f1_far" pos="0 0 0.05"><joint name="f1_b" range="0 1.6"/>
+              <geom fromto="0 0 0.01 0 0 0.03"/></body>
           </body>
         </body>
         <body name="f2_near" pos="0 -0.03 0.05"><joint name="f2_a" range="-0.1 1.6"/>
