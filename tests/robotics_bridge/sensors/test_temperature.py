@@ -335,6 +335,23 @@ def test_contacts_without_room_are_counted():
     assert float(suite.read("grid").max()) > 22
 
 
+def test_an_empty_scene_is_read_at_the_shortest_and_the_longest_step():
+    scene = Scene(("world", "pad"))
+    grid = TemperatureGrid(link="pad", low=(0, 0, 0), high=(0.01, 0.01, 0.01), base_temperature=30.0)
+    suite, state = SensorSuite(scene, {"grid": grid}, num_envs=2), HandState.empty(2, 2)
+    for dt in (1e-5, 0.1, 10.0):
+        suite.update(state, dt)
+        assert 22 < float(suite.read("grid").min()) <= float(suite.read("grid").max()) <= 30
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_cells_keep_their_heat():
+    suite, state = _make(cells=(100, 100, 10), source=1e5)
+    for _ in range(5):
+        suite.update(state, 0.01)
+    assert suite.read_ground_truth("grid").double().mean() - 22 == pytest.approx(1e5 * 0.05 / 1e6, rel=1e-3)
+
+
 @pytest.mark.gpu
 def test_cpu_and_cuda_agree():
     read = {}
