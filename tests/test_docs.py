@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -70,6 +71,31 @@ def test_the_readme_names_only_commands_that_exist(run_help):
             assert sub in run_help(command), f"README names brainbench {command} {sub}"
 
 
+@pytest.mark.parametrize("page", ["README.md", *PAGES])
+def test_commands_and_options_of_a_page_exist(page: str):
+    import typer
+
+    from brainbench.cli import app
+
+    for line in _commands(page):
+        command, words = typer.main.get_command(app), shlex.split(line, comments=True)[1:]
+        while words and words[0] in getattr(command, "commands", {}):
+            command = command.commands[words.pop(0)]
+        assert not getattr(command, "commands", None) or not words or words[0].startswith("-"), f"{page}: {line}"
+        known = {name for param in command.params for name in (*param.opts, *param.secondary_opts)} | {"--help"}
+        used = {word.partition("=")[0] for word in words if re.fullmatch(r"--?[a-z][a-z-]*(=.*)?", word)}
+        assert used <= known, f"{page}: {line} has {sorted(used - known)}; known are {sorted(known)}"
+
+
+def _commands(page: str) -> list[str]:
+    found = []
+    for block in _blocks(page, "bash"):
+        for line in block.replace("\\\n", " ").splitlines():
+            parts = re.split(r"&&|\|\|?", line.partition("#")[0])
+            found += [part.strip() for part in parts if part.strip().startswith("brainbench ")]
+    return found
+
+
 @pytest.fixture
 def run_help():
     from typer.testing import CliRunner
@@ -79,15 +105,25 @@ def run_help():
     return lambda *words: CliRunner().invoke(app, [*words, "--help"]).output
 
 
+PRELUDES = {
+    "docs/models.md": "import torch\nstimuli = torch.zeros(2, 22, 30, 5, 7)",
+    "docs/stimuli.md": "from brainbench.stimuli import WhiskerArray, whiskit\n"
+    "whiskit.save_parameters(WhiskerArray.rat(), 'whisker_param_average_rat/')",
+}
+"""What a page takes for granted."""
+
+ELSEWHERE = ("docs/recordings.md", "docs/statistics.md", "docs/datasets.md")
+"""Pages whose code other tests here run."""
+
+SLOW = ("docs/tactile.md",)
+
+
 @pytest.mark.parametrize(
     "page",
     [
-        "docs/score.md",
-        "docs/add-a-model.md",
-        "docs/fidelity.md",
-        "docs/policies.md",
-        "docs/index.md",
-        pytest.param("docs/tactile.md", marks=pytest.mark.slow),
+        pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else [])
+        for page in PAGES
+        if page not in ELSEWHERE and _blocks(page, "python")
     ],
 )
 def test_the_code_of_a_page_runs_from_top_to_bottom(
@@ -95,9 +131,7 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(
 ):
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    blocks = _blocks(page, "python")
-    assert blocks
-    for block in blocks:
+    for block in (PRELUDES.get(page, ""), *_blocks(page, "python")):
         exec(compile(block, page, "exec"), names)
     if page == "docs/score.md":
         assert names["record"].score.layer == "rotated"
