@@ -162,13 +162,26 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
 
     A point sets its anchor where it sinks below −enter and loses it above +leave, or when its geometry no longer
     touches. Points with an anchor are listed without gaps, in a fixed order, if they moved since: place (3) and
-    s_s h times the way since the anchor (3). Anchors are [P, 3, B] (x NaN: none): threads are environments.
+    s_s h times the way since the anchor (3). Anchors are [P, 3, B] (x NaN: none): threads are environments. Blocks of
+    points that hold no anchor and lie off the pad are passed over; ``held`` counts the anchors of each.
     """
     import warp as wp
 
     structs, pairs_type, solids_type = cloud_structs(), pair_structs().Pairs, query_structs().Solids
     io_type, gel_type, cloud_type = io_structs().Io, elastomer_structs().Gel, structs.Cloud
     distance = distance_function(kinds, raycast)
+
+    @wp.func
+    def height_over(solids: solids_type, own: wp.array(dtype=wp.int32), gel: gel_type, row: int, z: wp.vec3f) -> float:
+        """Signed distance of a point to the pad's surface, negative inside."""
+        if gel.own_last == gel.own_first:
+            return wp.dot(z - gel.center, gel.normal)
+        phi = float(wp.static(FAR))
+        for o in range(gel.own_first, gel.own_last):
+            local = wp.transform_point(wp.transform_inverse(solids.frame[row, own[o]]), z)
+            limit = 2.0 * solids.bound[row, own[o]][3]
+            phi = wp.min(phi, distance(solids, row, own[o], local, limit)[3])
+        return phi
 
     @wp.kernel(module="unique")
     def anchors(
@@ -180,6 +193,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
         cloud: cloud_type,
         io: io_type,
         anchor: wp.array3d(dtype=wp.float32),
+        held: wp.array2d(dtype=wp.int32),
         live: wp.array2d(dtype=wp.int32),
         moved: wp.array2d(dtype=wp.int32),
         listed: wp.array2d(dtype=wp.spatial_vectorf),
@@ -213,52 +227,51 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
             first = cloud.first[row, geometry]
             blocks = cloud.blocks[row, geometry]
             for block in range(blocks):
-                near = at >= 0
-                for i in range(wp.static(BLOCK)):
-                    index = place + block * wp.static(BLOCK) + i
-                    kept = anchor[index, 0, env]
-                    if stale:
-                        kept = wp.static(float("nan"))
-                    if near:
+                store = (place + block * wp.static(BLOCK)) // wp.static(BLOCK)
+                had = held[store, env]
+                if stale:
+                    had = 0
+                near = False
+                rotation = wp.mat33f()
+                offset = wp.vec3f()
+                if at >= 0:
+                    rotation = wp.transpose(pairs.rotation[env, at])
+                    offset = pairs.offset[env, at]
+                    sphere = cloud.sphere[first + block]
+                    middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
+                    near = height_over(solids, own, gel, solid_row, middle) - sphere[3] <= gel.leave
+                holds = int(0)
+                if near:
+                    for i in range(wp.static(BLOCK)):
                         p = cloud.point[(first + block) * wp.static(BLOCK) + i]
                         if not wp.isnan(p[0]):
-                            rotation = pairs.rotation[env, at]
-                            z = wp.transpose(rotation) @ (p - pairs.offset[env, at])
-                            phi = float(wp.static(FAR))
-                            if gel.own_last > gel.own_first:
-                                for o in range(gel.own_first, gel.own_last):
-                                    g = own[o]
-                                    frame = solids.frame[solid_row, g]
-                                    local = wp.transform_point(wp.transform_inverse(frame), z)
-                                    limit = 2.0 * solids.bound[solid_row, g][3]
-                                    phi = wp.min(phi, distance(solids, solid_row, g, local, limit)[3])
-                            else:
-                                phi = wp.dot(z - gel.center, gel.normal)
+                            index = place + block * wp.static(BLOCK) + i
+                            kept = wp.static(float("nan"))
+                            if had > 0:
+                                kept = anchor[index, 0, env]
+                            z = rotation @ (p - offset)
+                            phi = height_over(solids, own, gel, solid_row, z)
                             if wp.isnan(kept):
                                 if phi < -gel.enter:
                                     kept = z[0]
-                                    anchor[index, 0, env] = z[0]
                                     anchor[index, 1, env] = z[1]
                                     anchor[index, 2, env] = z[2]
-                                elif stale:
-                                    anchor[index, 0, env] = kept
                             elif phi > gel.leave:
                                 kept = wp.static(float("nan"))
-                                anchor[index, 0, env] = kept
+                            anchor[index, 0, env] = kept
                             if not wp.isnan(kept):
                                 drive = gel.shear * wp.max(-phi, 0.0)
-                                way = z - wp.vec3f(anchor[index, 0, env], anchor[index, 1, env], anchor[index, 2, env])
+                                way = z - wp.vec3f(kept, anchor[index, 1, env], anchor[index, 2, env])
                                 if drive * wp.length_sq(way) > 0.0:
                                     way = drive * way
                                     listed[gel.first_point + found, env] = wp.spatial_vectorf(
                                         z[0], z[1], z[2], way[0], way[1], way[2]
                                     )
                                     found += 1
-                                alive += 1
-                        elif stale:
-                            anchor[index, 0, env] = kept
-                    else:
-                        anchor[index, 0, env] = wp.static(float("nan"))
+                                holds += 1
+                if stale or holds != had:
+                    held[store, env] = holds
+                alive += holds
             place += blocks * wp.static(BLOCK)
         live[part, env] = alive
         moved[part, env] = found

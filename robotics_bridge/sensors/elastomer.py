@@ -12,6 +12,7 @@ import numpy as np
 from brainbench.errors import UsageError, unknown_name
 from robotics_bridge._device import warp
 from robotics_bridge.sensors._base import Asks, ProbeRuntime, QuerySensor
+from robotics_bridge.sensors._cloud_kernels import BLOCK
 from robotics_bridge.sensors._clouds import sample_cloud
 from robotics_bridge.sensors.noise import TAXEL_KNOBS
 
@@ -169,6 +170,7 @@ class ElastomerRuntime(ProbeRuntime):
         # Threads of a GPU are environments and want them side by side; a processor walks through the points of one.
         self._anchor = floats(total, 3, envs) if device.is_cuda else floats(envs, total, 3).transpose((1, 2, 0))
         self._listed = wp.zeros((envs, total), dtype=wp.spatial_vectorf, device=device).transpose((1, 0))
+        self._held = wp.zeros((-(-total // BLOCK), envs), dtype=wp.int32, device=device)
         self._moved = wp.zeros((count, envs), dtype=wp.int32, device=device)
         exponents = np.array([sensor.exponent for sensor in self._sensors], np.float32)
         self._exponents = wp.array(exponents, dtype=wp.float32, device=device)
@@ -199,7 +201,7 @@ class ElastomerRuntime(ProbeRuntime):
             self._transform()
         if self._cloud:
             inputs = [self._gels, self._own, self._tracked, solids, pairs, self._cloud.struct, self.io]
-            inputs += [self._anchor, self._live, self._moved, self._listed]
+            inputs += [self._anchor, self._held, self._live, self._moved, self._listed]
             kernel = kernels.anchor_kernel(self._own_kinds, self._raycast)
             wp.launch(kernel, dim=(c.num_envs, len(self._sensors)), inputs=inputs, device=c.device)
         way = ("direct", "separable", "fft").index(self._way)
