@@ -134,18 +134,27 @@ def fitted(drawing: Drawing, across: Scale, up: Scale, xs: Sequence[float], ys: 
     return f"Least-squares line with the 95 % band of its mean over {n} models: r = {number(r, 2)}{text}. "
 
 
-def ablation(key: str, title: str, entries: Sequence[Entry], level: Callable[[Entry], str], what: str) -> Figure:
-    groups: dict[tuple[str, str], dict[str, Entry]] = {}
+def ablation(
+    key: str,
+    title: str,
+    entries: Sequence[Entry],
+    level: Callable[[Entry], str],
+    held: Callable[[Entry], str],
+    what: str,
+) -> Figure:
+    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed."""
+    groups: dict[tuple[str, str, str], dict[str, Entry]] = {}
     for entry in entries:
         if entry.trained and level(entry) and math.isfinite(entry.value):
-            groups.setdefault((entry.architecture, entry.card.objective or ""), {}).setdefault(level(entry), entry)
+            model = (entry.architecture, entry.card.objective or "", held(entry))
+            groups.setdefault(model, {}).setdefault(level(entry), entry)
     groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
     if not groups:
         return Figure(key, title, "", None, f"no model was trained with more than one {what}")
     twin = twins(entries)
     rows = [
-        (f"{name}, {objective}" if i == 0 else "", label, entry)
-        for (name, objective), levels in groups.items()
+        (", ".join(part for part in model if part) if i == 0 else "", label, entry)
+        for model, levels in groups.items()
         for i, (label, entry) in enumerate(sorted(levels.items()))
     ]
     scale = score_scale([e.value for *_, e in rows], [e.interval for *_, e in rows], 330, WIDTH - 20)
@@ -244,4 +253,6 @@ def cut_words(count: int, shown: int = SHOWN) -> str:
 
 
 def cut(text: str, length: int) -> str:
+    """Shorten a label; of a path the last part stays."""
+    text = text.rpartition("/")[2] or text
     return text if len(text) <= length else text[: length - 1] + "…"

@@ -67,7 +67,7 @@ def fit_per_model(board: Board, entries: Sequence[Entry]) -> Figure:
     y = 44.0
     for entry in rows:
         kind = colour[entry.card.objective or "not stated"]
-        drawing.text(242, y + 4, cut(entry.name, 40), "end" if entry.first is not None else "end quiet")
+        drawing.text(242, y + 4, cut(entry.name, 36), "end" if entry.first is not None else "end quiet")
         draw_interval(drawing, scale, entry.interval, y, kind)
         for row in entry.rows if entry.seeds > 1 else ():
             drawing.mark(scale.at(row.record.score.value), y, "dot", f"{kind} faint", size=2)
@@ -175,7 +175,7 @@ def rdm_panel(board: Board, entries: Sequence[Entry]) -> Figure:
     for index, (name, detail, pairs) in enumerate(picked):
         x0 = index * (WIDTH / len(picked))
         drawing.text(x0, 13, name, "title")
-        drawing.text(x0, 28, cut(detail, max(12, int(side / 5.6))), "quiet small")
+        drawing.text(x0, 28, cut(detail, max(12, int(side / 6.3))), "quiet small")
         draw_matrix(drawing, x0, 38, side, pairs, board.conditions)
     caption = (
         "Each cell is the dissimilarity of two stimuli in the order of the records "
@@ -205,7 +205,7 @@ def accuracy(board: Board, entries: Sequence[Entry]) -> Figure:
     for entry in rows:
         kind = colour[entry.card.objective or "not stated"]
         card = entry.card
-        drawing.text(242, y + 4, cut(entry.name, 40), "end")
+        drawing.text(242, y + 4, cut(entry.name, 36), "end")
         other = twin.get(entry.architecture)
         if other is not None and other.card.top1 is not None:
             drawing.rect(
@@ -265,16 +265,22 @@ def augmentation(board: Board, entries: Sequence[Entry]) -> Figure:
     """Neural fit under each augmentation, for models trained with several (figure 3.8 c)."""
     del board
     key, title = "augmentation", "Augmentation ablation (as figure 3.8 c)"
-    return ablation(key, title, entries, lambda e: (e.card.augmentation or "").partition(" + ")[0], "augmentation")
+    return ablation(key, title, entries, _augmentation, lambda e: _masking(e) if e.masking else "", "augmentation")
 
 
 def masking(board: Board, entries: Sequence[Entry]) -> Figure:
     """Neural fit by the share of masked time steps, for models trained with several."""
     del board
     key, title = "masking", "Temporal masking"
-    return ablation(
-        key, title, entries, lambda e: f"{e.masking:.0%} masked" if e.trained else "", "share of masked steps"
-    )
+    return ablation(key, title, entries, _masking, _augmentation, "share of masked steps")
+
+
+def _augmentation(entry: Entry) -> str:
+    return (entry.card.augmentation or "").partition(" + ")[0]
+
+
+def _masking(entry: Entry) -> str:
+    return f"{entry.masking:.0%} masked" if entry.trained else ""
 
 
 def layers_of(entry: Entry) -> Drawing | None:

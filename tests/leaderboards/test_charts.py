@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -67,6 +67,7 @@ def test_every_figure_is_drawn_when_the_records_hold_what_it_needs(make_record):
     assert any("untrained twin 0.300" in text for text in _texts(figures["fit"].drawing))
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=4, max_size=20))
 def test_regression_agrees_with_scipy(points):
     x, y = (np.array(values) for values in zip(*points, strict=True))
@@ -94,6 +95,7 @@ def test_layers_stand_at_their_scores(make_record):
     assert any(text.startswith("conv4: 0.688") for text in texts)
 
 
+@settings(deadline=None)
 @given(low=st.floats(-3, 2), width=st.floats(0.1, 5), value=st.floats(-10, 10))
 def test_scales_keep_order_and_stay_inside(low, width, value):
     scale = Scale(low, low + width, 10, 200)
@@ -143,3 +145,16 @@ def test_an_interval_off_the_axis_is_held_at_its_end(make_record):
 
 def test_the_examples_hold():
     assert doctest.testmod(_svg).failed == 0
+
+
+def test_an_ablation_changes_one_thing_at_a_time(make_record):
+    records = [
+        _trained(make_record("net.a", 0.9), "simclr", "physical", 0.75),
+        _trained(make_record("net.b", 0.5), "simclr", "physical"),
+        _trained(make_record("net.c", 0.4), "simclr", "image"),
+    ]
+    figures = _figures(*records)
+    shown = [text for text in _texts(figures["augmentation"].drawing) if text.startswith("net.")]
+    assert {text.split(":")[0] for text in shown} == {"net.b, physical", "net.c, image"}
+    shown = [text for text in _texts(figures["masking"].drawing) if text.startswith("net.")]
+    assert {text.split(":")[0] for text in shown} == {"net.a, 75% masked", "net.b, 0% masked"}
