@@ -15,10 +15,14 @@ if TYPE_CHECKING:
 
 OBJECT = "object"
 """Name of the free body and of its geometry."""
+_STIFFNESS, _DAMPING, _ARMATURE = 2.0, 0.2, 0.01
+"""Servo of a hinge without a drive: N·m/rad, N·m·s/rad, kg·m²."""
 
 
 def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: float = 0.002, reach: float = 0.6) -> Any:
     """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm.
+
+    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge.
 
     Args:
         hand: Any hand.
@@ -43,6 +47,8 @@ def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: fl
     surface = surface + reach * _towards_fingers(hand, surface, up)
     spec = hand.mjspec()
     spec.option.timestep = timestep
+    if not hand.model.nu:
+        _add_servos(spec)
     palm = spec.body(hand.palm)
     turn = _onto_z(up)
     matrix = np.zeros(9)
@@ -54,7 +60,21 @@ def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: fl
         name=OBJECT, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=mass, condim=4,
         friction=(1.0, 0.01, 1e-4),
     )  # fmt: skip
-    return spec.compile()
+    return _raised(spec.compile())
+
+
+def _raised(model: Any) -> Any:
+    """Lift the ball of a model until it touches nothing: hulls of meshes reach above the palm they stand for."""
+    mujoco = engine()
+    ball, body = model.geom(OBJECT).id, model.body(OBJECT).id
+    for _ in range(60):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        if not any(ball in contact.geom for contact in data.contact):
+            break
+        model.body_pos[body, 2] += 1e-3
+        model.qpos0[model.jnt_qposadr[model.body_jntadr[body]] + 2] += 1e-3
+    return model
 
 
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:
@@ -65,6 +85,19 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
     target = np.where(np.abs(high) >= np.abs(low), high, low) * share
     # Joints that spread the fingers stay in their middle.
     return np.where(np.abs(high + low) < 0.5 * np.ptp(model.jnt_range[joints], axis=1), 0.0, target)
+
+
+def _add_servos(spec: Any) -> None:
+    """Give every hinge of a hand without drives, as URDF files are, a weak position servo."""
+    mujoco = engine()
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            joint.armature = max(joint.armature, _ARMATURE)
+            spec.add_actuator(
+                name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                gainprm=[_STIFFNESS] + [0.0] * 9, biasprm=[0.0, -_STIFFNESS, -_DAMPING] + [0.0] * 7,
+            )  # fmt: skip
 
 
 def _towards_fingers(hand: Hand, surface: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:

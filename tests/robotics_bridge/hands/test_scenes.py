@@ -44,3 +44,20 @@ def test_spreading_joints_stay_in_their_middle():
 def test_an_impossible_ball_is_refused():
     with pytest.raises(UsageError, match="positive radius"):
         holding(hands.load("xhand1"), radius=0.0)
+
+
+@pytest.mark.shared
+def test_a_urdf_without_drives_gets_servos_and_closes_too(reference):
+    hand = hands.load(reference / "hands/sharpa/sharpa_right_updated_effort.urdf")
+    model = holding(hand, radius=0.028, reach=0.9)
+    assert (hand.model.nu, model.nu) == (0, 22)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert not any(model.geom(OBJECT).id in contact.geom for contact in data.contact)
+    for step in range(500):
+        data.ctrl[:] = closing(hand, 0.6) * min(step / 200, 1)
+        mujoco.mj_step(model, data)
+    assert np.isfinite(data.qpos).all()
+    assert np.linalg.norm(data.xpos[model.body(OBJECT).id]) < 0.15
+    bent = model.joint("right_middle_PIP").qposadr
+    assert data.qpos[bent] > 0.4
