@@ -41,8 +41,9 @@ class Difference:
 class Change:
     """What became of one model between two builds."""
 
-    kind: Literal["added", "removed", "changed", "moved"]
-    """``moved``: the record is the same, its rank is not, because of others."""
+    kind: Literal["added", "removed", "changed", "moved", "restated"]
+    """``moved``: the record is the same, its rank is not, because of others. ``restated``: another record with the
+    same inputs and numbers, which says more or less beside them."""
     board: str
     name: str
     before: str
@@ -120,13 +121,13 @@ def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]
         for one, other in pairs:
             ones.pop(one.record.identity)
             others.pop(other.record.identity)
-            causes = tuple(
-                str(item) for item in differences(one.record, other.record, tolerance=0.0) if _is_cause(item)
-            )
-            changes.append(Change("changed", other.board, other.name, one.text, other.text, causes))
+            found = differences(one.record, other.record, tolerance=0.0)
+            causes = tuple(str(item) for item in found if _is_cause(item))
+            kind = "changed" if found else "restated"
+            changes.append(Change(kind, other.board, other.name, one.text, other.text, causes))
         changes += [Change("removed", one.board, one.name, one.text, "") for one in ones.values()]
         changes += [Change("added", other.board, other.name, "", other.text) for other in others.values()]
-    order = ("added", "removed", "changed", "moved")
+    order = ("added", "removed", "changed", "moved", "restated")
     return sorted(changes, key=lambda change: (order.index(change.kind), change.board, change.name, change.before))
 
 

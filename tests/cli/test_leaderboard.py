@@ -138,6 +138,16 @@ def test_patterns_mean_architectures_unless_they_have_a_dot():
         find_models(["zhuan"])
 
 
+def test_a_pattern_with_a_dot_finds_the_trained_models_that_come_with_the_package(monkeypatch, tmp_path):
+    from brainbench.models import checkpoints
+
+    monkeypatch.setattr(
+        checkpoints, "shipped", lambda: {"s4-small.simclr": tmp_path, "zhuang-small.supervised": tmp_path}
+    )
+    assert find_models(["*.*"]) == ["s4-small.simclr", "zhuang-small.supervised"]
+    assert find_models(["*.simclr"]) == ["s4-small.simclr"]
+
+
 def test_seeds_and_batches_are_read_or_refused(tmp_path):
     assert parse_seeds("0-2,7") == (0, 1, 2, 7)
     with pytest.raises(UsageError, match="such as 0-4"):

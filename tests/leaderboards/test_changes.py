@@ -79,3 +79,10 @@ def test_a_site_is_read_by_the_records_it_holds(make_record, tmp_path):
         open_build(tmp_path / "site")
     with pytest.raises(DataFileNotFoundError):
         open_build(tmp_path / "nowhere")
+
+
+def test_another_record_with_the_same_numbers_is_restated(make_record, tmp_path):
+    record = make_record("net")
+    more = replace(record, score=replace(record.score, provenance={**record.score.provenance, "note": "said later"}))
+    (change,) = compare_builds(_build([record], tmp_path / "old"), _build([more], tmp_path / "new"))
+    assert (change.kind, change.causes) == ("restated", ())

@@ -21,7 +21,10 @@ def diff(
     old, new = open_build(before), open_build(after)
     changes = compare_builds(old, new)
     problems = [{"path": item.path, "problem": item.problem} for item in (*old, *new) if item.problem]
-    rows = [[item.kind, item.name, item.before, item.after, "; ".join(item.causes)] for item in changes]
+    told = [item for item in changes if item.kind != "restated"]
+    rows = [[item.kind, item.name, item.before, item.after, "; ".join(item.causes)] for item in told]
     text = table("", ["", "model", "before", "after", "because"], rows) if rows else "No difference."
+    if restated := len(changes) - len(told):
+        text += f"\n{restated} restated: other records with the same inputs and numbers."
     text += "".join(f"\nleft out: {item['path']}: {item['problem']}" for item in problems)
     emit({"changes": changes, "problems": problems}, text, as_json=as_json)
