@@ -1,0 +1,29 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from brainbench.files import read_json
+
+
+@pytest.mark.slow
+def test_the_cost_of_tactile_queries_is_measured_against_their_error(
+    run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from robotics_bridge.sensors import tradeoff
+
+    for name, values in {"RESOLUTIONS": (8, 16), "POINTS": (50, 500), "TAXELS": (4, 20)}.items():
+        monkeypatch.setattr(tradeoff, name, values)
+    out = tmp_path / "table.json"
+    found = run("tradeoff", "tactile", "--out", str(out), "--plot", str(tmp_path / "plot.png"), "--json")
+    assert found.status == 0, found.err
+    points = json.loads(found.out)["points"]
+    assert points == read_json(out)["points"]
+    errors = {
+        part: [p["error"] for p in points if p["part"] == part] for part in ("mesh", "points", "taxels", "primitive")
+    }
+    assert errors["mesh"][0] > errors["mesh"][1] > errors["mesh"][2]
+    assert errors["points"][0] > errors["points"][1]
+    assert errors["taxels"][0] > errors["taxels"][1]
+    assert errors["primitive"][0] < 1e-5
+    assert (tmp_path / "plot.png").stat().st_size > 5000
