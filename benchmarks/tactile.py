@@ -145,14 +145,14 @@ def measure(function: Callable[[], object], device: str, repeats: int, groups: i
     return statistics.median(seconds)
 
 
-def moving(engine: Any, suite: SensorSuite, steps: int = 40) -> float:
-    """Median seconds of an update on the processor while the scene moves."""
+def moving(engine: Any, suite: SensorSuite, steps: int) -> float:
+    """Median processor seconds of an update while the scene moves."""
     seconds = []
     for _ in range(steps):
         engine.step()
-        start = time.perf_counter()
+        start = time.process_time()
         suite.update(engine.state, engine.timestep)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     return statistics.median(seconds[3:])
 
 
@@ -212,13 +212,18 @@ def part_sensors(options: argparse.Namespace, record: Callable[..., None]) -> No
         seconds, suite = timed(where, config, state, options.device, options.repeats)
         held = suite.state_bytes
         scale = options.envs / 16384 * count / 100
-        ratio = seconds / (ROOFLINE[noise is not None] * scale) if name == "kinematic" else float("nan")
+        ratio = (
+            seconds / (ROOFLINE[noise is not None] * scale)
+            if name == "kinematic" and options.device != "cpu"
+            else float("nan")
+        )
         per = (held["sensors"] + held["shared"]) / count
         record(
             part="sensors", case=label, envs=options.envs, ms=seconds * 1e3, roofline_ratio=ratio, bytes_per_taxel=per
         )
         taxel = seconds / options.envs / count * 1e9
-        rows.append([label, f"{seconds * 1e3:.3f}", f"{taxel:.3g}", f"{ratio:.2f}", f"{per:.0f}"])
+        against = "–" if np.isnan(ratio) else f"{ratio:.2f}"
+        rows.append([label, f"{seconds * 1e3:.3f}", f"{taxel:.3g}", against, f"{per:.0f}"])
         print(*rows[-1], sep="  ", flush=True)
         del suite
     columns = ["sensor", "ms / update", "ns / taxel", "time / H200 roofline", "bytes / taxel"]
@@ -348,29 +353,31 @@ def part_scaling(options: argparse.Namespace, record: Callable[..., None]) -> No
 
 
 def part_peer(options: argparse.Namespace, record: Callable[..., None]) -> None:
-    """The same scene beside Genesis on the processor: rates of ``benchmarks/tactile_genesis.py``."""
+    """The same scene beside Genesis on the processor, by processor time, which other work does not lengthen."""
     lines = Path(options.genesis).read_text(encoding="utf-8").splitlines()
-    peer = {row["sensor"]: row["env_steps_per_s"] for row in map(json.loads, lines)}
-    envs, rows = 64, []
+    peer = {row["sensor"]: row["processor_us"] for row in map(json.loads, lines)}
+    envs, rows, steps = 64, [], 40
     engine = settle(envs, "cpu", options.settle)
-    alone = envs / measure(engine.step, "cpu", 10, 5)
+    start = time.process_time()
+    engine.step(1)
+    for _ in range(steps):
+        engine.step()
+    alone = (time.process_time() - start) / (steps + 1) / envs * 1e6
     for name in ("none", *CLASSES):
         if name not in peer:
             continue
-        rate, own, theirs = alone, float("nan"), float("nan")
+        cells = ["–"] * 3
+        whole = alone
         if name != "none":
-            suite = SensorSuite(engine.scene, sensors(name), num_envs=envs)
-            own = moving(engine, suite) / envs
-            rate = 1 / (1 / alone + own)
-            theirs = 1 / peer[name] - 1 / peer["none"]
-        record(
-            part="peer", case=name, ours=rate, genesis=peer[name], sensor_us=own * 1e6, genesis_sensor_us=theirs * 1e6
-        )
-        cells = [f"{own * 1e6:.1f}", f"{theirs * 1e6:.0f}", f"{theirs / own:.0f} ×"] if name != "none" else ["–"] * 3
-        rows.append([name, f"{rate:,.0f}", f"{peer[name]:,.0f}", f"{rate / peer[name]:.1f} ×", *cells])
+            own = moving(engine, SensorSuite(engine.scene, sensors(name), num_envs=envs), steps) / envs * 1e6
+            theirs, whole = peer[name] - peer["none"], alone + own
+            cells = [f"{own:.1f}", f"{theirs:.0f}", f"{theirs / own:.0f} ×"]
+        record(part="peer", case=name, ours_us=whole, genesis_us=peer[name])
+        rows.append([name, f"{whole:.0f}", f"{peer[name]:.0f}", f"{peer[name] / whole:.1f} ×", *cells])
         print(*rows[-1], sep="  ", flush=True)
-    columns = ["sensor", "ours, env-steps/s", "Genesis 1.4.5", "ratio", "our sensor, µs/env", "theirs", "ratio"]
-    finish(options, "Tactile sensors on the processor beside Genesis", table(columns, rows))
+    columns = ["sensor", "step and sensor, ours", "Genesis 1.4.5", "ratio", "sensor alone, ours", "Genesis", "ratio"]
+    body = "Processor µs per environment and step (all threads), 64 environments, 100 taxels, 500 points.\n\n"
+    finish(options, "Tactile sensors on the processor beside Genesis", body + table(columns, rows))
 
 
 def finish(options: argparse.Namespace, title: str, body: str) -> None:

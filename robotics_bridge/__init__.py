@@ -1,5 +1,5 @@
-"""The robotics bridge: brain-scored encoders as the tactile front end of robot hands.
+"""The robotics bridge: touch of robot hands, simulated in thousands of environments at once.
 
-This version holds no code yet; the tactile simulator and the policies come with later versions. The
-package exists so that its name and its import rules (models and the floor, never the reverse) stand.
+``physics`` fills one batched state (C MuJoCo on processors, MuJoCo Warp on a GPU), ``sensors`` reads it, ``hands`` says
+where the sensors sit. Imports ``brainbench.models`` and the floor, never the reverse.
 """
