@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import mimetypes
 import os
+import socket
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -55,11 +56,16 @@ def make_server(folder: str | os.PathLike[str], *, host: str = "127.0.0.1", port
             f"There is no leaderboard in {os.fspath(folder)!r}; build one with: brainbench leaderboard build RECORDS"
         )
     try:
-        return ThreadingHTTPServer((host, port), partial(_Handler, root=root, host=host))
+        kind = _Server6 if ":" in host else ThreadingHTTPServer
+        return kind((host, port), partial(_Handler, root=root, host=host))
     except OSError as error:
         raise UsageError(
             f"The address {host}:{port} cannot be had ({error.strerror or error}); choose another with --port."
         ) from error
+
+
+class _Server6(ThreadingHTTPServer):
+    address_family = socket.AF_INET6
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -123,6 +123,37 @@ def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, file
     assert {path.name for path in to.glob("*.json")} == {item["record"] for item in results}
 
 
+def test_a_folder_becomes_a_site_and_a_report_and_a_score_its_own(run, scored, files, tmp_path):  # noqa: F811
+    path, where = scored
+    site = tmp_path / "site"
+    assert json.loads(run("leaderboard", "build", str(path.parent), "--out", str(site), "--json").out)["records"] == 1
+    assert (site / "index.html").is_file()
+    result = run("leaderboard", "report", str(site), "--out", str(tmp_path / "r.md"), "--json")
+    assert [Path(name).suffix for name in json.loads(result.out)["files"][:2]] == [".md", ".bib"]
+    assert run("leaderboard", "report", str(site), "--format", "docx").status == 2
+    given = ("--stimuli", files["arrays"], "--recordings", where, *PARTS, "--out", files["out"])
+    result = run("score", files["model"], *given, "--report", str(tmp_path / "one.html"))
+    assert result.status == 0, result.err
+    assert "paper" in result.out
+    assert "<svg" in (tmp_path / "one.html").read_text()
+    record = max(path.parent.glob("*.json"), key=lambda item: item.stat().st_mtime)
+    assert "--report" not in read_record(record).score.provenance["command"]
+
+
+def test_a_served_leaderboard_prints_its_address_and_ends_quietly(run, scored, monkeypatch):
+    from http.server import ThreadingHTTPServer
+
+    def interrupted(self, poll_interval: float = 0.5) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
+    path, _ = scored
+    result = run("leaderboard", "serve", str(path.parent), "--port", "0")
+    assert result.status == 0, result.err
+    assert result.out.startswith("http://127.0.0.1:")
+    assert run("leaderboard", "serve", str(path.parent / "none")).status == 2
+
+
 def test_nothing_to_add_is_an_error(run):
     result = run("leaderboard", "add")
     assert result.status == 2

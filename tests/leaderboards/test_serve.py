@@ -90,6 +90,18 @@ def test_no_site_and_a_taken_port_are_said(server, tmp_path):
         make_server(tmp_path / "site", port=server.server_address[1])
 
 
+def test_loopback_has_a_sixth_version_too(server, tmp_path):
+    import socket
+
+    if not socket.has_ipv6:
+        pytest.skip("no IPv6 here")
+    try:
+        made = make_server(tmp_path / "site", host="::1", port=0)
+    except UsageError:
+        pytest.skip("no IPv6 loopback here")
+    made.server_close()
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("chromium"), reason="needs the chromium browser")
 def test_served_pages_work_and_nothing_hostile_runs(server):

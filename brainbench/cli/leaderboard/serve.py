@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from brainbench.cli._shared import JsonOption, emit
 
 
 def serve(
@@ -17,6 +21,7 @@ def serve(
         "127.0.0.1"
     ),
     port: Annotated[int, typer.Option(help="Port; 0 takes a free one.")] = 8000,
+    as_json: JsonOption = False,
 ) -> None:
     """Serve a leaderboard for local reading, without writing anything; stop it with Ctrl-C."""
     from brainbench.errors import DataFileNotFoundError
@@ -34,12 +39,9 @@ def serve(
         site = source if built else build_leaderboard(read_records(source), Path(folder) / "site").parent
         server = make_server(site, host=host, port=port)
         shown = f"[{host}]" if ":" in host else host
-        print(f"http://{shown}:{server.server_address[1]}/  (Ctrl-C ends)", flush=True)
-        if host not in LOOPBACK:
-            print("Other machines can read this.", flush=True)
-        try:
+        address = f"http://{shown}:{server.server_address[1]}/"
+        everyone = "" if host in LOOPBACK else "\nOther machines can read this."
+        emit({"address": address, "site": site}, f"{address}  (Ctrl-C ends){everyone}", as_json=as_json)
+        sys.stdout.flush()
+        with server, contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
-        except KeyboardInterrupt:
-            print("ended")
-        finally:
-            server.server_close()
