@@ -17,6 +17,7 @@ import json
 import logging
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tarfile
@@ -30,6 +31,10 @@ from zoo_jobs import Job, all_jobs
 
 _log = logging.getLogger("train_zoo")
 ROOT = Path(__file__).resolve().parent.parent
+CLOSING = 100.0
+"""Seconds before the end when training stops; then the last networks are evaluated, scored and packed."""
+ROLES = ("small", "full", "untrained")
+"""A process each per GPU: Python's threads would wait for one another's compilers and probes."""
 TAR_BYTES, TARS = 15 * 2**20, 4
 """What may come back: files of at most 16 MiB, 64 MiB in all."""
 
@@ -44,10 +49,12 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--limit", type=int, help="sweeps per object; all of them if not given")
     told.add_argument("--links", type=int, default=12)
     told.add_argument("--step", type=float, default=1e-3)
-    told.add_argument("--minutes", type=float, default=9.0, help="from start to end, packing included")
-    told.add_argument("--small-seconds", type=float, default=120.0, help="training time of a small job")
-    told.add_argument("--full-seconds", type=float, default=240.0, help="training time of a full-size job")
-    told.add_argument("--places", type=int, default=6, help="jobs at a time on a GPU; a full-size one takes 4")
+    told.add_argument("--minutes", type=float, default=9.4, help="from start to end, packing included")
+    told.add_argument("--end", type=float, help="the same as seconds since 1970: $(($(date +%%s) + 570)) of the shell")
+    told.add_argument("--last", action="store_true", help="no later call will go on: end every schedule in this one")
+    told.add_argument("--small-seconds", type=float, default=130.0, help="training time of a small job")
+    told.add_argument("--full-seconds", type=float, default=200.0, help="training time of a full-size job")
+    told.add_argument("--places", type=int, default=4, help="small jobs at a time on a GPU, beside a full-size one")
     told.add_argument("--precision", default="bf16")
     told.add_argument("--epochs", type=int, help="epochs at most, whatever the job says")
     told.add_argument("--only", help="substring of the names of jobs to train")
@@ -56,6 +63,7 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--no-score", action="store_true")
     told.add_argument("--device", default=None, help="cpu for a trial run; all GPUs if not given")
     told.add_argument("--worker", type=int, help=argparse.SUPPRESS)
+    told.add_argument("--role", help=argparse.SUPPRESS)
     told.add_argument("--score", type=Path, help=argparse.SUPPRESS)
     told.add_argument("--shards", help=argparse.SUPPRESS)
     told.add_argument("--until", type=float, help=argparse.SUPPRESS)
@@ -81,7 +89,8 @@ def main() -> None:
 def campaign(args: argparse.Namespace) -> None:
     """Make the data, start a process per GPU, wait, pack."""
     started = time.time()
-    args.until = started + 60 * args.minutes - 45  # what packing and the last scores take
+    end = args.end or started + 60 * args.minutes
+    args.until = end - CLOSING
     gpus = 0 if args.device == "cpu" else count_gpus()
     args.work.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(args.work / "claims", ignore_errors=True)
@@ -94,17 +103,38 @@ def campaign(args: argparse.Namespace) -> None:
     if args.data is None:
         args.data = make_data(args, gpus)
         _log.info("data after %.0f s", time.time() - started)
+    # Sessions of their own, so that the end ends what they started too.
     workers = [
-        subprocess.Popen(command(args, worker=index), env=environment(index if gpus else None))
+        subprocess.Popen(
+            command(args, worker=index, role=role), env=environment(index if gpus else None), start_new_session=True
+        )
         for index in range(max(1, gpus))
+        for role in ROLES
     ]
-    codes = [worker.wait() for worker in workers]
-    if scoring is not None:
-        scoring.wait()
-    if any(codes):
-        _log.error("workers ended with %s", codes)
-    pack(args.work, args.out)
+    seen: Any = None
+    while any(worker.poll() is None for worker in workers) and time.time() < end - 12:
+        time.sleep(5.0)
+        # What is done is packed at once: a cut then costs what was running alone.
+        if (found := written(args.work)) != seen:
+            seen = found
+            pack(args.work, args.out)
+    for worker in workers:
+        if worker.poll() is None:
+            _log.warning("a worker is not done at the end and is left behind")
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(worker.pid, signal.SIGKILL)
+    if scoring is not None and scoring.poll() is None:
+        scoring.kill()
+    for result in pack(args.work, args.out):
+        print(row(result))
     _log.info("everything after %.0f s", time.time() - started)
+
+
+def written(work: Path) -> list[tuple[str, float]]:
+    """Return which results and states there are, and since when."""
+    names = ("result.json", "record.json", "state.safetensors")
+    paths = sorted(path for name in names for path in (work / "jobs").glob(f"*/{name}"))
+    return [(str(path), path.stat().st_mtime) for path in paths]
 
 
 def count_gpus() -> int:
@@ -238,10 +268,12 @@ class Worker:
         self.device = torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
         self.deadline = time.monotonic() + args.until - time.time()
         self.gate = Gate()
-        self.free = args.places
+        self.places = args.places if args.role == "small" else 1
+        self.free = self.places
         self.changed = threading.Condition()
         self.scores: list[subprocess.Popen[bytes]] = []
-        self.jobs = [job for job in all_jobs() if not args.only or args.only in job.name][: args.jobs]
+        chosen = [job for job in all_jobs() if not args.only or args.only in job.name][: args.jobs]
+        self.jobs = [job for job in chosen if job.role == args.role]
 
     def run(self) -> None:
         import torch
@@ -250,22 +282,25 @@ class Worker:
         if self.device.type == "cuda":
             torch.backends.cudnn.benchmark = True
             torch.set_float32_matmul_precision("high")
+        sys.setswitchinterval(1e-4)
+        if not self.jobs:
+            return
         self.data = Resident(self.args.data, self.device)
         if self.device.type == "cuda":
             torch.cuda.synchronize()
-        _log.info("worker %s: %s", self.args.worker, self.data.summary())
+        _log.info("worker %s %s: %s", self.args.worker, self.args.role, self.data.summary())
         threads = []
         while time.monotonic() < self.deadline - 20:
             with self.changed:
                 job = next((item for item in self.jobs if not self._claimed(item)), None)
                 if job is None:
                     break
-                if job.slots > self.free and self.free < self.args.places:
+                if not self.free:
                     self.changed.wait(1.0)
                     continue
                 if not self._claim(job) or self._late(job):
                     continue
-                self.free -= job.slots
+                self.free -= 1
             thread = threading.Thread(target=self._train, args=(job,))
             thread.start()
             threads.append(thread)
@@ -273,15 +308,18 @@ class Worker:
             thread.join()
         for process in self.scores:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(max(1.0, self.deadline + 30 - time.monotonic()))
+                process.wait(max(1.0, self.deadline + CLOSING - 25 - time.monotonic()))
 
     def _late(self, job: Job) -> bool:
         """Whether too little time is left for a job to be worth beginning."""
-        needed = 20.0 if job.objective == "untrained" else 0.6 * self._budget(job)
+        needed = 0.6 * self._budget(job) if self.args.last and job.objective != "untrained" else 30.0
         return self.deadline - time.monotonic() < needed
 
     def _budget(self, job: Job) -> float:
-        return self.args.full_seconds if job.full else self.args.small_seconds
+        if job.full:
+            # The published sizes without recurrence over areas are ten times cheaper.
+            return self.args.full_seconds * (1.0 if job.model.startswith("zhuang") else 0.35)
+        return self.args.small_seconds
 
     def _claimed(self, job: Job) -> bool:
         return (self.args.work / "claims" / job.name).exists()
@@ -318,6 +356,7 @@ class Worker:
                     budget=self._budget(job),
                     deadline=self.deadline,
                     precision=self.args.precision,
+                    last_call=self.args.last,
                 )
         except Exception:  # noqa: BLE001 - one job must not take the others with it
             _log.exception("%s failed", job.name)
@@ -325,7 +364,7 @@ class Worker:
         if status in ("finished", "diverged") and not self.args.no_score:
             self.scores.append(subprocess.Popen(command(self.args, score=out), env=environment(None)))
         with self.changed:
-            self.free += job.slots
+            self.free += 1
             self.changed.notify_all()
 
 
@@ -345,8 +384,8 @@ def score(folder: Path) -> None:
     write_text(folder / "record.json", record.to_json() + "\n")
 
 
-def pack(work: Path, out: Path) -> None:
-    """Write what comes back, the most valuable first, and print the table."""
+def pack(work: Path, out: Path) -> list[dict[str, Any]]:
+    """Write what comes back, the most valuable first; return the results."""
     from brainbench.files import read_json, write_text
 
     out.mkdir(parents=True, exist_ok=True)
@@ -369,8 +408,7 @@ def pack(work: Path, out: Path) -> None:
     states = [folder / "state.safetensors" for folder in folders]
     others = [path for folder in folders if folder.name not in ship for path in sorted((folder / "best").glob("*"))]
     fill(out, work, [path for path in (*shipped, *records, *states, *others) if path.is_file()])
-    for result in results:
-        print(row(result))
+    return results
 
 
 def row(result: dict[str, Any]) -> str:
@@ -390,6 +428,8 @@ def row(result: dict[str, Any]) -> str:
 
 def fill(out: Path, work: Path, paths: list[Path]) -> None:
     """Put files into tar files of limited size, as many as fit, in order."""
+    from brainbench.files import atomic_path
+
     room = [TAR_BYTES] * TARS
     inside: list[list[Path]] = [[] for _ in room]
     left = 0
@@ -403,7 +443,7 @@ def fill(out: Path, work: Path, paths: list[Path]) -> None:
         inside[place].append(path)
     for index, chosen in enumerate(inside):
         if chosen:
-            with tarfile.open(out / f"zoo-{index}.tar", "w") as file:
+            with atomic_path(out / f"zoo-{index}.tar") as temporary, tarfile.open(temporary, "w") as file:
                 for path in chosen:
                     file.add(path, str(path.relative_to(work)))
     _log.info("%d files packed, %d left out", sum(map(len, inside)), left)

@@ -28,8 +28,6 @@ FULL = (
 )
 SEEDS = 3
 FULL_EPOCHS = 20
-SMALL_SLOTS, FULL_SLOTS = 1, 4
-"""How much of a GPU's places a job takes."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +50,9 @@ class Job:
         return "-small" not in self.model
 
     @property
-    def slots(self) -> int:
-        """How many places it takes."""
-        return FULL_SLOTS if self.full else SMALL_SLOTS
+    def role(self) -> str:
+        """Which process of a GPU does it."""
+        return "untrained" if self.objective == "untrained" else "full" if self.full else "small"
 
     @property
     def name(self) -> str:
@@ -84,6 +82,7 @@ class Job:
             seed=self.seed,
             batch_size=256,
             weights_dtype="float16",
+            probe_epochs=40,
         )
         return dataclasses.replace(chosen, compile="off")
 

@@ -37,6 +37,13 @@ from brainbench.models.training.state import load_state, save_state
 
 STATE, BEST, RESULT, LOG = "state.safetensors", "best", "result.json", "log.jsonl"
 EVALUATED = 512
+LARGEST = 100.0
+"""Sweeps with a force above 10 mN or a moment above 100 µN·m are failed simulations that were not noticed: usual sweeps
+stay five times below."""
+SAVED = 40.0
+"""Seconds between saved states."""
+CHUNK = 4
+"""Steps that are launched before a thread lets another one launch."""
 _log = logging.getLogger("train_zoo")
 _drawing = threading.Lock()
 """Initial weights come from PyTorch's own generator, which threads share."""
@@ -51,7 +58,7 @@ class Split:
         parts, labels = [], []
         for batch in data:
             part = batch.input / self.scale
-            good = (part.abs().flatten(1).amax(1) < 6e4).nonzero()[:, 0]  # what half precision cannot hold
+            good = (part.abs().flatten(1).amax(1) < LARGEST).nonzero()[:, 0]
             parts.append(part[good].half())
             labels.append(batch.label[good].clone())
         self.sweeps, self.labels = torch.cat(parts), torch.cat(labels)
@@ -112,6 +119,8 @@ class Trainer:
         self.rate = torch.zeros((), device=device)
         self.optimizer = make_optimizer(self.config.optimizer, self.learner.parameters(), self.config.learning_rate)
         make_capturable(self.optimizer, self.rate)
+        self.bad, self.skipped = torch.zeros(1, device=device), torch.zeros(1, device=device)
+        self.optimizer.found_inf = self.bad.view(())  # pyright: ignore[reportAttributeAccessIssue]
         self.trained = [parameter for parameter in self.learner.parameters() if parameter.requires_grad]
         self.augmentation = Augmentation(self.config.augmentation, self.config.masking)
         self.generator = torch.Generator(device).manual_seed(job.seed)
@@ -132,7 +141,8 @@ class Trainer:
 
     def prepare(self, alone: Any, together: Any, *, fused: bool = True, graphs: bool = True) -> None:
         """Warm up and capture the training step and the validation step; the network is as new afterwards."""
-        fuse(self.learner, fused and self.device.type == "cuda")
+        # The compiler cannot be used by several threads; full-size networks have a process of their own.
+        fuse(self.learner, fused and self.job.full and self.device.type == "cuda")
         start = {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
         self._set_epoch(0)
         self.learner.train()
@@ -153,9 +163,11 @@ class Trainer:
         with self._autocast():
             loss, _ = self.learner(self._views(x), labels)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
+        norm = torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
+        self.bad.copy_(1 - torch.isfinite(norm).float())  # the optimiser leaves such a step out
+        self.skipped.add_(self.bad)
         self.optimizer.step()
-        self.losses.index_copy_(0, self.cursor, loss.detach().float().view(1))
+        self.losses.index_copy_(0, self.cursor, torch.nan_to_num(loss.detach().float()).view(1))
         self.cursor.add_(1).remainder_(self.steps)
 
     def _check(self) -> None:
@@ -177,17 +189,15 @@ class Trainer:
     def _autocast(self) -> Any:
         return torch.autocast(self.device.type, dtype=torch.bfloat16) if self.precision == "bf16" else nullcontext()
 
-    def _set_epoch(self, epoch: int) -> None:
+    def _set_epoch(self, epoch: int, start: float = 0.0, stop: float = 0.01) -> None:
+        """Draw the order of an epoch that takes training from ``start`` to ``stop``, shares of its whole."""
         config = self.config
         generator = torch.Generator().manual_seed(job_seed(config.seed, epoch))
         order = torch.randperm(len(self.data.train), generator=generator)[: self.order.numel()]
         rates = [
             config.learning_rate
             * rate_factor(
-                config.schedule,
-                epoch + step / self.steps,
-                epochs=config.epochs,
-                warmup_epochs=config.warmup_epochs,
+                config.schedule, 100 * (start + (stop - start) * step / self.steps), epochs=100, warmup_epochs=10
             )
             for step in range(self.steps)
         ]
@@ -196,16 +206,27 @@ class Trainer:
         self.cursor.zero_()
         self.generator.manual_seed(job_seed(config.seed, epoch))
 
-    def train_epoch(self, launch: Any) -> float:
-        """Train one epoch; return its mean loss. ``launch`` is called around every launch of a step."""
-        started = time.monotonic()
+    def progress(self, budget: float, epochs: int, epoch_seconds: float) -> float:
+        """Return how far training is, from 0 to 1, by time or by epochs; what lacks less than half an epoch is done."""
+        done = max(self.seconds / budget, self.epoch / epochs)
+        return 1.0 if done + 0.5 * epoch_seconds / budget >= 1.0 or self.epoch >= epochs else done
+
+    def train_epoch(self, launch: Any, start: float, stop: float) -> float:
+        """Train one epoch; return its mean loss. ``launch`` is entered for every few launches.
+
+        Args:
+            launch: Context manager.
+            start, stop: Where the epoch lies in the schedule, from 0 to 1.
+        """
+        began = time.monotonic()
         with launch():
-            self._set_epoch(self.epoch)
+            self._set_epoch(self.epoch, start, min(stop, 1.0))
         self.learner.train()
         ahead: list[Any] = []
-        for _ in range(self.steps):
+        for first in range(0, self.steps, CHUNK):
             with launch():
-                self.step()
+                for _ in range(first, min(first + CHUNK, self.steps)):
+                    self.step()
                 if self.device.type == "cuda":
                     event = torch.cuda.Event()
                     event.record()
@@ -214,7 +235,7 @@ class Trainer:
                         ahead.pop(0).synchronize()
         with launch():
             loss = float(self.losses.mean())
-        self.seconds += time.monotonic() - started
+        self.seconds += time.monotonic() - began
         self.epoch += 1
         return loss
 
@@ -244,6 +265,7 @@ class Trainer:
             "best": self.best if math.isfinite(self.best) else None,
             "best_epoch": self.best_epoch,
             "seconds": self.seconds,
+            "skipped": float(self.skipped),
             "data": self.data.hash,
         }
         for group in self.optimizer.param_groups:
@@ -268,6 +290,7 @@ class Trainer:
             group.update({key: value for key, value in old.items() if key != "params"})
             group["lr"] = rate
         self.epoch, self.best_epoch, self.seconds = plain["epoch"], plain["best_epoch"], plain["seconds"]
+        self.skipped.fill_(plain["skipped"])
         self.best = plain["best"] if plain["best"] is not None else math.inf
 
     def finish(self, out: Path) -> dict[str, Any]:
@@ -372,17 +395,20 @@ def run_job(
     budget: float,
     deadline: float,
     precision: str = "bf16",
+    last_call: bool = False,
 ) -> str:
-    """Train a job to its end, or until the deadline; return ``finished``, ``stopped``, ``diverged`` or ``untrained``.
+    """Train a job to its end, or until the deadline; return ``finished`` or ``stopped``.
 
     Args:
         job, data, device: What, on what, where.
         out: The job's folder; a state in it is gone on with.
         exclusive, shared, long: Context managers: recording a graph is alone on the device; launches pause for it,
             long work does not.
-        budget: Seconds that the training may take; sets the number of epochs after the first one.
-        deadline: time.monotonic() at which it stops.
+        budget: Seconds that the training may take over all calls; the schedule ends with them, or with the job's
+            epochs if they come first.
+        deadline: time.monotonic() at which it stops and saves its state.
         precision: ``bf16`` or ``float32``.
+        last_call: Nobody will go on with it: let the schedule end at the deadline.
     """
     out.mkdir(parents=True, exist_ok=True)
     if (out / RESULT).is_file():
@@ -408,32 +434,32 @@ def run_job(
         log.write(json.dumps({"job": job.name, "epoch": trainer.epoch, **values}) + "\n")
         log.flush()
 
-    note(kind="start", prepared=prepared, steps=trainer.steps, epochs=trainer.config.epochs, precision=precision)
-    while trainer.epoch < trainer.config.epochs:
+    note(kind="start", prepared=prepared, steps=trainer.steps, precision=precision)
+    if last_call:
+        budget = min(budget, trainer.seconds + deadline - time.monotonic())
+    took, checked, saved, validating = 0.0, 0.0, time.monotonic(), 0.0
+    while (progress := trainer.progress(budget, job.epochs, took)) < 1.0:
         began = time.monotonic()
-        loss = trainer.train_epoch(shared)
-        took = time.monotonic() - began
-        if not math.isfinite(loss):
-            note(kind="diverged", loss=None)
-            break
-        if trainer.epoch == 1 and not state:
-            # Fixed once, so that the schedule is that of a run of so many epochs.
-            left = min(budget - took, deadline - time.monotonic() - 15)
-            epochs = max(2, min(job.epochs, 1 + int(left / max(took, 1e-9))))
-            if epochs < trainer.config.epochs:
-                trainer.config = dataclasses.replace(
-                    trainer.config, epochs=epochs, warmup_epochs=job.config(epochs).warmup_epochs
-                )
-        line: dict[str, Any] = {"kind": "epoch", "loss": loss, "seconds": took}
-        if trainer.epoch % max(1, trainer.config.epochs // 20) == 0 or trainer.epoch == trainer.config.epochs:
-            line["validation"] = trainer.validate(shared)
-        note(**line, epochs=trainer.config.epochs)
-        if time.monotonic() > deadline and trainer.epoch < trainer.config.epochs:
-            with exclusive():
+        if began > deadline:
+            with long():
                 trainer.save(out / STATE)
-            note(kind="stopped")
+            note(kind="stopped", progress=progress)
             return "stopped"
-    status = "finished" if trainer.epoch == trainer.config.epochs else "diverged"
+        ahead = max(progress + took / budget, (trainer.epoch + 1) / job.epochs)
+        loss = trainer.train_epoch(shared, progress, ahead)
+        took = time.monotonic() - began
+        line: dict[str, Any] = {"kind": "epoch", "loss": loss, "seconds": took, "progress": progress}
+        if trainer.epoch == 1 or trainer.progress(budget, job.epochs, took) >= min(1.0, checked + 0.1):
+            began = time.monotonic()
+            line["validation"], checked = trainer.validate(shared), progress
+            validating += time.monotonic() - began
+        note(**line, skipped=float(trainer.skipped))
+        if time.monotonic() - saved > SAVED:
+            with long():
+                trainer.save(out / STATE)
+            saved = time.monotonic()
+    trainer.config = dataclasses.replace(job.config(max(1, trainer.epoch)), precision=precision)
+    status, began = "finished", time.monotonic()
     with long():
         result = trainer.finish(out)
     result |= {
@@ -442,6 +468,13 @@ def run_job(
         "sweeps_per_second": trainer.steps * trainer.order.shape[1] * trainer.epoch / max(trainer.seconds, 1e-9),
         "best": trainer.best,
         "precision": precision,
+        "skipped_steps": float(trainer.skipped),
+        "seconds": {
+            "prepare": prepared,
+            "train": trainer.seconds,
+            "validate": validating,
+            "probe and evaluate": time.monotonic() - began,
+        },
     }
     write_json(out / RESULT, result)
     note(kind="finished", top1=result["evaluation"]["top1"])

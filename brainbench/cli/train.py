@@ -39,7 +39,8 @@ def train(
     masking: Annotated[float | None, typer.Option(help="Share of masked time steps (published with 0.75).")] = None,
     precision: Annotated[str | None, typer.Option(help="bf16 (mixed), float32, or auto: bf16 on CUDA.")] = None,
     compile: Annotated[
-        str | None, typer.Option(help="off, parts (of the network), default (the whole) or graphs (whole steps as CUDA graphs).")
+        str | None,
+        typer.Option(help="off, parts (of the network), default (the whole) or graphs (whole steps as CUDA graphs)."),
     ] = None,
     weights_dtype: Annotated[
         str | None, typer.Option(help="Precision of the model that is written: float32, float16 or bfloat16.")
