@@ -1,0 +1,284 @@
+"""The network of a policy as a model class of rsl_rl: groups of observations → encoders → head → actions.
+
+Name it in a configuration as ``class_name="robotics_bridge.policies.student:TactilePolicy"``. Each flat group passes an
+encoder of its own, ``tactile`` [B, S, N, C] one of :mod:`~robotics_bridge.policies.encoders`; the head is a multilayer
+perceptron. All memory is one array [1, B, H], as rsl_rl stores it, and exports are complete: normalisers, taxel grid,
+encoder, head and memory. Letters: B batch, T time, H state, D latent, A action.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.utils import unpad_trajectories
+from torch import nn
+
+from brainbench.errors import UsageError, unknown_name
+from robotics_bridge.policies.encoders import EncoderConfig, TactileEncoder
+
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
+TACTILE = "tactile"
+"""Name of the group of readings."""
+EMBEDDERS = ("none", "mlp", "lstm")
+_EMBEDDING, _WIDTHS, _LSTM = 64, (512, 256, 128), 128
+"""Of flat groups (thesis, section 4.3.4)."""
+
+
+class GroupEncoder(nn.Module):
+    """The embedding of a flat group: nothing, an MLP [512, 256, 128] → 64, or an LSTM 128 → 64."""
+
+    def __init__(self, size: int, kind: str) -> None:
+        super().__init__()
+        if kind not in EMBEDDERS:
+            raise unknown_name("encoder of a flat group", kind, EMBEDDERS)
+        self.features, self.state_size = (_EMBEDDING, 0) if kind != "none" else (size, 0)
+        self.cell: nn.LSTMCell | None = None
+        self.net: nn.Module = nn.Identity()
+        if kind == "mlp":
+            sizes = (size, *_WIDTHS)
+            layers = [part for a, b in zip(sizes, _WIDTHS, strict=False) for part in (nn.Linear(a, b), nn.ELU())]
+            self.net = nn.Sequential(*layers, nn.Linear(_WIDTHS[-1], _EMBEDDING))
+        elif kind == "lstm":
+            self.cell, self.net = nn.LSTMCell(size, _LSTM), nn.Linear(_LSTM, _EMBEDDING)
+            self.state_size = 2 * _LSTM
+
+    def forward(self, x: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding, h_out)."""
+        if self.cell is None:
+            return self.net(x), h_in
+        hidden, memory = h_in.chunk(2, 1)
+        hidden, memory = self.cell(x, (hidden, memory))
+        return self.net(hidden), torch.cat((hidden, memory), 1)
+
+
+class PolicyCore(nn.Module):
+    """Observations → latent, one step, all memory in one array.
+
+    Args:
+        sizes: Flat group → its length, in order.
+        embedder: Encoder of flat groups.
+        tactile: Encoder of touch, or None.
+    """
+
+    def __init__(self, sizes: Mapping[str, int], embedder: str, tactile: TactileEncoder | None) -> None:
+        super().__init__()
+        self.groups = tuple(sizes)
+        self.embedders = nn.ModuleList(GroupEncoder(size, embedder) for size in sizes.values())
+        self.tactile: TactileEncoder | None = tactile
+        self.splits: list[int] = [*(int(part.state_size) for part in self.embedders)]  # type: ignore[arg-type]
+        self.splits.append(tactile.state_size if tactile is not None else 0)
+        # Runtimes know no empty arrays, so a policy without memory carries one number that stays zero.
+        self.splits.append(0 if sum(self.splits) else 1)
+        self.state_size: int = sum(self.splits)
+        """H."""
+        self.features: int = sum(int(part.features) for part in self.embedders)  # type: ignore[arg-type]
+        self.features += tactile.features if tactile is not None else 0
+
+    def forward(
+        self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor, *, kept: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (latent [B, D], h_out [B, H]).
+
+        Args:
+            flat: Normalised flat groups.
+            taxels: Readings [B, S, N, C]; or the features that a frozen encoder gave for them, with ``kept``.
+            h_in: Memory.
+            kept: ``taxels`` holds features; the memory of touch is then left as it is.
+        """
+        states = list(h_in.split(self.splits, 1))
+        parts = []
+        for index, (embed, x) in enumerate(zip(self.embedders, flat, strict=True)):
+            y, states[index] = embed(x, states[index])
+            parts.append(y)
+        if self.tactile is not None and taxels is not None:
+            if kept:
+                parts.append(self.tactile.embed(taxels))
+            else:
+                y, states[-2] = self.tactile(taxels, states[-2])
+                parts.append(y)
+        return torch.cat(parts, 1), torch.cat(states, 1)
+
+
+class TactilePolicy(MLPModel):
+    """A policy that feels; a drop-in for rsl_rl's models.
+
+    Args:
+        obs: Observations of the environment, for their shapes.
+        obs_groups: Observation set → groups.
+        obs_set: The set that this model reads.
+        output_dim: A.
+        hidden_dims: Of the head.
+        activation: Of the head.
+        obs_normalization: Normalise flat groups by their running mean and deviation.
+        distribution_cfg: Of the actions' distribution, as rsl_rl takes it.
+        tactile: Fields of :class:`~robotics_bridge.policies.encoders.EncoderConfig`; needed when the set has touch.
+        embedder: Encoder of flat groups: ``none``, ``mlp`` or ``lstm``.
+
+    Raises:
+        UsageError: touch and its encoder do not fit.
+    """
+
+    is_recurrent: bool = True
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        hidden_dims: tuple[int, ...] | list[int] = (512, 256, 128),
+        activation: str = "elu",
+        obs_normalization: bool = True,
+        distribution_cfg: dict | None = None,
+        *,
+        tactile: Mapping[str, Any] | None = None,
+        embedder: str = "mlp",
+    ) -> None:
+        names = list(obs_groups[obs_set])
+        touch = TACTILE in names
+        if touch and tactile is None:
+            raise UsageError("The observations hold touch; name its encoder with tactile={'name': …}.")
+        config = EncoderConfig.of(tactile) if touch and tactile is not None else None
+        encoder = config.build() if config is not None else None
+        if encoder is not None and tuple(obs[TACTILE].shape[1:]) != encoder.shape:
+            raise UsageError(
+                f"The tactile encoder for {encoder.config.observe}, {encoder.config.placement}, "
+                f"{encoder.config.resolution} reads [sub-steps, items, channels] = {list(encoder.shape)}; the "
+                f"environment gives {list(obs[TACTILE].shape[1:])}."
+            )
+        core = PolicyCore({name: obs[name].shape[-1] for name in names if name != TACTILE}, embedder, encoder)
+        self._latent_size = core.features
+        super().__init__(
+            obs, obs_groups, obs_set, output_dim, hidden_dims, activation, obs_normalization, distribution_cfg
+        )
+        self.core: PolicyCore = core
+        self.config: dict[str, Any] = {
+            "tactile": config.plain() if config is not None else None,
+            "embedder": embedder,
+            "hidden_dims": list(hidden_dims),
+            "activation": activation,
+            "obs_normalization": obs_normalization,
+            "distribution_cfg": copy.deepcopy(distribution_cfg),
+        }
+        """How to build it again."""
+        self._state: torch.Tensor | None = None
+
+    @property
+    def touch(self) -> bool:
+        """Whether the policy reads touch."""
+        return self.core.tactile is not None
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every group that it reads, per environment."""
+        found: dict[str, tuple[int, ...]] = {
+            name: (size,) for name, size in zip(self.obs_groups, self._sizes, strict=True)
+        }
+        if self.core.tactile is not None:
+            found[TACTILE] = self.core.tactile.shape
+        return found
+
+    def advance(
+        self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (latent [B, D], h_out [B, H]) of one step; nothing is remembered in the model.
+
+        Args:
+            obs: Groups.
+            h_in: Memory [B, H]; zeros before the first step.
+            features: What the frozen encoder gave for this step, instead of its readings.
+        """
+        flat = self._normalised(obs)
+        if features is not None:
+            return self.core(flat, features, h_in, kept=True)
+        return self.core(flat, obs[TACTILE] if self.touch else None, h_in)
+
+    def _normalised(self, obs: Any) -> list[torch.Tensor]:
+        if not self.obs_groups:
+            return []
+        return list(self.obs_normalizer(torch.cat([obs[name] for name in self.obs_groups], -1)).split(self._sizes, -1))
+
+    def action_of(self, latent: torch.Tensor) -> torch.Tensor:
+        """Return the deterministic actions [B, A] of a latent."""
+        output = self.mlp(latent)
+        return output if self.distribution is None else self.distribution.deterministic_output(output)
+
+    def zeros(self, batch: int) -> torch.Tensor:
+        """Return the memory [B, H] before the first step."""
+        like = next(self.parameters())
+        return torch.zeros(batch, self.core.state_size, device=like.device, dtype=like.dtype)
+
+    def get_latent(self, obs: Any, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
+        """Return the latent: of a step (the model remembers), or of padded sequences [T, B, …] when masks are given."""
+        if masks is None:
+            if self._state is None:
+                self._state = self.zeros(len(obs[next(iter(self.shapes))]))[None]
+            latent, state = self.advance(obs, self._state[0])
+            self._state = state[None]
+            return latent
+        if hidden_state is None:
+            raise UsageError("Sequences need the hidden state in which they begin.")
+        state, found = hidden_state[0], []
+        for step in range(masks.shape[0]):
+            latent, state = self.advance({name: obs[name][step] for name in self.shapes}, state)
+            found.append(latent)
+        return unpad_trajectories(torch.stack(found), masks)  # type: ignore[return-value]
+
+    def reset(self, dones: torch.Tensor | None = None, hidden_state: Any = None) -> None:
+        """Forget: all environments, or those that are done; or take a given memory [1, B, H]."""
+        if dones is None:
+            self._state = hidden_state
+        elif self._state is not None:
+            done = dones.view(-1).bool()
+            self._state = torch.where(done[None, :, None], torch.zeros_like(self._state), self._state)
+
+    def get_hidden_state(self) -> Any:
+        """Return the memory [1, B, H]; zeros of one row before the first step of a model that was never run."""
+        return self._state
+
+    def detach_hidden_state(self, dones: torch.Tensor | None = None) -> None:
+        """Cut the memory (of environments that are done) off the computation before."""
+        if self._state is not None:
+            kept = self._state if dones is not None else self._state.detach()
+            if dones is not None:
+                kept = torch.where(dones.view(1, -1, 1).bool(), self._state.detach(), self._state)
+            self._state = kept
+
+    def update_normalization(self, obs: Any) -> None:
+        """Take observations [..., B, …] into account in the normalisers; touch may be left out."""
+        if self.obs_normalization and self.obs_groups:
+            flat = torch.cat([obs[name].reshape(-1, obs[name].shape[-1]) for name in self.obs_groups], -1)
+            self.obs_normalizer.update(flat)  # type: ignore[operator]
+        if self.core.tactile is not None and TACTILE in obs.keys():  # noqa: SIM118 - a TensorDict has no other "in"
+            self.core.tactile.observe_scale(obs[TACTILE].reshape(-1, 1, *self.core.tactile.shape))
+
+    def as_jit(self) -> nn.Module:
+        """Return a scriptable module: forward(obs [1, all groups flattened, in order]) → actions; it remembers."""
+        from robotics_bridge.policies.exported import JitPolicy
+
+        return JitPolicy(self)
+
+    def as_onnx(self, verbose: bool = False) -> nn.Module:
+        """Return a module of one step for ONNX: (group …, h_in) → (actions, h_out)."""
+        from robotics_bridge.policies.exported import StepPolicy
+
+        return StepPolicy(self)
+
+    def _get_obs_dim(self, obs: Any, obs_groups: dict[str, list[str]], obs_set: str) -> tuple[list[str], int]:
+        names = [name for name in obs_groups[obs_set] if name != TACTILE]
+        for name in names:
+            if obs[name].ndim != 2:
+                raise UsageError(f"The group {name!r} must be flat [B, n]; received {list(obs[name].shape)}.")
+        # A list of numbers may stand before nn.Module is ready; modules may not.
+        self._sizes = [int(math.prod(obs[name].shape[1:])) for name in names]
+        return names, sum(self._sizes)
+
+    def _get_latent_dim(self) -> int:
+        return self._latent_size
