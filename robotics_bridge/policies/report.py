@@ -1,0 +1,233 @@
+"""Compare distilled students: success with intervals over seeds, per task, observation type and encoder.
+
+A student's folder holds ``evaluation.json``: a list of evaluations, one per evaluation seed, each with ``seed``,
+``success`` and ``metric`` (one number per episode). Students that differ only in their training seed belong together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brainbench.errors import DataError, DataFileNotFoundError
+from brainbench.files import content_hash, provenance, read_json
+from brainbench.types import Interval, ModelCard, ResultRecord, Score, SubjectScore
+from robotics_bridge.policies.distill_config import DistillConfig
+
+EVALUATION = "evaluation.json"
+FEWEST_SEEDS = 3
+"""Training seeds below which an interval says little about a new student."""
+
+
+@dataclass(frozen=True)
+class StudentResult:
+    """Students that differ in their training seed only."""
+
+    config: DistillConfig
+    """Of the first of them."""
+    seeds: tuple[int, ...]
+    """Training seeds."""
+    success: tuple[float, ...]
+    """Share of successful episodes, per training seed."""
+    episodes: int
+    """In all."""
+    metric: float
+    """Mean of the task's own metric."""
+    interval: Interval | None
+    """Of the mean success."""
+    note: str
+    """What the interval does not cover; empty if nothing."""
+    difference: Interval | None = None
+    """Of the success beyond that of ``none``, over training seeds in common."""
+
+    @property
+    def value(self) -> float:
+        """Mean success."""
+        return float(np.mean(self.success))
+
+
+def read_results(folders: Iterable[str | Path]) -> list[StudentResult]:
+    """Return the results of all evaluated students below some folders, best first within each task and hand.
+
+    Raises:
+        DataFileNotFoundError: no student was evaluated there.
+        DataError: an evaluation is damaged.
+    """
+    groups: dict[str, list[tuple[DistillConfig, list[dict[str, Any]]]]] = defaultdict(list)
+    for root in folders:
+        for path in sorted(Path(root).rglob(EVALUATION)):
+            described = read_json(path.parent / "config.json")
+            if not isinstance(described, dict) or not isinstance(described.get("distill"), dict):
+                continue
+            config = DistillConfig.of(described["distill"])
+            groups[config.name.rpartition("_seed")[0]].append((config, _evaluations(path)))
+    if not groups:
+        raise DataFileNotFoundError(
+            "No evaluated student was found; brainbench policy distill evaluates what it has trained."
+        )
+    results = [_result(members) for members in groups.values()]
+    bare = {(r.config.task, r.config.hand): r for r in results if r.config.observe == "none"}
+    found = [_against(result, bare.get((result.config.task, result.config.hand))) for result in results]
+    return sorted(found, key=lambda r: (r.config.task, r.config.hand, -r.value, r.config.name))
+
+
+def _evaluations(path: Path) -> list[dict[str, Any]]:
+    found = read_json(path)
+    if not isinstance(found, list) or not found:
+        raise DataError(f"{str(path)!r} is no list of evaluations.")
+    for item in found:
+        if not isinstance(item, dict) or not item.get("success") or "seed" not in item:
+            raise DataError(f"{str(path)!r} holds an evaluation without 'seed' or 'success'.")
+    return found
+
+
+def _result(members: Sequence[tuple[DistillConfig, list[dict[str, Any]]]]) -> StudentResult:
+    members = sorted(members, key=lambda member: member[0].seed)
+    shares = [float(np.mean([np.mean(item["success"]) for item in found])) for _, found in members]
+    every = [item for _, found in members for item in found]
+    metrics = np.concatenate([np.asarray(item.get("metric") or [math.nan], dtype=float) for item in every])
+    if len(members) > 1:
+        interval = t_interval(shares, f"t over {len(members)} training seeds")
+        note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
+    else:
+        parts = [float(np.mean(item["success"])) for item in every]
+        interval = t_interval(parts, f"t over {len(parts)} evaluation seeds")
+        note = "one training seed: the interval covers chance in evaluation alone"
+    episodes = sum(len(item["success"]) for item in every)
+    seeds = tuple(config.seed for config, _ in members)
+    finite = metrics[np.isfinite(metrics)]
+    metric = float(finite.mean()) if len(finite) else math.nan
+    return StudentResult(members[0][0], seeds, tuple(shares), episodes, metric, interval, note)
+
+
+def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult:
+    if bare is None or bare is result:
+        return result
+    own, other = (dict(zip(r.seeds, r.success, strict=True)) for r in (result, bare))
+    common = sorted(set(own) & set(other))
+    gains = [own[seed] - other[seed] for seed in common]
+    return replace(result, difference=t_interval(gains, f"paired t over {len(common)} training seeds"))
+
+
+def t_interval(values: Sequence[float], method: str, level: float = 0.95) -> Interval | None:
+    """Return the t interval of a mean; None for fewer than two values."""
+    from scipy.special import stdtrit
+
+    if len(values) < 2:
+        return None
+    half = float(stdtrit(len(values) - 1, (1 + level) / 2) * np.std(values, ddof=1) / math.sqrt(len(values)))
+    mean = float(np.mean(values))
+    return Interval(mean - half, mean + half, level, method)
+
+
+COLUMNS = ("task", "hand", "touch", "placement", "resolution", "noise", "encoder", "seeds", "success", "over none")
+
+
+def rows(results: Sequence[StudentResult]) -> list[list[str]]:
+    """Return the table of the results as text, in the order of :data:`COLUMNS`."""
+    found = []
+    for result in results:
+        config, tactile = result.config, result.config.tactile
+        gain = result.difference
+        where = ["–", "–", "–", "–"]
+        if tactile is not None:
+            learning = f" ({tactile.learning})" if "learning" in config.encoder_settings else ""
+            where = [config.placement, config.resolution, "noisy" if config.noisy else "clean", tactile.arm + learning]
+        found.append(
+            [
+                config.task, config.hand, config.observe, *where, str(len(result.seeds)),
+                f"{result.value:.3f}{_span(result.interval)}",
+                "–" if gain is None else f"{(gain.low + gain.high) / 2:+.3f}{_span(gain)}",
+            ]
+        )  # fmt: skip
+    return found
+
+
+def _span(interval: Interval | None) -> str:
+    return "" if interval is None else f" [{interval.low:.3f}, {interval.high:.3f}]"
+
+
+def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
+    """Return one result record per group of students, for a leaderboard.
+
+    A board is a task on a hand: its recordings are the evaluation protocol, its animals the training seeds. A record
+    is ``unreliable`` where fewer than :data:`FEWEST_SEEDS` students were trained.
+    """
+    found = []
+    for result in results:
+        config, tactile = result.config, result.config.tactile
+        protocol = {"task": config.task, "hand": config.hand, "variant": config.variant}
+        source = f"{config.task} on {config.hand} ({config.variant})"
+        name = config.name.rpartition("_seed")[0]
+        score = Score(
+            name=name,
+            value=result.value,
+            status="unreliable" if result.note else "ok",
+            reasons=(result.note,) if result.note else (),
+            interval=result.interval,
+            subjects=tuple(
+                SubjectScore(f"seed {seed}", share, math.nan, math.nan)
+                for seed, share in zip(result.seeds, result.success, strict=True)
+            ),
+            estimator="policy-success",
+            metric="share of successful episodes",
+            provenance={
+                **provenance(),
+                "recordings": {"source": source, "content_hash": content_hash(protocol)},
+                "settings": {"episodes": result.episodes, "metric": result.metric, **config.plain()},
+                "command": f"brainbench policy distill {config.task} --observe {config.observe}",
+            },
+        )
+        card = ModelCard(
+            name=name, family="policy", objective="distillation", seed=config.seed,
+            encoder=tactile.arm if tactile is not None else None, attender="none",
+        )  # fmt: skip
+        found.append(ResultRecord(score, card=card))
+    return found
+
+
+def draw(results: Sequence[StudentResult], path: str | Path) -> Path:
+    """Draw success with intervals, one panel per task and hand."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    panels: dict[tuple[str, str], list[StudentResult]] = defaultdict(list)
+    for result in results:
+        panels[result.config.task, result.config.hand].append(result)
+    longest = max(len(found) for found in panels.values())
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(1.2 + 4.6 * len(panels), 1.2 + 0.32 * longest), squeeze=False, layout="constrained"
+    )
+    for axis, ((task, hand), found) in zip(axes[0], panels.items(), strict=True):
+        for height, result in enumerate(reversed(found)):
+            low, high = (result.value,) * 2 if result.interval is None else (result.interval.low, result.interval.high)
+            color = "0.55" if result.config.observe == "none" else "tab:blue"
+            axis.plot([low, high], [height, height], color=color, lw=1.5)
+            axis.plot(result.success, [height] * len(result.success), ".", color="0.75", ms=4)
+            axis.plot(result.value, height, "o", color=color, ms=5)
+        labels = [_label(result) for result in reversed(found)]
+        axis.set_yticks(range(len(found)), labels, fontsize=7)
+        axis.set_xlabel("share of successful episodes")
+        axis.set_title(f"{task}, {hand}", fontsize=9)
+        axis.spines[["top", "right"]].set_visible(False)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+    return path
+
+
+def _label(result: StudentResult) -> str:
+    config, tactile = result.config, result.config.tactile
+    if tactile is None:
+        return "none"
+    noise = ", noisy" if config.noisy else ""
+    return f"{config.observe}, {config.placement}, {config.resolution}{noise}\n{tactile.arm}"
