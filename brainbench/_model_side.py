@@ -225,12 +225,19 @@ def _baseline_input(stimuli: Stimuli) -> NDArray[np.floating]:
 
 def _with_weights(module: torch.nn.Module, card: ModelCard) -> Candidate:
     """Fill in the card what the weights tell."""
-    from brainbench.files import content_hash
+    import torch
 
-    state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
-    digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
+    from brainbench.files import content_hash
     from brainbench.models.diagram import graph_of
 
+    lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
+    if lazy:
+        raise UsageError(
+            f"{card.name} has lazy layers without weights yet ({', '.join(lazy[:3])}): run it once, on zeros of shape "
+            "[1, 22, 30, 5, 7] for instance, before you return it."
+        )
+    state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
+    digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
     count = sum(parameter.numel() for parameter in module.parameters())
     return Candidate(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
 

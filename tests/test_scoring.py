@@ -228,6 +228,13 @@ def test_a_model_whose_input_does_not_fit_says_what_it_was_given(recordings: xr.
         brainbench.score(nn.Linear(3, 2), recordings=recordings, stimuli=str(arrays))
 
 
+def test_a_lazy_layer_without_weights_is_named():
+    with pytest.raises(
+        UsageError, match=r"Sequential has lazy layers without weights yet \(1\.weight, 1\.bias\): run it"
+    ):
+        brainbench.score(nn.Sequential(nn.Flatten(), nn.LazyLinear(3)))
+
+
 def test_other_things_are_no_models():
     with pytest.raises(UsageError, match="received int"):
         brainbench.score(3)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, table
+from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,12 +23,13 @@ app = typer.Typer(no_args_is_help=True, help="Inspect, check, copy and fetch neu
 
 @app.command("inspect")
 def inspect(
-    path: Annotated[Path, typer.Argument(help="An NWB file or a file in our HDF5 layout.")], as_json: JsonOption = False
+    path: Annotated[Path, typer.Argument(help="'demo', an NWB file or a file in our HDF5 layout.")],
+    as_json: JsonOption = False,
 ) -> None:
     """Show what a file holds and which --conditions could label its trials."""
     from brainbench.datasets import inspect as inspect_file
 
-    inspection = inspect_file(path)
+    inspection = inspect_file(_found(str(path)))
     emit(inspection, str(inspection), as_json=as_json)
 
 
@@ -50,7 +51,8 @@ def rdm(
     from brainbench._brain_side import brain_side
     from brainbench.datasets import pooled
 
-    brain = brain_side(source, conditions=conditions, select=select, window=window, progress=None)
+    with progress_bar() as progress:
+        brain = brain_side(source, conditions=conditions, select=select, window=window, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, time="mean", seed=seed)
@@ -86,7 +88,7 @@ def rdm(
 
 @app.command("check")
 def check(
-    source: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
+    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
     conditions: Annotated[
         str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] whose labels are checked; the recipe's by default.")
     ] = None,
@@ -100,7 +102,7 @@ def check(
     """
     from brainbench.datasets import check as check_files
 
-    checkup = check_files(source, conditions=conditions)
+    checkup = check_files(_found(source), conditions=conditions)
     data = {
         "verdict": checkup.verdict,
         "source": checkup.source,
@@ -114,7 +116,7 @@ def check(
 
 @app.command("export")
 def export(
-    source: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
+    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
     target: Annotated[Path, typer.Argument(help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")],
     select: SelectOption = None,
     as_json: JsonOption = False,
@@ -122,7 +124,7 @@ def export(
     """Write a small copy without raw data: spike times and tables. Scores of the copy are identical."""
     from brainbench.datasets import export as export_files
 
-    files = export_files(source, target, select=select)
+    files = export_files(_found(source), target, select=select)
     rows = [[str(path), f"{path.stat().st_size / 1e6:.2f} MB"] for path in files]
     emit({"files": files}, table("", ["file", ""], rows, right=(1,)), as_json=as_json)
 
@@ -139,6 +141,16 @@ def fetch(
 
     folder = fetch_files(name, out, assets=assets)
     emit({"folder": folder}, str(folder), as_json=as_json)
+
+
+def _found(source: str) -> str:
+    """Return a source as the files' readers take it: the demo recordings by their folder."""
+    if source != "demo":
+        return source
+    from brainbench._brain_side import demo_recordings
+
+    with progress_bar() as progress:
+        return str(demo_recordings(progress=progress))
 
 
 def _verdict(animal: SubjectRDM) -> str:

@@ -19,6 +19,9 @@ from brainbench.errors import DataError, UsageError
 UNIT_COLUMNS = {"depth": float, "layer": str, "inhibitory": float}
 """Unit columns carried along where present, with the type that can say "missing"."""
 
+_MOST_COUNTS = 1 << 32
+"""Counts of one session that are made at most: 16 GiB."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -192,7 +195,7 @@ def count(
         counts [R, T, U] (float32) and duration [R, T] (s).
 
     Raises:
-        UsageError: the bin is not positive.
+        UsageError: the bin is not positive, or so narrow that the counts would not fit in memory.
     """
     span = edges[:, 1] - edges[:, 0]
     if bin is None:
@@ -203,6 +206,11 @@ def count(
         longest = max([length or 0.0, *span.tolist()])
         # Rounding must not add an empty bin when the length is a whole number of bins.
         number = max(1, math.ceil(longest / bin - 1e-6))
+        if number * len(edges) * max(1, len(spikes)) > _MOST_COUNTS:
+            raise UsageError(
+                f"A bin of {bin:g} s cuts windows of up to {longest:g} s into {number:,} bins; with {len(edges):,} "
+                f"trials and {len(spikes):,} units that is more than {_MOST_COUNTS:,} counts. Take wider bins."
+            )
         bounds = np.minimum(edges[:, :1] + bin * np.arange(number + 1), edges[:, 1:])
         bounds[:, -1] = edges[:, 1]
     duration = np.diff(bounds, axis=1)

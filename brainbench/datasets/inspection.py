@@ -245,6 +245,7 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
         yield f"  processing/{name}: {', '.join(contents)}"
     for item in session.acquired:
         shape = " × ".join(map(str, item.shape))
-        yield f"  {item.name} ({item.kind}): {shape} samples, {item.gigabytes:.3g} GB, not read"
+        size = f"{item.gigabytes:.3g} GB" if item.gigabytes >= 0.1 else f"{item.gigabytes * 1e3:.3g} MB"
+        yield f"  {item.name} ({item.kind}): {shape} samples, {size}, not read"
     for item in (*session.missing, *session.notes):
         yield f"  ! {item}"

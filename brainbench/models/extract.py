@@ -65,8 +65,8 @@ def extract(
             into memory.
 
     Raises:
-        UsageError: a layer does not exist or gives nothing per stimulus, or the model cannot process
-            the stimuli; the message says what it was given and what it failed with.
+        UsageError: a layer does not exist or gives nothing per stimulus, no layer does, or the model cannot
+            process the stimuli; the message says what it was given and what it failed with.
     """
     import torch
 
@@ -93,6 +93,11 @@ def extract(
                         f"{list(rows.shape[1:])}; give stimuli of one length or leave this layer out."
                     )
                 result[name][start:stop] = rows
+    if not result:
+        raise UsageError(
+            f"Nothing in {type(model).__name__} gives an activation per stimulus: no output of it or of its parts has "
+            f"the {len(values)} stimuli as its first axis. Return [B, ...] for stimuli [B, T, C, H, W]."
+        )
     for name, activity in result.items():
         if isinstance(activity, np.memmap):
             activity.flush()

@@ -51,6 +51,13 @@ def test_sessions_and_animals_are_pooled_on_request(run, folder, pool, names):
     assert run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", "al").status == 2
 
 
+def test_the_demo_recordings_can_be_looked_into_and_checked(run):
+    assert "trials:stimulus" in run("recordings", "inspect", "demo").out
+    result = run("recordings", "check", "demo")
+    assert result.status == 0
+    assert "6 sessions, 0 errors" in result.out
+
+
 def test_fetching_without_the_client_says_how_to_get_it(run, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     result = run("recordings", "fetch", "rodgers", "--out", str(tmp_path / "data"))

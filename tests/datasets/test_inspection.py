@@ -50,7 +50,7 @@ def test_signals_are_listed_and_a_broken_link_hides_nothing(tmp_path):
         file["acquisition/behavior/touch"].attrs["neurodata_type"] = "TimeSeries"
         file["acquisition/voltage"] = h5py.ExternalLink("not-here.h5", "/voltage")
     report = inspect(path)
-    assert "acquisition/behavior/touch (TimeSeries): 1000 × 2 samples, 1.6e-05 GB, not read" in str(report)
+    assert "acquisition/behavior/touch (TimeSeries): 1000 × 2 samples, 0.016 MB, not read" in str(report)
     assert report.sessions[0].units.spikes == 120
 
 

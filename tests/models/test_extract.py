@@ -226,6 +226,15 @@ def test_nothing_to_extract_from_is_an_error(x, chunk):
         extract(nn.Flatten(2), x, chunk=chunk)
 
 
+def test_a_model_that_forgets_its_stimuli_says_what_to_return(stimuli):
+    class Mean(nn.Module):
+        def forward(self, x):
+            return x.mean()
+
+    with pytest.raises(UsageError, match=r"Nothing in Mean gives an activation per stimulus.*Return \[B, \.\.\.\]"):
+        extract(Mean(), stimuli)
+
+
 def test_a_sweep_too_long_for_the_attender_says_so(stimuli):
     with pytest.raises(UsageError, match="at most 32 steps"):
         extract(load_model("zhuang-small+gpt"), np.zeros((1, 33, 30, 5, 7), np.float32))

@@ -74,7 +74,7 @@ def test_equal_seeds_give_equal_weights_and_disturb_nobody():
     assert any(not torch.equal(value, third[name]) for name, value in first.items())
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, True, "0"])
+@pytest.mark.parametrize("seed", [-1, 1.5, True, "0", 2**63])
 def test_a_seed_is_a_whole_number(seed):
     with pytest.raises(UsageError, match="seed must be a whole number"):
         load_model(SMALL, seed=seed)
