@@ -17,6 +17,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Part = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
+Aligned = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.int64]"]
+"""x [T'] from the start of the episode, readings y [T, N], and for each reading the index of x that it shows."""
+
+_SURE = 25.0
+"""Difference of the misfit, in units of the noise's variance, at which one lag beats the next."""
+_WINDOW = 40
+"""Readings to either side over which drift counts as a level."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +34,8 @@ class Fit:
     gains: NDArray[np.float64]
     """[probes × episodes]."""
     gain_errors: NDArray[np.float64]
+    parameters: tuple[float, ...]
+    """log white, log walk, β, log τ."""
 
 
 def segments(log: Log) -> list[Part]:
@@ -64,21 +73,93 @@ def find_quantum(values: NDArray[np.float64]) -> float:
     return step if off.max() < 0.02 and coarse else 0.0
 
 
-def find_delay(parts: list[Part], longest: int) -> int:
-    """Return the delay in readings at which the signal explains the differences of the readings best."""
+def blur(x: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
+    """Return the mean of ``x`` over lags of ``first`` to ``last`` readings; it was 0 before."""
+    total = np.cumsum(np.pad(x, (last + 1, 0)))
+    end = np.arange(len(x)) + last + 1
+    return (total[end - first] - total[end - last - 1]) / (last - first + 1)
+
+
+def find_delays(parts: list[Part], longest: int) -> tuple[int, int]:
+    """Return the range of lags over which the blurred signal explains the differences of the readings best.
+
+    Lags that vary blur a signal in the mean. The best single lag is found first and its range then grown.
+    """
     longest = min(longest, min(len(x) for x, _y in parts) // 2)
-    if longest <= 0:
-        return 0
-    misfit = np.zeros(longest + 1)
-    for lag in range(longest + 1):
-        for x, y in parts:
-            steps = len(x) - longest
-            a = np.diff(x[longest - lag : longest - lag + steps])
-            b = np.diff(y[longest : longest + steps], axis=0)
-            power = float(a @ a)
-            if power > 0:
-                misfit[lag] -= float(((a @ b) ** 2 / power / np.maximum((b * b).sum(axis=0), 1e-300)).mean())
-    return int(np.argmin(misfit))
+    steps = [np.diff(y[longest:], axis=0) for _x, y in parts]
+    powers = [np.maximum((step * step).sum(axis=0), 1e-300) for step in steps]
+
+    def explained(first: int, last: int) -> float:
+        score = 0.0
+        for (x, _y), step, power in zip(parts, steps, powers, strict=True):
+            a = np.diff(blur(x, first, last)[longest:])
+            own = float(a @ a)
+            score += float(((a @ step) ** 2 / own / power).mean()) if own > 0 else 0.0
+        return score
+
+    best = max(((lag, lag) for lag in range(longest + 1)), key=lambda lags: explained(*lags))
+    while True:
+        first, last = best
+        steps_of = [(-1, 0), (1, 0), (0, -1), (0, 1)]
+        near = [(first + a, last + b) for a, b in steps_of if 0 <= first + a <= last + b <= longest]
+        found = max(near, key=lambda lags: explained(*lags), default=best)
+        if explained(*found) <= explained(*best):
+            return best
+        best = found
+
+
+def align(parts: list[Part], first: int, last: int) -> list[Aligned]:
+    """Return the parts with the signal blurred over a range of lags."""
+    return [(blur(x, first, last), y, np.arange(len(x))) for x, y in parts]
+
+
+def find_lags(
+    parts: list[Part], guess: tuple[int, int], dt: float, fit: Fit
+) -> tuple[list[Aligned], NDArray[np.int64]]:
+    """Return the parts with each reading aligned by itself, and the lags [n] that could be told, in readings.
+
+    All probes of an update are equally late, so that together they show by how much wherever the signal moves.
+    """
+    white, walk, beta, tau = fit.parameters
+    middle = sum(guess) // 2
+    lags = np.arange(2 * guess[1] + 1)
+    found, told, place = [], [], 0
+    for x, y in parts:
+        n = y.shape[1]
+        model = x + beta * maxwell(x, math.exp(-dt / math.exp(tau)))
+        gain = fit.gains[place : place + n]
+        place += n
+        rows = np.arange(lags[-1], len(x))
+        shown = model[rows[:, None] - lags]
+        noise = math.exp(2 * white) + math.exp(2 * walk)
+        level = _level(y[rows] - np.outer(model[rows - middle], gain), np.ptp(shown, axis=1), noise)
+        rest = y[rows] - level
+        # Σ (rest − gain · shown)² for every lag, from its three terms.
+        misfit = (rest**2).sum(axis=1)[:, None] - 2 * shown * (rest @ gain)[:, None] + shown**2 * (gain @ gain)
+        order = np.argsort(misfit, axis=1)
+        best, second = (np.take_along_axis(misfit, order[:, [k]], axis=1)[:, 0] for k in (0, 1))
+        sure = second - best > _SURE * noise
+        told.append(order[sure, 0])
+        found.append((x, y[rows], rows, misfit))
+    lags = np.concatenate(told)
+    first, last = extent(lags, guess)
+    return [(x, y, rows - first - misfit[:, first : last + 1].argmin(axis=1)) for x, y, rows, misfit in found], lags
+
+
+def extent(lags: NDArray[np.int64], guess: tuple[int, int]) -> tuple[int, int]:
+    """Return the smallest and largest lag that occur more often than mistakes do (2 % of the certain ones)."""
+    values, counts = np.unique(lags, return_counts=True)
+    kept = values[counts > 0.02 * max(len(lags), 1)]
+    return (int(kept.min()), int(kept.max())) if len(kept) and len(lags) >= 20 else guess
+
+
+def _level(rest: NDArray, moves: NDArray, noise: float) -> NDArray:
+    """Return what drifts slowly under ``rest`` [T, N], told where no lag matters: ``moves`` [T] is how much one can."""
+    weight = 1 / (1 + moves**2 / noise) ** 2
+    window = np.ones(2 * _WINDOW + 1)
+    total = np.convolve(weight, window)[_WINDOW:-_WINDOW]
+    mixed = np.cumsum(np.pad(weight[:, None] * rest, ((_WINDOW + 1, _WINDOW), (0, 0))), axis=0)
+    return (mixed[len(window) :] - mixed[: -len(window)]) / np.maximum(total, 1e-12)[:, None]
 
 
 def maxwell(x: NDArray[np.float64], keep: float) -> NDArray[np.float64]:
@@ -98,11 +179,12 @@ def _sine(values: NDArray[np.float64]) -> NDArray[np.float64]:
 class _Likelihood:
     """Minus the log-likelihood as a function of (log white, log walk, β, log τ)."""
 
-    def __init__(self, parts: list[Part], dt: float, moving: bool) -> None:
+    def __init__(self, parts: list[Aligned], dt: float, moving: bool) -> None:
         self.dt, self.moving = dt, moving
-        self.x = [x for x, _y in parts]
-        self.y = [_sine(y) for _x, y in parts]
-        self.signal = [_sine(x) for x in self.x]
+        self.x = [x for x, _y, _at in parts]
+        self.at = [at for _x, _y, at in parts]
+        self.y = [_sine(y) for _x, y, _at in parts]
+        self.signal = [_sine(x[at]) for x, at in zip(self.x, self.at, strict=True)]
         self.rate = [2 - 2 * np.cos(np.pi * np.arange(1, len(y) + 1) / (len(y) + 1)) for y in self.y]
         self._cached: tuple[float, list[NDArray[np.float64]]] = (math.nan, [])
 
@@ -110,7 +192,7 @@ class _Likelihood:
         """Return the transformed ξ of each part."""
         if self._cached[0] != tau:
             keep = math.exp(-self.dt / tau)
-            self._cached = (tau, [_sine(maxwell(x, keep)) for x in self.x])
+            self._cached = (tau, [_sine(maxwell(x, keep)[at]) for x, at in zip(self.x, self.at, strict=True)])
         return self._cached[1]
 
     def __call__(self, white: float, walk: float, beta: float, tau: float) -> float:
@@ -138,8 +220,8 @@ class _Likelihood:
         return np.concatenate(found), np.concatenate(errors)
 
 
-def fit_dynamics(parts: list[Part], dt: float, quantum: float, *, moving: bool) -> Fit:
-    """Fit white noise, drift, hysteresis, gains and bias by maximum likelihood."""
+def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: bool, known: Fit | None = None) -> Fit:
+    """Fit white noise, drift, hysteresis, gains and bias by maximum likelihood, near ``known`` if that is given."""
     target = _Likelihood(parts, dt, moving)
     spread = math.sqrt(float(np.mean([np.mean(y**2) for y in target.y]))) or 1e-12
     duration = max(len(x) for x in target.x) * dt
@@ -147,7 +229,10 @@ def fit_dynamics(parts: list[Part], dt: float, quantum: float, *, moving: bool) 
     still = _minimum(lambda p: target(math.exp(p[0]), math.exp(p[1]), 0.0, dt), starts)
     best, cost = (*still[0], 0.0, math.log(10 * dt)), still[1]
     if moving:
-        for tau in np.geomspace(2 * dt, min(duration / 4, 100.0 * dt), 5):
+        taus = np.geomspace(2 * dt, min(duration / 4, 100.0 * dt), 5)
+        if known and known.parameters[2]:
+            taus = [math.exp(known.parameters[3])]
+        for tau in taus:
             found = _minimum(_free(target), [*still[0], 0.1, math.log(tau)])
             if found[1] < cost - 1e-9:
                 best, cost = tuple(found[0]), found[1]
@@ -171,7 +256,7 @@ def fit_dynamics(parts: list[Part], dt: float, quantum: float, *, moving: bool) 
         gains, gain_errors = target.gains(white, walk, best[2], math.exp(best[3]))
     bias, error = _bias(parts, dt, white, walk if drifts else 0.0, best, gains, moving)
     estimates["bias"] = Estimate(bias, bias - _Z * error, bias + _Z * error, "level of the residuals")
-    return Fit(estimates, gains, gain_errors)
+    return Fit(estimates, gains, gain_errors, best)
 
 
 def _free(target: _Likelihood) -> Any:
@@ -237,15 +322,15 @@ def _named(best: tuple[float, ...], errors: list[float], free: list[bool], quant
 
 
 def _bias(
-    parts: list[Part], dt: float, white: float, walk: float, best: tuple[float, ...], gains: NDArray, moving: bool
+    parts: list[Aligned], dt: float, white: float, walk: float, best: tuple[float, ...], gains: NDArray, moving: bool
 ) -> tuple[float, float]:
     """Return the common offset and its error: the best linear estimate under drift that starts at zero."""
     from scipy.linalg import solveh_banded
 
     estimates, precisions, place = [], [], 0
-    for x, y in parts:
+    for x, y, at in parts:
         count, n = y.shape
-        model = x + best[2] * maxwell(x, math.exp(-dt / math.exp(best[3]))) if moving else np.zeros(count)
+        model = (x + best[2] * maxwell(x, math.exp(-dt / math.exp(best[3]))))[at] if moving else np.zeros(count)
         rest = y - np.outer(model, gains[place : place + n] if moving else np.ones(n))
         place += n
         # Differences, with the first reading in front: its drift is one step.

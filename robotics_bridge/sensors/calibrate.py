@@ -29,9 +29,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-NOT_FITTED = ("jitter", "radius", "crosstalk")
-"""Knobs that a log of one signal cannot tell: the first hides in the delay, the others need known places."""
+NOT_FITTED = ("radius", "crosstalk")
+"""Knobs that a log of one signal cannot tell: they need known places."""
 _Z = 1.959963984540054
+_ROUNDS = 12
 _SIGNIFICANT = 6.63
 """Twice the gain in log-likelihood (χ², one degree, 1 %) that drift or hysteresis must bring to be kept."""
 
@@ -144,13 +145,13 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     Raises:
         DataError: no probe is alive, or the reference never changes.
     """
-    from robotics_bridge.sensors._calibrate_fit import Fit, find_dead, find_delay, find_quantum, fit_dynamics, segments
+    from robotics_bridge.sensors import _calibrate_fit as parts_of
 
     estimates: dict[str, Estimate] = {}
     notes = [f"Not fitted: {', '.join(NOT_FITTED)}."]
     knobs: dict[str, Any] = {}
-    parts = segments(log)
-    stuck, values = find_dead(parts)
+    parts = parts_of.segments(log)
+    stuck, values = parts_of.find_dead(parts)
     living = [(x, y[:, ~dead]) for (x, y), dead in zip(parts, stuck, strict=True) if (~dead).any()]
     if not living:
         raise DataError("Every probe of the log is stuck at one value, so nothing can be fitted.")
@@ -161,21 +162,26 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
             raise DataError("The reference never changes; leave the column out for a device at rest.")
         held, at = (np.concatenate([items[index] for index in moved]) for items in (stuck, values))
         _dead(held, at, knobs, estimates)
-    quantum = find_quantum(np.concatenate([y.ravel() for _x, y in living]))
+    quantum = parts_of.find_quantum(np.concatenate([y.ravel() for _x, y in living]))
     knobs["quantum"] = quantum
     estimates["quantum"] = Estimate(
         quantum, quantum, quantum, "all readings are its multiples" if quantum else "none found"
     )
-    delay = find_delay(living, round(max_delay / log.step)) if log.reference is not None else 0
-    shifted = [(x[: len(x) - delay], y[delay:]) for x, y in living]
-    fit: Fit = fit_dynamics(shifted, log.step, quantum, moving=log.reference is not None)
+    moving = log.reference is not None
+    guess = parts_of.find_delays(living, round(max_delay / log.step)) if moving else (0, 0)
+    fit = parts_of.fit_dynamics(parts_of.align(living, *guess), log.step, quantum, moving=moving)
+    lags = np.zeros(0, int)
+    for _ in range(_ROUNDS if moving and guess[1] else 0):
+        aligned, found = parts_of.find_lags(living, guess, log.step, fit)
+        settled, lags = np.array_equal(found, lags), found
+        if settled or (guess[0] == guess[1] and np.all(lags == guess[0])):
+            break
+        fit = parts_of.fit_dynamics(aligned, log.step, quantum, moving=True, known=fit)
     if log.reference is None:
         notes.append("Without a column 'reference' the true signal counts as 0: gain, delay, hysteresis and dead "
                      "probes were not fitted.")  # fmt: skip
     else:
-        knobs["read_delay"] = delay * log.step
-        low = max(delay - 1, 0) * log.step
-        estimates["read_delay"] = Estimate(delay * log.step, low, delay * log.step, "best agreement, to one reading")
+        _delay(parts_of.extent(lags, guess), len(lags), log.step, knobs, estimates)
         _gain(fit, knobs, estimates, notes)
     for name, item in fit.estimates.items():
         knobs[name] = item.value
@@ -186,6 +192,22 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         notes.append("The white noise is far below a quantisation step; its value is an upper bound at best.")
     about = {"readings": int(log.readings.size), "probes": list(log.probes), "episodes": len(parts), "step": log.step}
     return Calibration(Noise(**knobs), estimates, tuple(fit.gains.tolist()), tuple(notes), about)
+
+
+def _delay(
+    lags: tuple[int, int], certain: int, step: float, knobs: dict[str, Any], estimates: dict[str, Estimate]
+) -> None:
+    """Enter delay and jitter: lags are rounded up to whole readings and spread evenly over twice the jitter."""
+    first, last = lags
+    middle, half = (first + last - 1) / 2 * step, (last - first + 1) / 2 * step
+    if first == last:
+        middle, half = last * step, 0.0
+    knobs["read_delay"], knobs["jitter"] = middle, min(half, middle)
+    low = max(middle - (step if first == last else step / 2), 0.0)
+    high = middle if first == last else middle + step / 2
+    estimates["read_delay"] = Estimate(middle, low, high, "best agreement, to one reading")
+    how = f"{certain} readings whose lag is certain" if certain else "no lag is certain"
+    estimates["jitter"] = Estimate(knobs["jitter"], max(half - step / 2, 0.0), half + step / 2, how)
 
 
 def _dead(stuck: NDArray, values: NDArray, knobs: dict[str, Any], estimates: dict[str, Estimate]) -> None:
@@ -237,5 +259,5 @@ def _gain(fit: Any, knobs: dict[str, Any], estimates: dict[str, Estimate], notes
 def describe(calibration: Calibration) -> Sequence[tuple[str, Estimate]]:
     """Return the estimates in the order of the model."""
     order = ["gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum"]
-    order += ["dead_probability", "dead_low", "dead_high", "read_delay"]
+    order += ["dead_probability", "dead_low", "dead_high", "read_delay", "jitter"]
     return [(name, calibration.estimates[name]) for name in order if name in calibration.estimates]

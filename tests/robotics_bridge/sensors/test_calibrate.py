@@ -49,6 +49,7 @@ def test_planted_values_are_recovered_within_their_intervals():
     assert noise.hysteresis == pytest.approx(0.4, rel=0.05)
     assert noise.hysteresis_tau == pytest.approx(0.06, rel=0.05)
     assert noise.read_delay == pytest.approx(0.03, abs=1e-9)
+    assert noise.jitter == 0
     assert noise.gain == pytest.approx((0.8, 1.2), abs=0.04)
     truth = {"walk": 0.002, "hysteresis": 0.4, "hysteresis_tau": 0.06, "dead_probability": 0.15, "gain_low": 0.8}
     truth |= {"gain_high": 1.2, "bias": 0.05}
@@ -57,6 +58,22 @@ def test_planted_values_are_recovered_within_their_intervals():
         margin = 0.3 * (estimate.high - estimate.low)
         assert estimate.low - margin <= value <= estimate.high + margin, name
     assert 0.1 <= noise.dead_range[0] <= noise.dead_range[1] <= 0.6 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("jitter", "seed"),
+    [(0.01, 1), pytest.param(0.005, 0, marks=pytest.mark.slow), pytest.param(0.02, 1, marks=pytest.mark.slow)],
+)
+def test_jitter_is_recovered_with_what_it_would_otherwise_blur(jitter, seed):
+    noise = Noise(
+        white=0.02, gain=(0.8, 1.2), hysteresis=0.4, hysteresis_tau=0.06, read_delay=0.03, jitter=jitter, bias=0.1
+    )
+    found = calibrate(_log(noise, steps=2000, probes=30, seed=seed))
+    assert found.noise.jitter == pytest.approx(jitter, abs=1e-9)
+    assert found.noise.read_delay == pytest.approx(0.03, abs=1e-9)
+    assert found.noise.white == pytest.approx(0.02, rel=0.1)
+    assert found.noise.hysteresis == pytest.approx(0.4, rel=0.1)
+    assert found.noise.hysteresis_tau == pytest.approx(0.06, rel=0.1)
 
 
 @pytest.mark.slow
