@@ -3,27 +3,25 @@
     PYTHONPATH=. python benchmarks/train_zoo.py --minutes 9 --out $OUT          # makes the data, trains, scores, packs
     PYTHONPATH=. python benchmarks/train_zoo.py --install FOLDER_OF_TARS        # puts the small ones into the package
 
-One process per GPU; in it one thread and stream per job, whole training steps as CUDA graphs (``zoo_loop.py``), all
-sweeps in the GPU's memory. Jobs are in ``zoo_jobs.py``, the most valuable first; each is claimed by one process. At
-the deadline unfinished jobs save their state. What comes back: ``results.jsonl``, ``curves.jsonl`` and up to six tar
-files with checkpoints of small networks, result records and states; given with ``--resume`` they are gone on with.
+A few processes per GPU, each with all sweeps in the GPU's memory, each doing one job after the other with whole
+training steps as CUDA graphs (``zoo_loop.py``). Jobs are in ``zoo_jobs.py``, the most valuable first; each is claimed
+by one process. At the deadline unfinished jobs save their state. Results come back as soon as there are any:
+``results.jsonl``, ``curves.jsonl`` and up to four tar files with checkpoints of small networks, result records and
+states, replaced in one move each; given with ``--resume`` they are gone on with.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import logging
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tarfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,31 +29,37 @@ from zoo_jobs import Job, all_jobs
 
 _log = logging.getLogger("train_zoo")
 ROOT = Path(__file__).resolve().parent.parent
-CLOSING = 100.0
+CLOSING = 75.0
 """Seconds before the end when training stops; then the last networks are evaluated, scored and packed."""
-ROLES = ("small", "full", "untrained")
-"""A process each per GPU: Python's threads would wait for one another's compilers and probes."""
+LEAVING = 12.0
+"""Seconds before the end when all that still runs is ended."""
+MOST_FAULTS = 12
+"""Workers that are replaced when they fail."""
 TAR_BYTES, TARS = 15 * 2**20, 4
 """What may come back: files of at most 16 MiB, 64 MiB in all."""
 
 
 def parser() -> argparse.ArgumentParser:
-    told = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    told = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     told.add_argument("--out", type=Path, default=Path("zoo-out"), help="where results are packed")
     told.add_argument("--work", type=Path, default=Path("/tmp/zoo-work"), help="folders of the jobs")
     told.add_argument("--data", type=Path, help="a data set that is there already")
     told.add_argument("--recipe", default="thesis-high")
     told.add_argument("--objects", default="procedural-24:10")
-    told.add_argument("--limit", type=int, help="sweeps per object; all of them if not given")
+    told.add_argument("--limit", type=int, help="only the first sweeps of each object")
+    told.add_argument("--sample", type=float, help="only this fraction of all sweeps")
+    told.add_argument("--shard", type=int, help="sweeps per shard")
     told.add_argument("--links", type=int, default=12)
     told.add_argument("--step", type=float, default=1e-3)
     told.add_argument("--minutes", type=float, default=9.4, help="from start to end, packing included")
     told.add_argument("--end", type=float, help="the same as seconds since 1970: $(($(date +%%s) + 570)) of the shell")
     told.add_argument("--last", action="store_true", help="no later call will go on: end every schedule in this one")
-    told.add_argument("--small-seconds", type=float, default=130.0, help="training time of a small job")
-    told.add_argument("--full-seconds", type=float, default=200.0, help="training time of a full-size job")
-    told.add_argument("--places", type=int, default=4, help="small jobs at a time on a GPU, beside a full-size one")
-    told.add_argument("--precision", default="bf16")
+    told.add_argument("--small-seconds", type=float, default=130.0, help="training time of a small job of weight 1")
+    told.add_argument("--full-seconds", type=float, default=200.0, help="training time of a full-size job of weight 1")
+    told.add_argument("--places", type=int, default=3, help="processes on a GPU, or on the processor")
+    told.add_argument("--learning-rate", type=float, help="instead of the jobs' own")
+    told.add_argument("--batch", type=int, default=256, help="sweeps per step")
+    told.add_argument("--precision", default="auto", help="bf16, float32, or what is safe and fast on the device")
     told.add_argument("--epochs", type=int, help="epochs at most, whatever the job says")
     told.add_argument("--only", help="substring of the names of jobs to train")
     told.add_argument("--jobs", type=int, help="only so many jobs")
@@ -63,7 +67,6 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--no-score", action="store_true")
     told.add_argument("--device", default=None, help="cpu for a trial run; all GPUs if not given")
     told.add_argument("--worker", type=int, help=argparse.SUPPRESS)
-    told.add_argument("--role", help=argparse.SUPPRESS)
     told.add_argument("--score", type=Path, help=argparse.SUPPRESS)
     told.add_argument("--shards", help=argparse.SUPPRESS)
     told.add_argument("--until", type=float, help=argparse.SUPPRESS)
@@ -87,7 +90,7 @@ def main() -> None:
 
 
 def campaign(args: argparse.Namespace) -> None:
-    """Make the data, start a process per GPU, wait, pack."""
+    """Make the data, keep a few processes per GPU at work, bring every result back as soon as it is there."""
     started = time.time()
     end = args.end or started + 60 * args.minutes
     args.until = end - CLOSING
@@ -97,37 +100,80 @@ def campaign(args: argparse.Namespace) -> None:
     (args.work / "claims").mkdir()
     if args.resume:
         unpack(args.resume, args.work)
-    scoring = (
-        None if args.no_score else subprocess.Popen(command(args, score=args.work / "warm-up"), env=environment(None))
-    )
+    scorers = Scorers(args)
+    scorers.start(args.work / "warm-up")
     if args.data is None:
         args.data = make_data(args, gpus)
         _log.info("data after %.0f s", time.time() - started)
-    # Sessions of their own, so that the end ends what they started too.
-    workers = [
-        subprocess.Popen(
-            command(args, worker=index, role=role), env=environment(index if gpus else None), start_new_session=True
-        )
-        for index in range(max(1, gpus))
-        for role in ROLES
-    ]
-    seen: Any = None
-    while any(worker.poll() is None for worker in workers) and time.time() < end - 12:
-        time.sleep(5.0)
+    places = [index for _ in range(args.places) for index in range(max(1, gpus))]
+    workers: list[subprocess.Popen[bytes] | None] = [None] * len(places)
+    faults, seen = 0, None
+    while time.time() < end - LEAVING:
+        for place, gpu in enumerate(places):
+            worker = workers[place]
+            if worker is not None:
+                if worker.poll() in (None, 0) or faults >= MOST_FAULTS or time.time() > args.until - 30:
+                    continue
+                faults += 1
+                _log.error("worker %d ended with %s; another one takes its place", place, worker.poll())
+            workers[place] = start_worker(args, place, gpu if gpus else None)
+        scorers.look()
         # What is done is packed at once: a cut then costs what was running alone.
         if (found := written(args.work)) != seen:
             seen = found
             pack(args.work, args.out)
+        if all(worker is not None and worker.poll() is not None for worker in workers) and scorers.idle:
+            break
+        time.sleep(2.0)
     for worker in workers:
-        if worker.poll() is None:
-            _log.warning("a worker is not done at the end and is left behind")
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(worker.pid, signal.SIGKILL)
-    if scoring is not None and scoring.poll() is None:
-        scoring.kill()
+        if worker is not None and worker.poll() is None:
+            _log.warning("a worker is not done at the end and is ended")
+            worker.kill()
+    scorers.kill()
     for result in pack(args.work, args.out):
         print(row(result))
     _log.info("everything after %.0f s", time.time() - started)
+
+
+def start_worker(args: argparse.Namespace, place: int, gpu: int | None) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(command(args, worker=place), env=environment(gpu))
+
+
+class Scorers:
+    """Processes that score what is trained, on the processor, a few at a time."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args = args
+        self.most = 1 if args.device == "cpu" else max(2, (os.cpu_count() or 1) // 8)
+        self.running: list[subprocess.Popen[bytes]] = []
+        self.given: set[Path] = set()
+
+    def start(self, folder: Path) -> None:
+        """Score a job's network; without one, only make the stimuli."""
+        if not self.args.no_score:
+            self.given.add(folder)
+            self.running.append(subprocess.Popen(command(self.args, score=folder), env=environment(None)))
+
+    def look(self) -> None:
+        """Start what can be scored now."""
+        self.running = [process for process in self.running if process.poll() is None]
+        for path in sorted((self.args.work / "jobs").glob("*/result.json")):
+            # The first one makes the stimuli that all others read.
+            if len(self.running) >= self.most or (self.running and len(self.given) == 1):
+                return
+            if path.parent not in self.given and not (path.parent / "record.json").is_file():
+                self.start(path.parent)
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that there is has been scored."""
+        self.look()
+        return not self.running
+
+    def kill(self) -> None:
+        """End what still runs."""
+        for process in self.running:
+            process.kill()
 
 
 def written(work: Path) -> list[tuple[str, float]]:
@@ -172,7 +218,8 @@ def make_plan(args: argparse.Namespace, gpus: int) -> Any:
         backend="rod",
         device="cuda" if gpus else "cpu",
         limit=args.limit,
-        shard_size=3120 if gpus else None,
+        sample=args.sample,
+        shard_size=args.shard or (3120 if gpus else None),
     )
     return GenerationPlan(args.recipe, GRIDS[args.recipe], resolve_objects([args.objects], surfaces=True), settings)
 
@@ -209,57 +256,8 @@ def make_shards(args: argparse.Namespace) -> None:
         run_here(missing, folder, max(1, (os.cpu_count() or 1) // count), lambda done: None)
 
 
-class Gate:
-    """Many threads that launch, or one that records: recording waits for the launching to pause.
-
-    Long work that is not to be interrupted is waited for without pausing the others.
-    """
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._inside, self._waiting, self._long = 0, False, 0
-
-    @contextlib.contextmanager
-    def long(self) -> Iterator[None]:
-        with self._changed:
-            self._changed.wait_for(lambda: self._inside >= 0 and not self._waiting)
-            self._long += 1
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._long -= 1
-                self._changed.notify_all()
-
-    @contextlib.contextmanager
-    def shared(self) -> Iterator[None]:
-        with self._changed:
-            self._changed.wait_for(lambda: self._inside >= 0 and not self._waiting)
-            self._inside += 1
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._inside -= 1
-                self._changed.notify_all()
-
-    @contextlib.contextmanager
-    def exclusive(self) -> Iterator[None]:
-        with self._changed:
-            self._changed.wait_for(lambda: self._inside >= 0 and not self._long and not self._waiting)
-            self._waiting = True
-            self._changed.wait_for(lambda: self._inside == 0)
-            self._inside, self._waiting = -1, False
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._inside = 0
-                self._changed.notify_all()
-
-
 class Worker:
-    """The jobs of one GPU."""
+    """Does one job after the other on one GPU, or on the processor; others may work beside it."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         import torch
@@ -267,13 +265,7 @@ class Worker:
         self.args = args
         self.device = torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
         self.deadline = time.monotonic() + args.until - time.time()
-        self.gate = Gate()
-        self.places = args.places if args.role == "small" else 1
-        self.free = self.places
-        self.changed = threading.Condition()
-        self.scores: list[subprocess.Popen[bytes]] = []
-        chosen = [job for job in all_jobs() if not args.only or args.only in job.name][: args.jobs]
-        self.jobs = [job for job in chosen if job.role == args.role]
+        threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
 
     def run(self) -> None:
         import torch
@@ -282,90 +274,77 @@ class Worker:
         if self.device.type == "cuda":
             torch.backends.cudnn.benchmark = True
             torch.set_float32_matmul_precision("high")
-        sys.setswitchinterval(1e-4)
-        if not self.jobs:
-            return
-        self.data = Resident(self.args.data, self.device)
-        if self.device.type == "cuda":
-            torch.cuda.synchronize()
-        _log.info("worker %s %s: %s", self.args.worker, self.args.role, self.data.summary())
-        threads = []
-        while time.monotonic() < self.deadline - 20:
-            with self.changed:
-                job = next((item for item in self.jobs if not self._claimed(item)), None)
-                if job is None:
-                    break
-                if not self.free:
-                    self.changed.wait(1.0)
-                    continue
-                if not self._claim(job) or self._late(job):
-                    continue
-                self.free -= 1
-            thread = threading.Thread(target=self._train, args=(job,))
-            thread.start()
-            threads.append(thread)
-        for thread in threads:
-            thread.join()
-        for process in self.scores:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(max(1.0, self.deadline + CLOSING - 25 - time.monotonic()))
+        data = Resident(self.args.data, self.device)
+        _log.info("worker %s: %s", self.args.worker, data.summary())
+        while (job := self._next()) is not None:
+            self._train(job, data)
 
-    def _late(self, job: Job) -> bool:
-        """Whether too little time is left for a job to be worth beginning."""
-        needed = 0.6 * self._budget(job) if self.args.last and job.objective != "untrained" else 30.0
-        return self.deadline - time.monotonic() < needed
+    def _next(self) -> Job | None:
+        """Claim the first job that nobody has claimed and that there is time for."""
+        for job in chosen_jobs(self.args):
+            if self.deadline - time.monotonic() < self._needed(job):
+                continue
+            try:
+                os.close(os.open(self.args.work / "claims" / job.name, os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                continue
+            return job
+        return None
+
+    def _needed(self, job: Job) -> float:
+        """Return the seconds without which a job is not worth beginning."""
+        return 0.6 * self._budget(job) if self.args.last and job.objective != "untrained" else 25.0
 
     def _budget(self, job: Job) -> float:
-        if job.full:
-            # The published sizes without recurrence over areas are ten times cheaper.
-            return self.args.full_seconds * (1.0 if job.model.startswith("zhuang") else 0.35)
-        return self.args.small_seconds
+        return job.weight * (self.args.full_seconds if job.full else self.args.small_seconds)
 
-    def _claimed(self, job: Job) -> bool:
-        return (self.args.work / "claims" / job.name).exists()
+    def _precision(self, job: Job) -> str:
+        if self.args.precision != "auto":
+            return self.args.precision
+        # On the CPU PyTorch's bf16 gradients of strided convolutions are now and then not finite.
+        return "bf16" if self.device.type == "cuda" or job.model.startswith("zhuang") else "float32"
 
-    def _claim(self, job: Job) -> bool:
-        try:
-            os.close(os.open(self.args.work / "claims" / job.name, os.O_CREAT | os.O_EXCL))
-        except FileExistsError:
-            return False
-        return True
-
-    def _train(self, job: Job) -> None:
+    def _train(self, job: Job, data: Any) -> None:
         import dataclasses
 
-        import torch
         from zoo_loop import run_job
 
-        out = self.args.work / "jobs" / job.name
         if self.args.epochs:
             job = dataclasses.replace(job, epochs=min(job.epochs, self.args.epochs))
-        stream = torch.cuda.Stream() if self.device.type == "cuda" else None
+        if self.args.learning_rate:
+            job = dataclasses.replace(job, learning_rate=self.args.learning_rate)
         started = time.monotonic()
-        status = "failed"
-        try:
-            with torch.cuda.stream(stream) if stream is not None else contextlib.nullcontext():
-                status = run_job(
-                    job,
-                    self.data,
-                    self.device,
-                    out,
-                    exclusive=self.gate.exclusive,
-                    shared=self.gate.shared,
-                    long=self.gate.long,
-                    budget=self._budget(job),
-                    deadline=self.deadline,
-                    precision=self.args.precision,
-                    last_call=self.args.last,
-                )
-        except Exception:  # noqa: BLE001 - one job must not take the others with it
-            _log.exception("%s failed", job.name)
-        _log.info("%s: %s after %.0f s", job.name, status, time.monotonic() - started)
-        if status in ("finished", "diverged") and not self.args.no_score:
-            self.scores.append(subprocess.Popen(command(self.args, score=out), env=environment(None)))
-        with self.changed:
-            self.free += 1
-            self.changed.notify_all()
+        out = self.args.work / "jobs" / job.name
+        # A failed launch leaves the device unusable: the process ends, and another one takes its place.
+        status = run_job(
+            job,
+            data,
+            self.device,
+            out,
+            budget=self._budget(job),
+            deadline=self.deadline,
+            precision=self._precision(job),
+            batch=self.args.batch,
+            last_call=self.args.last,
+        )
+        told = ""
+        if (out / "result.json").is_file():
+            result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+            times = ", ".join(f"{name} {value:.1f}" for name, value in result.get("seconds", {}).items())
+            told = f" ({times} s; {result.get('sweeps_per_second', 0):,.0f} sweeps/s)"
+        _log.info("%s: %s after %.0f s%s", job.name, status, time.monotonic() - started, told)
+
+
+def _end_with(parent: int) -> None:
+    """End this process when the one that started it is gone."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
+def chosen_jobs(args: argparse.Namespace) -> list[Job]:
+    """Return the jobs of this call."""
+    return [job for job in all_jobs() if not args.only or args.only in job.name][: args.jobs]
 
 
 def score(folder: Path) -> None:
@@ -403,10 +382,11 @@ def pack(work: Path, out: Path) -> list[dict[str, Any]]:
     write_text(out / "results.jsonl", "".join(json.dumps(result) + "\n" for result in results))
     write_text(out / "curves.jsonl", "".join(curves))
     ship = {job.name for job in all_jobs() if job.ship}
-    shipped = [path for folder in folders if folder.name in ship for path in sorted((folder / "best").glob("*"))]
+    ended = [folder for folder in folders if (folder / "result.json").is_file()]
+    shipped = [path for folder in ended if folder.name in ship for path in sorted((folder / "best").glob("*"))]
     records = [path for folder in folders for path in (folder / "record.json", folder / "result.json")]
     states = [folder / "state.safetensors" for folder in folders]
-    others = [path for folder in folders if folder.name not in ship for path in sorted((folder / "best").glob("*"))]
+    others = [path for folder in ended if folder.name not in ship for path in sorted((folder / "best").glob("*"))]
     fill(out, work, [path for path in (*shipped, *records, *states, *others) if path.is_file()])
     return results
 
@@ -457,18 +437,32 @@ def unpack(folder: Path, work: Path) -> None:
 
 
 def install(folder: Path) -> None:
-    """Put the trained networks that are to be shipped into the package."""
+    """Put the trained networks that are to be shipped into the package, each with its untrained twin in its card."""
+    from brainbench.files import read_json, write_json, write_text
+    from brainbench.models.training.card import model_card
+    from brainbench.models.training.config import TrainingConfig
+
     work = folder / "unpacked"
     unpack(folder, work)
     target = ROOT / "brainbench" / "models" / "weights"
     for job in all_jobs():
-        best = work / "jobs" / job.name / "best"
-        if job.ship and (work / "jobs" / job.name / "result.json").is_file():
-            place = target / f"{job.model}.{job.objective}"
-            shutil.rmtree(place, ignore_errors=True)
-            shutil.copytree(best, place)
-            size = sum(path.stat().st_size for path in place.iterdir())
-            _log.info("%s: %.2f MB", place.relative_to(ROOT), size / 1e6)
+        ended = work / "jobs" / job.name
+        if not (job.ship and (ended / "result.json").is_file()):
+            continue
+        if read_json(ended / "result.json")["status"] != "finished":
+            _log.warning("%s diverged and is not installed", job.name)
+            continue
+        place = target / f"{job.model}.{job.objective}"
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(ended / "best", place)
+        info = read_json(place / "config.json")
+        twin = work / "jobs" / f"{job.model}.untrained.seed{job.seed}" / "result.json"
+        if twin.is_file():
+            info["twin_evaluation"] = read_json(twin)["evaluation"]
+        write_json(place / "config.json", info)
+        write_text(place / "README.md", model_card(TrainingConfig.from_mapping(info["training"]), info))
+        size = sum(path.stat().st_size for path in place.iterdir())
+        _log.info("%s: %.2f MB", place.relative_to(ROOT), size / 1e6)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,15 @@ FULL = (
     ("resnet18", "supervised"),
     ("s4", "supervised"),
 )
+WEIGHTS = {
+    "zhuang-intersection-ln-small": 1.6,
+    "zhuang-small+mamba": 1.2,
+    "zhuang-small": 1.0,
+    "s4-small+gpt": 0.8,
+    "resnet18-small+gpt": 0.7,
+    "resnet18-small": 0.5,
+}
+"""How training time is divided among the small networks, by what a step costs."""
 SEEDS = 3
 FULL_EPOCHS = 20
 
@@ -41,6 +50,8 @@ class Job:
     masking: float = 0.0
     epochs: int = 100
     """At most so many; fewer where the first epoch shows that time would not allow them."""
+    learning_rate: float | None = None
+    """Highest; by model when None."""
     ship: bool = False
     """Its weights come back."""
 
@@ -50,9 +61,11 @@ class Job:
         return "-small" not in self.model
 
     @property
-    def role(self) -> str:
-        """Which process of a GPU does it."""
-        return "untrained" if self.objective == "untrained" else "full" if self.full else "small"
+    def weight(self) -> float:
+        """Its share of training time, relative to others of its size; SimCLR trains on two views."""
+        # The published sizes without recurrence over areas are several times cheaper.
+        own = WEIGHTS.get(self.model, 1.0 if self.model.startswith("zhuang") else 0.35)
+        return own * (1.3 if self.objective == "simclr" else 0.7)
 
     @property
     def name(self) -> str:
@@ -68,13 +81,14 @@ class Job:
         so all anneal by a cosine after a tenth of warm-up, with AdamW at rates of the published (supervised) search
         spaces. SimCLR was published with LARS, under which the loss of so short a run hardly fell.
         """
+        usual = 1e-3 if not self.full or self.model in ("resnet18", "s4") else 3e-4
         chosen = TrainingConfig.published(
             self.model,
             self.objective,
             epochs=epochs,
             optimizer="adamw",
             schedule="cosine",
-            learning_rate=1e-3 if not self.full or self.model in ("resnet18", "s4") else 3e-4,
+            learning_rate=self.learning_rate or usual,
             warmup_epochs=max(1, round(0.1 * epochs)),
             decoder="linear",
             augmentation=self.augmentation,

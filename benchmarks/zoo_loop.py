@@ -10,7 +10,6 @@ import dataclasses
 import json
 import logging
 import math
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -33,6 +32,7 @@ from brainbench.models.registry import load_model
 from brainbench.models.training.captured import captured, copy_state, fuse, make_capturable, reset_optimizer
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.probe import fit_probe
+from brainbench.models.training.start import draw_silent_biases
 from brainbench.models.training.state import load_state, save_state
 
 STATE, BEST, RESULT, LOG = "state.safetensors", "best", "result.json", "log.jsonl"
@@ -40,13 +40,11 @@ EVALUATED = 512
 LARGEST = 100.0
 """Sweeps with a force above 10 mN or a moment above 100 µN·m are failed simulations that were not noticed: usual sweeps
 stay five times below."""
-SAVED = 40.0
+SAVED = 30.0
 """Seconds between saved states."""
-CHUNK = 4
-"""Steps that are launched before a thread lets another one launch."""
+HOPELESS = 0.5
+"""A job diverges when more than this share of an epoch's steps has a gradient that is not finite."""
 _log = logging.getLogger("train_zoo")
-_drawing = threading.Lock()
-"""Initial weights come from PyTorch's own generator, which threads share."""
 
 
 class Split:
@@ -104,14 +102,18 @@ class Trainer:
         device: Where they are.
         epochs: Passes over the training sweeps.
         precision: ``bf16`` (mixed) or ``float32`` (TF32 where the device has it).
+        batch: Sweeps per step.
     """
 
-    def __init__(self, job: Job, data: Resident, device: torch.device, epochs: int, precision: str) -> None:
+    def __init__(
+        self, job: Job, data: Resident, device: torch.device, epochs: int, precision: str, batch: int = 256
+    ) -> None:
         self.job, self.data, self.device, self.precision = job, data, device, precision
-        self.config = dataclasses.replace(job.config(epochs), precision=precision)
+        self.config = dataclasses.replace(job.config(epochs), precision=precision, batch_size=batch)
         self.options = {"classes": len(data.classes), "decoder": self.config.decoder}
-        with _drawing, seeded(job.seed):
+        with seeded(job.seed):
             model = load_model(job.model, seed=job.seed, **self.options)
+            self.drawn = draw_silent_biases(model)
             self.learner: Any = make_learner(job.objective, model).to(device)
         if device.type == "cuda":
             self.learner = self.learner.to(memory_format=torch.channels_last)
@@ -124,29 +126,29 @@ class Trainer:
         self.trained = [parameter for parameter in self.learner.parameters() if parameter.requires_grad]
         self.augmentation = Augmentation(self.config.augmentation, self.config.masking)
         self.generator = torch.Generator(device).manual_seed(job.seed)
-        batch = self.config.batch_size
-        self.steps, self.checks = max(1, len(data.train) // batch), math.ceil(len(data.validation) / EVALUATED)
+        self._checked = min(EVALUATED, len(data.validation))
+        self.steps, self.checks = max(1, len(data.train) // batch), math.ceil(len(data.validation) / self._checked)
         options: dict[str, Any] = {"device": device}
         self.cursor = torch.zeros(1, dtype=torch.long, **options)
         self.order = torch.zeros(self.steps, min(batch, len(data.train)), dtype=torch.long, **options)
         self.rates = torch.zeros(self.steps, **options)
         self.losses = torch.zeros(self.steps, **options)
         self.checked = torch.zeros(1, dtype=torch.long, **options)
-        rows = torch.arange(self.checks * EVALUATED, **options).view(self.checks, -1)
+        rows = torch.arange(self.checks * self._checked, **options).view(self.checks, -1)
         self.check_rows, self.check_weights = rows % len(data.validation), (rows < len(data.validation)).float()
         self.found = torch.zeros((), **options)
         self.epoch, self.best, self.best_epoch = 0, math.inf, None
         self.kept: dict[str, torch.Tensor] = {}
         self.seconds = 0.0
 
-    def prepare(self, alone: Any, together: Any, *, fused: bool = True, graphs: bool = True) -> None:
+    def prepare(self, *, fused: bool = True, graphs: bool = True) -> None:
         """Warm up and capture the training step and the validation step; the network is as new afterwards."""
-        # The compiler cannot be used by several threads; full-size networks have a process of their own.
+        # Compiling takes longer than it saves a small network.
         fuse(self.learner, fused and self.job.full and self.device.type == "cuda")
         start = {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
         self._set_epoch(0)
         self.learner.train()
-        options = {"generators": (self.generator,), "alone": alone, "together": together}
+        options: dict[str, Any] = {"generators": (self.generator,), "warm_up": 3 if self.device.type == "cuda" else 0}
         self.step = captured(self._step, self.device, **options) if graphs else self._step
         self.learner.eval()
         with torch.no_grad():
@@ -211,38 +213,24 @@ class Trainer:
         done = max(self.seconds / budget, self.epoch / epochs)
         return 1.0 if done + 0.5 * epoch_seconds / budget >= 1.0 or self.epoch >= epochs else done
 
-    def train_epoch(self, launch: Any, start: float, stop: float) -> float:
-        """Train one epoch; return its mean loss. ``launch`` is entered for every few launches.
-
-        Args:
-            launch: Context manager.
-            start, stop: Where the epoch lies in the schedule, from 0 to 1.
-        """
+    def train_epoch(self, start: float, stop: float) -> float:
+        """Train one epoch that lies between ``start`` and ``stop`` (0 to 1) in the schedule; return its mean loss."""
         began = time.monotonic()
-        with launch():
-            self._set_epoch(self.epoch, start, min(stop, 1.0))
+        self._set_epoch(self.epoch, start, min(stop, 1.0))
         self.learner.train()
-        ahead: list[Any] = []
-        for first in range(0, self.steps, CHUNK):
-            with launch():
-                for _ in range(first, min(first + CHUNK, self.steps)):
-                    self.step()
-                if self.device.type == "cuda":
-                    event = torch.cuda.Event()
-                    event.record()
-                    ahead.append(event)
-                    if len(ahead) > 2:  # a deep queue of one job would starve the others
-                        ahead.pop(0).synchronize()
-        with launch():
-            loss = float(self.losses.mean())
+        for _ in range(self.steps):
+            self.step()
+        loss = float(self.losses.mean())
         self.seconds += time.monotonic() - began
         self.epoch += 1
         return loss
 
-    def validate(self, launch: Any) -> float:
+    def validate(self) -> float:
         """Return what the best network has least of: 1 − accuracy, or the self-supervised loss; keep the best."""
         self.learner.eval()
-        with launch(), torch.no_grad():
+        # The same views in every epoch, so that losses can be compared.
+        self.generator.manual_seed(job_seed(self.config.seed, -1))
+        with torch.no_grad():
             self.checked.zero_()
             self.found.zero_()
             for _ in range(self.checks):
@@ -251,9 +239,8 @@ class Trainer:
         score = 1 - found / len(self.data.validation) if self.learner.supervised else found / self.checks
         if score < self.best:
             self.best, self.best_epoch = score, self.epoch
-            with launch():
-                for name, value in self.learner.state_dict().items():
-                    self.kept[name].copy_(value)
+            for name, value in self.learner.state_dict().items():
+                self.kept[name].copy_(value)
         return score
 
     def save(self, path: Path) -> None:
@@ -299,7 +286,7 @@ class Trainer:
         fuse(self.learner, False)
         if self.device.type == "cuda":
             self.model = self.model.to(memory_format=torch.contiguous_format)
-        return publish(self.job, self.model, self.config, self.data, out, self.epoch, self.best_epoch, self.device)
+        return publish(self, out)
 
 
 class _Both(torch.nn.Module):
@@ -317,21 +304,20 @@ def job_seed(seed: int, epoch: int) -> int:
     return seed * 1_000_003 + epoch
 
 
-def publish(
-    job: Job,
-    model: Any,
-    config: Any,
-    data: Resident,
-    out: Path,
-    epochs: int,
-    best_epoch: int | None,
-    device: torch.device,
-) -> dict[str, Any]:
+def publish(trainer: Trainer, out: Path) -> dict[str, Any]:
     """Write a network in half precision, load it again, probe and evaluate it; return what was found."""
-    options = {"classes": len(data.classes), "decoder": config.decoder}
+    job, model, config, data, device = trainer.job, trainer.model, trainer.config, trainer.data, trainer.device
+    options, epochs, best_epoch = trainer.options, trainer.epoch, trainer.best_epoch
 
     def write(evaluation: Any) -> None:
-        info = checkpoint_info(config, data.classes, epochs_done=epochs, best_epoch=best_epoch, evaluation=evaluation)
+        info = checkpoint_info(
+            config,
+            data.classes,
+            epochs_done=epochs,
+            best_epoch=best_epoch,
+            evaluation=evaluation,
+            drawn_biases=trainer.drawn,
+        )
         info["data"] = data.summary()
         card = model_card(config, info)
         save_checkpoint(
@@ -366,8 +352,7 @@ def publish(
 def evaluate_untrained(job: Job, data: Resident, out: Path, device: torch.device) -> dict[str, Any]:
     """Probe and evaluate a network as it was drawn."""
     config = dataclasses.replace(Job(job.model, "simclr", seed=job.seed).config(1), precision="float32")
-    with _drawing:
-        model = load_model(job.model, seed=job.seed, classes=len(data.classes)).to(device)
+    model = load_model(job.model, seed=job.seed, classes=len(data.classes)).to(device)
     fit_probe(
         model, data.train.batches(), classes=len(data.classes), epochs=config.probe_epochs, seed=job.seed, device=device
     )
@@ -389,42 +374,37 @@ def run_job(
     device: torch.device,
     out: Path,
     *,
-    exclusive: Any,
-    shared: Any,
-    long: Any,
     budget: float,
     deadline: float,
     precision: str = "bf16",
+    batch: int = 256,
     last_call: bool = False,
 ) -> str:
-    """Train a job to its end, or until the deadline; return ``finished`` or ``stopped``.
+    """Train a job to its end, or until the deadline; return ``finished``, ``diverged`` or ``stopped``.
 
     Args:
         job, data, device: What, on what, where.
         out: The job's folder; a state in it is gone on with.
-        exclusive, shared, long: Context managers: recording a graph is alone on the device; launches pause for it,
-            long work does not.
         budget: Seconds that the training may take over all calls; the schedule ends with them, or with the job's
             epochs if they come first.
         deadline: time.monotonic() at which it stops and saves its state.
         precision: ``bf16`` or ``float32``.
+        batch: Sweeps per step.
         last_call: Nobody will go on with it: let the schedule end at the deadline.
     """
     out.mkdir(parents=True, exist_ok=True)
     if (out / RESULT).is_file():
-        return "finished"
+        return str(read_json(out / RESULT).get("status", "finished"))
+    started = time.monotonic()
     if job.objective == "untrained":
-        with long():
-            evaluate_untrained(job, data, out, device)
+        evaluate_untrained(job, data, out, device)
         return "finished"
     state = read_plain(out / STATE)
-    epochs = int(state["epochs"]) if state else job.epochs
-    precision = str(state["precision"]) if state else precision
     if state and state["data"] != data.hash:
         _log.warning("%s: the state belongs to other data; starting anew", job.name)
         state = None
-    started = time.monotonic()
-    trainer = prepared_trainer(job, data, device, epochs, precision, exclusive, long)
+    precision = str(state["precision"]) if state else precision
+    trainer = prepared_trainer(job, data, device, job.epochs, precision, batch)
     if state:
         trainer.load(out / STATE)
     prepared = time.monotonic() - started
@@ -437,36 +417,39 @@ def run_job(
     note(kind="start", prepared=prepared, steps=trainer.steps, precision=precision)
     if last_call:
         budget = min(budget, trainer.seconds + deadline - time.monotonic())
-    took, checked, saved, validating = 0.0, 0.0, time.monotonic(), 0.0
+    status, took, checked, saved, validating = "finished", 0.0, 0.0, time.monotonic(), 0.0
     while (progress := trainer.progress(budget, job.epochs, took)) < 1.0:
-        began = time.monotonic()
-        if began > deadline:
-            with long():
-                trainer.save(out / STATE)
+        began, skipped = time.monotonic(), float(trainer.skipped)
+        # An epoch that would pass the deadline is not begun; later ones are as long as the last.
+        if began + 0.8 * took > deadline:
+            trainer.save(out / STATE)
             note(kind="stopped", progress=progress)
             return "stopped"
         ahead = max(progress + took / budget, (trainer.epoch + 1) / job.epochs)
-        loss = trainer.train_epoch(shared, progress, ahead)
+        loss = trainer.train_epoch(progress, ahead)
         took = time.monotonic() - began
-        line: dict[str, Any] = {"kind": "epoch", "loss": loss, "seconds": took, "progress": progress}
+        missed = float(trainer.skipped) - skipped
+        line: dict[str, Any] = {"kind": "epoch", "loss": loss, "seconds": took, "progress": progress, "skipped": missed}
+        if missed > HOPELESS * trainer.steps:
+            note(**line)
+            status = "diverged"
+            break
         if trainer.epoch == 1 or trainer.progress(budget, job.epochs, took) >= min(1.0, checked + 0.1):
             began = time.monotonic()
-            line["validation"], checked = trainer.validate(shared), progress
+            line["validation"], checked = trainer.validate(), progress
             validating += time.monotonic() - began
-        note(**line, skipped=float(trainer.skipped))
+        note(**line)
         if time.monotonic() - saved > SAVED:
-            with long():
-                trainer.save(out / STATE)
+            trainer.save(out / STATE)
             saved = time.monotonic()
-    trainer.config = dataclasses.replace(job.config(max(1, trainer.epoch)), precision=precision)
-    status, began = "finished", time.monotonic()
-    with long():
-        result = trainer.finish(out)
+    trainer.config = dataclasses.replace(job.config(max(1, trainer.epoch)), precision=precision, batch_size=batch)
+    began = time.monotonic()
+    result = trainer.finish(out)
     result |= {
         "status": status,
         "training_seconds": trainer.seconds,
         "sweeps_per_second": trainer.steps * trainer.order.shape[1] * trainer.epoch / max(trainer.seconds, 1e-9),
-        "best": trainer.best,
+        "best": trainer.best if math.isfinite(trainer.best) else None,
         "precision": precision,
         "skipped_steps": float(trainer.skipped),
         "seconds": {
@@ -477,25 +460,24 @@ def run_job(
         },
     }
     write_json(out / RESULT, result)
-    note(kind="finished", top1=result["evaluation"]["top1"])
+    note(kind=status, top1=result["evaluation"]["top1"])
     (out / STATE).unlink(missing_ok=True)
     return status
 
 
 def prepared_trainer(
-    job: Job, data: Resident, device: torch.device, epochs: int, precision: str, alone: Any, together: Any
+    job: Job, data: Resident, device: torch.device, epochs: int, precision: str, batch: int
 ) -> Trainer:
     """Return a trainer, in the fastest way that works here."""
     for fused, graphs in ((True, True), (False, True), (False, False)):
-        with together():
-            trainer = Trainer(job, data, device, epochs, precision)
+        trainer = Trainer(job, data, device, epochs, precision, batch)
         try:
-            trainer.prepare(alone, together, fused=fused, graphs=graphs)
+            trainer.prepare(fused=fused, graphs=graphs)
         except Exception:  # compilers and drivers fail in many ways
             if not graphs or device.type != "cuda":
                 raise
             _log.exception("%s: fused %s, recorded %s does not work here", job.name, fused, graphs)
-            torch.cuda.current_stream(device).synchronize()
+            torch.cuda.synchronize(device)
         else:
             return trainer
     raise RuntimeError("unreachable")

@@ -11,6 +11,8 @@ from brainbench.models.evaluation import Evaluation
 from brainbench.models.registry import describe_model
 from brainbench.models.training.config import TrainingConfig
 
+_START = "| start | biases drawn as PyTorch does: layer norm of silence has a slope of 316, step after step |"
+
 
 def checkpoint_info(
     config: TrainingConfig,
@@ -19,8 +21,12 @@ def checkpoint_info(
     epochs_done: int,
     best_epoch: int | None,
     evaluation: Evaluation | None,
+    drawn_biases: int = 0,
 ) -> dict[str, Any]:
-    """Return what a checkpoint's configuration says beside the architecture, in plain values."""
+    """Return what a checkpoint's configuration says beside the architecture, in plain values.
+
+    ``drawn_biases`` is what :func:`~brainbench.models.training.start.draw_silent_biases` returned.
+    """
     return {
         "objective": config.objective,
         "augmentation": config.augmentation + (f" + {config.masking:.0%} masking" if config.masking else ""),
@@ -29,6 +35,7 @@ def checkpoint_info(
         "epochs": epochs_done,
         "published_epochs": 100,
         "best_epoch": best_epoch,
+        "drawn_biases": drawn_biases,
         "training": dataclasses.asdict(config),
         "evaluation": to_plain(evaluation),
         "twin": config.model,
@@ -51,9 +58,11 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
         f"| architecture | {config.model} ({known.citation}) |",
         f"| parameters | {known.parameters:,} with 117 classes; {len(info['classes'])} classes here |",
         "| input | sweeps [B, T, 30, 5, 7] in N and N·m; normalised inside |",
+        *_data(info.get("data")),
         f"| epochs | {info['epochs']} (published: {info['published_epochs']}); best: {info['best_epoch']} |",
         f"| optimiser | {config.optimizer}, {config.schedule}, learning rate {config.learning_rate:g}, batch "
-        f"{config.batch_size} |",
+        f"{config.batch_size}, gradients clipped to a norm of {config.clip:g}, {config.precision} |",
+        *([_START] if info.get("drawn_biases") else []),
         f"| augmentation | {info['augmentation']} |",
         f"| seed | {config.seed} |",
     ]
@@ -67,10 +76,33 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
             f"| collapsed | {'yes: ' + found['reason'] if found['collapsed'] else 'no'} |",
         ]
     lines += [
-        f"| untrained twin | {info['twin']} |",
+        f"| untrained twin | {info['twin']}{_beside(found, info.get('twin_evaluation'))} |",
         f"| licence | {info['licence']} |",
         "",
         "Trained on simulated touch alone; what it says about brains is what `brainbench score` measures.",
         "",
     ]
     return "\n".join(lines)
+
+
+def _data(data: Mapping[str, Any] | None) -> list[str]:
+    if not data:
+        return []
+    return [
+        f"| data | {data['hash']}: {data['train']:,} sweeps to train, {data['validation']:,} to validate, "
+        f"{data['test']:,} of other objects to test; {data['left_out']:,} left out as unstable |"
+    ]
+
+
+def _beside(found: Mapping[str, Any] | None, twin: Mapping[str, Any] | None) -> str:
+    """Return how a twin, read by a linear probe, compares with what was trained."""
+    if not found or not twin:
+        return ""
+    low, high = twin["interval"]["low"], twin["interval"]["high"]
+    if found["interval"]["low"] > high:
+        verdict = "training helped"
+    elif found["interval"]["high"] < low:
+        verdict = "**training made it worse**"
+    else:
+        verdict = "**training changed less than these intervals can tell**"
+    return f", linear probe: top-1 {twin['top1']:.3f} [{low:.3f}, {high:.3f}]; {verdict}"

@@ -54,7 +54,8 @@ def fit_probe(
     if not torch.isfinite(features).all():
         raise DataError("The features of the training sweeps are not finite, so no probe can be fitted.")
     mean, scale = features.mean(0), features.std(0)
-    scale = torch.where(scale > 1e-12, scale, torch.ones_like(scale))
+    # What hardly varies is left small: blown up, its weights would be too large to be stored.
+    scale = scale.clamp_min(max(1e-4 * float(scale.max()), 1e-12))
     features = (features - mean) / scale
     generator = torch.Generator().manual_seed(seed)
     layer = Linear(features.shape[1], classes).to(features.device)

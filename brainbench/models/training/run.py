@@ -41,6 +41,7 @@ from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.logs import RunLog
 from brainbench.models.training.probe import fit_probe
 from brainbench.models.training.processes import Processes, processes
+from brainbench.models.training.start import draw_silent_biases
 from brainbench.models.training.state import load_state, save_state
 from brainbench.types import Progress
 
@@ -121,6 +122,7 @@ class _Run:
         self.options: dict[str, Any] = {"classes": len(data.classes), "decoder": config.decoder}
         self._claim()
         model = load_model(config.model, seed=config.seed, **self.options).train()
+        self.drawn = draw_silent_biases(model)
         learner = make_learner(config.objective, model)
         if where.count > 1 and config.batch_size % where.count:
             raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
@@ -281,7 +283,12 @@ class _Run:
 
     def _publish(self, result: Evaluation | None) -> None:
         info = checkpoint_info(
-            self.config, self.data.classes, epochs_done=self.epoch, best_epoch=self.best_epoch, evaluation=result
+            self.config,
+            self.data.classes,
+            epochs_done=self.epoch,
+            best_epoch=self.best_epoch,
+            evaluation=result,
+            drawn_biases=self.drawn,
         )
         save_checkpoint(
             self.out / BEST,
