@@ -36,7 +36,9 @@ def elastomer_structs() -> SimpleNamespace:
         poisson: wp.float32
         softening: wp.float32
         thickness: wp.float32
-        expansion: wp.float32
+        recoil: wp.float32
+        expansion_x: wp.float32
+        expansion_y: wp.float32
         frame_x: wp.float32
         frame_y: wp.float32
         center: wp.vec3f
@@ -50,7 +52,6 @@ def elastomer_structs() -> SimpleNamespace:
         step_y: wp.float32
         link: wp.int32
         slot: wp.int32
-        first_point: wp.int32
         own_first: wp.int32
         own_last: wp.int32
 
@@ -157,13 +158,18 @@ def spread_kernel(planes: int) -> Any:
 
 
 @cache
-def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
-    """Return the kernel that follows surface points inside the elastomer (before 4.20). Dim [B, S].
+def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> Any:
+    """Return the kernel that follows surface points inside the elastomer (before 4.20).
 
     A point sets its anchor where it sinks below −enter and loses it above +leave, or when its geometry no longer
-    touches. Points with an anchor are listed without gaps, in a fixed order, if they moved since: place (3) and
-    s_s h times the way since the anchor (3). Anchors are [P, 3, B] (x NaN: none): threads are environments. Blocks of
-    points that hold no anchor and lie off the pad are passed over; ``held`` counts the anchors of each.
+    touches. Points with an anchor are listed, block by block in a fixed order, if they moved since: place (3) and
+    s_s h times the way since the anchor (3). Anchors are [P, 3, B] (x NaN: none). Blocks of points that hold no anchor
+    and lie off the pad are passed over; ``held`` counts the anchors of each and ``moved`` what it lists.
+
+    Args:
+        kinds: of the pad's geometries.
+        raycast: ask triangles.
+        side_by_side: environments are neighbouring threads, dim [S · blocks, B]; otherwise dim [B, S · blocks].
     """
     import warp as wp
 
@@ -192,89 +198,86 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool) -> Any:
         pairs: pairs_type,
         cloud: cloud_type,
         io: io_type,
+        blocks: int,
         anchor: wp.array3d(dtype=wp.float32),
         held: wp.array2d(dtype=wp.int32),
-        live: wp.array2d(dtype=wp.int32),
         moved: wp.array2d(dtype=wp.int32),
+        dragged: wp.array2d(dtype=wp.int32),
         listed: wp.array2d(dtype=wp.spatial_vectorf),
     ):
-        env, part = wp.tid()
+        i, j = wp.tid()
+        env = i
+        store = j
+        if wp.static(side_by_side):
+            env = j
+            store = i
+        part = store // blocks
         gel = gels[part]
+        had = held[store, env]
+        if io.age[env] == 0:
+            had = 0
+        moved[store, env] = 0
         count = pairs.count[env, gel.slot]
-        fresh = io.age[env] == 0
-        if (io.status[env] & 1) != 0:
-            live[part, env] = 0
-            moved[part, env] = 0
-            return
-        if fresh:
-            live[part, env] = 0
-        if count == 0 and live[part, env] == 0:
-            moved[part, env] = 0
-            return
         row = env % cloud.first.shape[0]
-        solid_row = env % solids.kind.shape[0]
-        # After a lull (none alive) every stored anchor is stale.
-        stale = live[part, env] == 0
-        found = int(0)
-        alive = int(0)
-        place = int(gel.first_point)
+        # Which geometry the block belongs to, counted through those that are tracked.
+        block = store - part * blocks
+        geometry = int(-1)
         for member in range(tracked.shape[0]):
-            geometry = tracked[member]
-            at = int(-1)
+            if geometry < 0:
+                if block < cloud.blocks[row, tracked[member]]:
+                    geometry = tracked[member]
+                else:
+                    block -= cloud.blocks[row, tracked[member]]
+        at = int(-1)
+        if geometry >= 0:
             for k in range(count):
                 if pairs.geometry[env, pairs.first[gel.slot] + k] == geometry:
                     at = pairs.first[gel.slot] + k
-            first = cloud.first[row, geometry]
-            blocks = cloud.blocks[row, geometry]
-            for block in range(blocks):
-                store = (place + block * wp.static(BLOCK)) // wp.static(BLOCK)
-                had = held[store, env]
-                if stale:
-                    had = 0
-                near = False
-                rotation = wp.mat33f()
-                offset = wp.vec3f()
-                if at >= 0:
-                    rotation = wp.transpose(pairs.rotation[env, at])
-                    offset = pairs.offset[env, at]
-                    sphere = cloud.sphere[first + block]
-                    middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
-                    near = height_over(solids, own, gel, solid_row, middle) - sphere[3] <= gel.leave
-                holds = int(0)
-                if near:
-                    for i in range(wp.static(BLOCK)):
-                        p = cloud.point[(first + block) * wp.static(BLOCK) + i]
-                        if not wp.isnan(p[0]):
-                            index = place + block * wp.static(BLOCK) + i
-                            kept = wp.static(float("nan"))
-                            if had > 0:
-                                kept = anchor[index, 0, env]
-                            z = rotation @ (p - offset)
-                            phi = height_over(solids, own, gel, solid_row, z)
-                            if wp.isnan(kept):
-                                if phi < -gel.enter:
-                                    kept = z[0]
-                                    anchor[index, 1, env] = z[1]
-                                    anchor[index, 2, env] = z[2]
-                            elif phi > gel.leave:
-                                kept = wp.static(float("nan"))
-                            anchor[index, 0, env] = kept
-                            if not wp.isnan(kept):
-                                drive = gel.shear * wp.max(-phi, 0.0)
-                                way = z - wp.vec3f(kept, anchor[index, 1, env], anchor[index, 2, env])
-                                if drive * wp.length_sq(way) > 0.0:
-                                    way = drive * way
-                                    listed[gel.first_point + found, env] = wp.spatial_vectorf(
-                                        z[0], z[1], z[2], way[0], way[1], way[2]
-                                    )
-                                    found += 1
-                                holds += 1
-                if stale or holds != had:
-                    held[store, env] = holds
-                alive += holds
-            place += blocks * wp.static(BLOCK)
-        live[part, env] = alive
-        moved[part, env] = found
+        if at < 0 or (io.status[env] & 1) != 0:
+            held[store, env] = 0
+            return
+        rotation = wp.transpose(pairs.rotation[env, at])
+        offset = pairs.offset[env, at]
+        first = cloud.first[row, geometry] + block
+        sphere = cloud.sphere[first]
+        solid_row = env % solids.kind.shape[0]
+        middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
+        if height_over(solids, own, gel, solid_row, middle) - sphere[3] > gel.leave:
+            held[store, env] = 0
+            return
+        found = int(0)
+        holds = int(0)
+        for n in range(wp.static(BLOCK)):
+            p = cloud.point[first * wp.static(BLOCK) + n]
+            if not wp.isnan(p[0]):
+                index = store * wp.static(BLOCK) + n
+                kept = wp.static(float("nan"))
+                if had > 0:
+                    kept = anchor[index, 0, env]
+                z = rotation @ (p - offset)
+                phi = height_over(solids, own, gel, solid_row, z)
+                if wp.isnan(kept):
+                    if phi < -gel.enter:
+                        kept = z[0]
+                        anchor[index, 1, env] = z[1]
+                        anchor[index, 2, env] = z[2]
+                elif phi > gel.leave:
+                    kept = wp.static(float("nan"))
+                anchor[index, 0, env] = kept
+                if not wp.isnan(kept):
+                    drive = gel.shear * wp.max(-phi, 0.0)
+                    way = z - wp.vec3f(kept, anchor[index, 1, env], anchor[index, 2, env])
+                    if drive * wp.length_sq(way) > 0.0:
+                        way = drive * way
+                        listed[store * wp.static(BLOCK) + found, env] = wp.spatial_vectorf(
+                            z[0], z[1], z[2], way[0], way[1], way[2]
+                        )
+                        found += 1
+                    holds += 1
+        held[store, env] = holds
+        if found > 0:
+            moved[store, env] = found
+            dragged[env, part] = io.age[env] * 1024 + io.episode[env]
 
     return anchors
 
@@ -326,7 +329,9 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
         stamp: wp.array2d(dtype=wp.int32),
         height: wp.array3d(dtype=wp.float32),
         spread: wp.array3d(dtype=wp.float32),
-        live: wp.array2d(dtype=wp.int32),
+        blocks: int,
+        moved: wp.array2d(dtype=wp.int32),
+        dragged: wp.array2d(dtype=wp.int32),
         listed: wp.array2d(dtype=wp.spatial_vectorf),
     ):
         env, n = wp.tid()
@@ -372,40 +377,45 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
                         h = height[plane, env, gel.start + source]
                         if h > 0.0:
                             away = across_plane(x - probes.position[gel.start + source], normal)
-                            w = wp.exp(-gel.spread * wp.dot(away, away))
+                            square = gel.spread * wp.dot(away, away)
+                            w = wp.exp(-square)
+                            if wp.static(layered):
+                                away = (1.0 - gel.recoil * square) * away
                             bulge = height[wp.static(planes) + plane, env, gel.start + source]
                             u += gel.dilate * w * (h * away + bulge * normal)
                 if wp.static(layered):
-                    if gel.expansion != 0.0:
+                    if gel.expansion_x != 0.0 or gel.expansion_y != 0.0:
                         for source in range(gel.rows * gel.columns):
                             total += height[plane, env, gel.start + source]
                         local = x - gel.center
                         bx = wp.dot(local, gel.along)
                         by = wp.dot(local, gel.across)
-                        scale = gel.expansion * total / float(gel.rows * gel.columns)
+                        scale = total / float(gel.rows * gel.columns)
                         ux = bx
                         uy = by
                         if gel.frame_x > 0.0:
                             # Displacement of a layer whose edges are clamped: the first mode that vanishes there.
                             ux = gel.frame_x / wp.pi * wp.sin(wp.pi * wp.clamp(bx / gel.frame_x, -1.0, 1.0))
                             uy = gel.frame_y / wp.pi * wp.sin(wp.pi * wp.clamp(by / gel.frame_y, -1.0, 1.0))
-                        u += scale * (ux * gel.along + uy * gel.across)
+                        u += scale * (gel.expansion_x * ux * gel.along + gel.expansion_y * uy * gel.across)
                 if plane == 0:
                     truth = u
                 else:
                     signal = u
         slide = wp.vec3f(0.0)
-        for k in range(live[part, env]):
-            point = listed[gel.first_point + k, env]
-            slip = across_plane(wp.vec3f(point[3], point[4], point[5]), normal)
-            away = across_plane(x - wp.vec3f(point[0], point[1], point[2]), normal)
-            if wp.static(layered):
-                if gel.layered == 1:
-                    slide += traction(gel, away, slip)
-                else:
-                    slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
-            else:
-                slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
+        if dragged[env, part] == io.age[env] * 1024 + io.episode[env]:
+            for block in range(part * blocks, part * blocks + blocks):
+                for k in range(moved[block, env]):
+                    point = listed[block * wp.static(BLOCK) + k, env]
+                    slip = across_plane(wp.vec3f(point[3], point[4], point[5]), normal)
+                    away = across_plane(x - wp.vec3f(point[0], point[1], point[2]), normal)
+                    if wp.static(layered):
+                        if gel.layered == 1:
+                            slide += traction(gel, away, slip)
+                        else:
+                            slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
+                    else:
+                        slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
         if wp.static(planes == 1):
             signal = truth
         truth += slide

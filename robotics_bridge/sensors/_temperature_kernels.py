@@ -110,106 +110,102 @@ def thermal_kernels() -> SimpleNamespace:
         conductance: wp.array2d(dtype=wp.float32),
         inflow: wp.array2d(dtype=wp.float32),
     ):
-        """Add the conductance of every contact (W/K) to the cell it lies in. Dim [B, S]; see the module."""
-        env, s = wp.tid()
-        grid = sensors[s]
+        """Add the conductance of every contact (W/K) to the cell it lies in. Dim [B, S, M]; see the module."""
+        env, s, i = wp.tid()
         count = wp.min(number[env, s], kept.shape[2])
-        if (status[env] & 1) != 0:
-            count = 0
+        if i >= count or (status[env] & 1) != 0:
+            return
+        grid = sensors[s]
         frame = pose[env, grid.link]
-        for i in range(count):
-            c = kept[env, s, i]
-            other = other_link(contact_geom[c], link_of, grid.link)
-            # The points that share the other link: their number, centre and mean normal.
-            points = int(0)
-            rank = int(0)
-            center = wp.vec3f(float(0.0), float(0.0), float(0.0))
-            normal = wp.vec3f(float(0.0), float(0.0), float(0.0))
-            spots = float(0.0)
-            deepest = float(0.0)
+        c = kept[env, s, i]
+        other = other_link(contact_geom[c], link_of, grid.link)
+        # The points that share the other link: their number, centre and mean normal.
+        points = int(0)
+        center = wp.vec3f(float(0.0), float(0.0), float(0.0))
+        normal = wp.vec3f(float(0.0), float(0.0), float(0.0))
+        spots = float(0.0)
+        deepest = float(0.0)
+        for j in range(count):
+            d = kept[env, s, j]
+            if other_link(contact_geom[d], link_of, grid.link) == other:
+                points = points + 1
+                center = center + contact_position[d]
+                side = contact_normal[d]
+                if wp.dot(side, contact_normal[c]) < float(0.0):
+                    side = -side
+                normal = normal + side
+                spots = spots + spot(contact_distance[d], grid.bluntness)
+                deepest = wp.max(deepest, -contact_distance[d])
+        center = center / float(points)
+        area = spots
+        if points >= 3:
+            # Polygon about the centre, by polar angle: each point spans a triangle with the next one.
+            n = wp.normalize(normal)
+            u = wp.cross(n, wp.vec3f(float(1.0), float(0.0), float(0.0)))
+            if wp.length(u) < float(0.5):
+                u = wp.cross(n, wp.vec3f(float(0.0), float(1.0), float(0.0)))
+            u = wp.normalize(u)
+            v = wp.cross(n, u)
+            polygon = float(0.0)
             for j in range(count):
                 d = kept[env, s, j]
                 if other_link(contact_geom[d], link_of, grid.link) == other:
-                    points = points + 1
-                    center = center + contact_position[d]
-                    side = contact_normal[d]
-                    if wp.dot(side, contact_normal[c]) < float(0.0):
-                        side = -side
-                    normal = normal + side
-                    spots = spots + spot(contact_distance[d], grid.bluntness)
-                    deepest = wp.max(deepest, -contact_distance[d])
-                    if d < c:
-                        rank = rank + 1
-            center = center / float(points)
-            area = spots
-            if points >= 3:
-                # Polygon about the centre, by polar angle: each point spans a triangle with the next one.
-                n = wp.normalize(normal)
-                u = wp.cross(n, wp.vec3f(float(1.0), float(0.0), float(0.0)))
-                if wp.length(u) < float(0.5):
-                    u = wp.cross(n, wp.vec3f(float(0.0), float(1.0), float(0.0)))
-                u = wp.normalize(u)
-                v = wp.cross(n, u)
-                polygon = float(0.0)
-                for j in range(count):
-                    d = kept[env, s, j]
-                    if other_link(contact_geom[d], link_of, grid.link) == other:
-                        p = contact_position[d] - center
-                        x = wp.dot(p, u)
-                        y = wp.dot(p, v)
-                        angle = wp.atan2(y, x)
-                        least = float(7.0)
-                        nx = x
-                        ny = y
-                        for k in range(count):
-                            e = kept[env, s, k]
-                            if k != j and other_link(contact_geom[e], link_of, grid.link) == other:
-                                q = contact_position[e] - center
-                                qx = wp.dot(q, u)
-                                qy = wp.dot(q, v)
-                                turn = wp.atan2(qy, qx) - angle
-                                if turn < float(0.0) or (turn == float(0.0) and k < j):
-                                    turn = turn + float(6.283185307179586)
-                                if turn < least:
-                                    least = turn
-                                    nx = qx
-                                    ny = qy
-                        polygon = polygon + float(0.5) * (x * ny - y * nx)
-                area = wp.max(area, polygon)
+                    p = contact_position[d] - center
+                    x = wp.dot(p, u)
+                    y = wp.dot(p, v)
+                    angle = wp.atan2(y, x)
+                    least = float(7.0)
+                    nx = x
+                    ny = y
+                    for k in range(count):
+                        e = kept[env, s, k]
+                        if k != j and other_link(contact_geom[e], link_of, grid.link) == other:
+                            q = contact_position[e] - center
+                            qx = wp.dot(q, u)
+                            qy = wp.dot(q, v)
+                            turn = wp.atan2(qy, qx) - angle
+                            if turn < float(0.0) or (turn == float(0.0) and k < j):
+                                turn = turn + float(6.283185307179586)
+                            if turn < least:
+                                least = turn
+                                nx = qx
+                                ny = qy
+                    polygon = polygon + float(0.5) * (x * ny - y * nx)
+            area = wp.max(area, polygon)
+        if grid.published == 1:
+            # The published floor π d_w δ lacks a length; the radius supplies it.
+            area = wp.max(area, wp.pi * grid.depth_weight * wp.max(deepest, float(0.0)) * grid.bluntness)
+        whole = area
+        area = area / float(points)
+        if area > float(0.0):
+            local = wp.transform_point(wp.transform_inverse(frame), contact_position[c])
+            index = int(0)
+            for axis in range(3):
+                cell = int(wp.floor((local[axis] - grid.low[axis]) / grid.cell[axis]))
+                index = index * grid.shape[axis] + wp.clamp(cell, 0, grid.shape[axis] - 1)
+            index = grid.first + index
+            k_own = grid.conductivity
+            k_other = link_conductivity[other]
+            g = float(0.0)
             if grid.published == 1:
-                # The published floor π d_w δ lacks a length; the radius supplies it.
-                area = wp.max(area, wp.pi * grid.depth_weight * wp.max(deepest, float(0.0)) * grid.bluntness)
-            whole = area
-            area = area / float(points)
-            if area > float(0.0):
-                local = wp.transform_point(wp.transform_inverse(frame), contact_position[c])
-                index = int(0)
-                for axis in range(3):
-                    cell = int(wp.floor((local[axis] - grid.low[axis]) / grid.cell[axis]))
-                    index = index * grid.shape[axis] + wp.clamp(cell, 0, grid.shape[axis] - 1)
-                index = grid.first + index
-                k_own = grid.conductivity
-                k_other = link_conductivity[other]
-                g = float(0.0)
-                if grid.published == 1:
-                    volume = grid.cell[0] * grid.cell[1] * grid.cell[2]
-                    g = float(2.0) * k_own * k_other / (k_own + k_other) * whole * area / volume
-                else:
-                    facing = wp.quat_rotate_inv(wp.transform_get_rotation(frame), contact_normal[c])
-                    across = wp.abs(facing[0]) * grid.cell[0] + wp.abs(facing[1]) * grid.cell[1]
-                    across = across + wp.abs(facing[2]) * grid.cell[2]
-                    # The spot spreads within its cell as it does in the touched body.
-                    disc = float(4.0) * wp.sqrt(whole / wp.pi) / float(points)
-                    resistance = float(1.0) / (k_own * (float(2.0) * area / across + disc))
-                    if grid.contact > float(0.0):
-                        resistance = resistance + float(1.0) / (grid.contact * area)
-                    # A half-space that gives heat through a disc: planar at first, spreading later.
-                    time = touched[env, index] + float(0.5) * dt
-                    planar = area / wp.sqrt(wp.pi * link_diffusivity[other] * time)
-                    resistance = resistance + float(1.0) / (k_other * (planar + disc))
-                    g = float(1.0) / resistance
-                conductance[env, index] = conductance[env, index] + g
-                inflow[env, index] = inflow[env, index] + g * link_temperature[env, other]
+                volume = grid.cell[0] * grid.cell[1] * grid.cell[2]
+                g = float(2.0) * k_own * k_other / (k_own + k_other) * whole * area / volume
+            else:
+                facing = wp.quat_rotate_inv(wp.transform_get_rotation(frame), contact_normal[c])
+                across = wp.abs(facing[0]) * grid.cell[0] + wp.abs(facing[1]) * grid.cell[1]
+                across = across + wp.abs(facing[2]) * grid.cell[2]
+                # The spot spreads within its cell as it does in the touched body.
+                disc = float(4.0) * wp.sqrt(whole / wp.pi) / float(points)
+                resistance = float(1.0) / (k_own * (float(2.0) * area / across + disc))
+                if grid.contact > float(0.0):
+                    resistance = resistance + float(1.0) / (grid.contact * area)
+                # A half-space that gives heat through a disc: planar at first, spreading later.
+                time = touched[env, index] + float(0.5) * dt
+                planar = area / wp.sqrt(wp.pi * link_diffusivity[other] * time)
+                resistance = resistance + float(1.0) / (k_other * (planar + disc))
+                g = float(1.0) / resistance
+            wp.atomic_add(conductance, env, index, g)
+            wp.atomic_add(inflow, env, index, g * link_temperature[env, other])
 
     @wp.func
     def settled(x: wp.float64) -> wp.float64:

@@ -126,7 +126,7 @@ class TemperatureRuntime(ReadoutRuntime):
             self._link_of, self._structures, self.found_contacts, self._kept,
         )  # fmt: skip
         run(
-            k.conduct, self.found_contacts.shape, state.contact_geom, state.contact_distance, state.contact_position,
+            k.conduct, self._kept.shape, state.contact_geom, state.contact_distance, state.contact_position,
             state.contact_normal, self._link_of, self._structures, self.found_contacts, self._kept, state.status,
             state.pose, self._conductivity, self._diffusivity, self.link_temperature, self._touched, dt, self._g,
             self._inflow,

@@ -38,8 +38,12 @@ class Layer:
     """Radius over which a surface point spreads its traction (m)."""
     thickness: float = 0.0
     """Of a layer bonded to a rigid base (m); 0 means a half-space."""
-    expansion: float = 0.0
-    """Lateral strain of the pad per metre of its mean indentation (1/m): what the gel cannot compress, it widens."""
+    recoil: float = 0.0
+    """κ: how much of the push past its middle turns round, by 1 − κ λ_d r². The net push is 1 − 2κ of the published
+    one: at ½ the gel takes all that is displaced up, above it is drawn in, as under any load on a compressible body."""
+    expansion: float | tuple[float, float] = 0.0
+    """Lateral strain of the pad per metre of its mean indentation (1/m), or along and across: what the gel cannot
+    compress, it widens."""
     frame: tuple[float, float] | None = None
     """Half widths (m), along and across, of the clamped frame where the widening vanishes; None means free edges."""
 
@@ -51,6 +55,8 @@ class Layer:
                 f"softening is positive and thickness not negative (m); received {self.softening!r} and "
                 f"{self.thickness!r}."
             )
+        if not 0 <= self.recoil <= 2:
+            raise UsageError(f"recoil lies between 0 (as published) and 2; received {self.recoil!r}.")
         if self.frame is not None and not min(self.frame) > 0:
             raise UsageError(f"The half widths of a frame are positive (m); received {self.frame!r}.")
 
@@ -98,6 +104,8 @@ class ElastomerTaxel(QuerySensor):
                 f"dilation={self.dilation!r} needs a regular planar grid (Probes.grid); these probes are "
                 "placed freely. Use 'auto' or 'direct'."
             )
+        if self.dilation == "separable" and self.layer and self.layer.recoil:
+            raise UsageError("A layer with recoil has no separable dilation; use dilation='auto', 'fft' or 'direct'.")
         if self.points < 0 or min(self.dilate_spread, self.shear_spread, self.enter, self.leave) < 0:
             raise UsageError("points, spreads and the thresholds of an elastomer must not be negative.")
 
@@ -111,7 +119,9 @@ class ElastomerTaxel(QuerySensor):
         """How its dilation is summed."""
         if self.dilation != "auto":
             return self.dilation
-        return "separable" if self.planar else "direct"
+        if not self.planar:
+            return "direct"
+        return "fft" if self.layer and self.layer.recoil else "separable"
 
     def group(self) -> Hashable:
         """Sensors of one class and equal group share one runtime and its kernels."""
@@ -165,13 +175,14 @@ class ElastomerRuntime(ProbeRuntime):
         self._height = floats(2 * self._planes, envs, self.count)
         self._spread = floats(3 * self._planes, envs, self.count) if self._way != "direct" else floats(1, 1, 1)
         self._stamp = wp.full((envs, count), -1, dtype=wp.int32, device=device)
-        self._live = wp.zeros((count, envs), dtype=wp.int32, device=device)
-        total = max(count * self._total, 1)
+        self._dragged = wp.full((envs, count), -1, dtype=wp.int32, device=device)
+        self._blocks = -(-self._total // BLOCK)
+        total = max(count * self._blocks * BLOCK, 1)
         # Threads of a GPU are environments and want them side by side; a processor walks through the points of one.
         self._anchor = floats(total, 3, envs) if device.is_cuda else floats(envs, total, 3).transpose((1, 2, 0))
         self._listed = wp.zeros((envs, total), dtype=wp.spatial_vectorf, device=device).transpose((1, 0))
-        self._held = wp.zeros((-(-total // BLOCK), envs), dtype=wp.int32, device=device)
-        self._moved = wp.zeros((count, envs), dtype=wp.int32, device=device)
+        stores = (max(count * self._blocks, 1), envs)
+        self._held, self._moved = (wp.zeros(stores, dtype=wp.int32, device=device) for _ in range(2))
         exponents = np.array([sensor.exponent for sensor in self._sensors], np.float32)
         self._exponents = wp.array(exponents, dtype=wp.float32, device=device)
         self._weights, self._reach = self._weigh()
@@ -181,7 +192,7 @@ class ElastomerRuntime(ProbeRuntime):
     @property
     def state_bytes(self) -> int:
         """Lasting memory per environment [bytes]: readings, anchors, and what kernels hand to one another."""
-        followed = 9 * self._total * len(self._sensors) + 3 * len(self._sensors)
+        followed = (9 * self._total + 2 * self._blocks + 2) * len(self._sensors)
         spread = 3 * self._planes if self._way != "direct" else 0
         return super().state_bytes + 4 * (followed + self.count * (2 * self._planes + spread))
 
@@ -201,13 +212,14 @@ class ElastomerRuntime(ProbeRuntime):
             self._transform()
         if self._cloud:
             inputs = [self._gels, self._own, self._tracked, solids, pairs, self._cloud.struct, self.io]
-            inputs += [self._anchor, self._held, self._live, self._moved, self._listed]
-            kernel = kernels.anchor_kernel(self._own_kinds, self._raycast)
-            wp.launch(kernel, dim=(c.num_envs, len(self._sensors)), inputs=inputs, device=c.device)
+            inputs += [self._blocks, self._anchor, self._held, self._moved, self._dragged, self._listed]
+            kernel = kernels.anchor_kernel(self._own_kinds, self._raycast, c.device.is_cuda)
+            dim = (self._held.shape[0], c.num_envs)
+            wp.launch(kernel, dim=dim if c.device.is_cuda else dim[::-1], inputs=inputs, device=c.device)
         way = ("direct", "separable", "fft").index(self._way)
         kernel = kernels.marker_kernel(way, self._layered, self._planes, self.mode, *self.stores)
         inputs = [self.probes, self.io, self.knobs, self._gels, self._weights, self._reach, self._stamp, self._height]
-        self.launch(kernel, *inputs, self._spread, self._moved, self._listed)
+        self.launch(kernel, *inputs, self._spread, self._blocks, self._moved, self._dragged, self._listed)
         self.finish(dt)
 
     def _describe(self, own: list[tuple[int, ...]]) -> Any:
@@ -219,6 +231,7 @@ class ElastomerRuntime(ProbeRuntime):
         for index, (sensor, place) in enumerate(zip(self._sensors, self.places.values(), strict=True)):
             gel, probes, layer = kind(), sensor.probes, sensor.layer or Layer()
             rows, columns = place.layout if len(place.layout) == 2 else (1, place.count)
+            widening = layer.expansion if isinstance(layer.expansion, tuple) else (layer.expansion,) * 2
             along, across, normal = _axes(sensor)
             values = {
                 "dilate": sensor.dilate_scale,
@@ -232,7 +245,9 @@ class ElastomerRuntime(ProbeRuntime):
                 "poisson": layer.poisson,
                 "softening": layer.softening,
                 "thickness": layer.thickness,
-                "expansion": layer.expansion if sensor.layer else 0.0,
+                "recoil": layer.recoil,
+                "expansion_x": widening[0],
+                "expansion_y": widening[1],
                 "frame_x": layer.frame[0] if layer.frame else 0.0,
                 "frame_y": layer.frame[1] if layer.frame else 0.0,
                 "start": place.start,
@@ -242,7 +257,6 @@ class ElastomerRuntime(ProbeRuntime):
                 "step_x": probes.pitch[1] if probes.pitch else 0.0,
                 "link": self.context.scene.link_index(sensor.link),
                 "slot": int(slots[place.start]),
-                "first_point": index * self._total,
                 "own_first": owned,
                 "own_last": owned + len(own[index]),
             }
@@ -322,6 +336,8 @@ def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any
     pitch = sensor.probes.pitch or (1.0, 1.0)
     y = torch.arange(1 - rows, rows, device=device)[:, None] * pitch[0]
     x = torch.arange(1 - columns, columns, device=device)[None, :] * pitch[1]
-    bell = torch.exp(-sensor.dilate_spread * (x**2 + y**2))
+    reach = sensor.dilate_spread * (x**2 + y**2)
+    bell = torch.exp(-reach)
+    push = bell * (1 - (sensor.layer.recoil if sensor.layer else 0.0) * reach)
     size = (3 * rows - 2, 3 * columns - 2)
-    return size, torch.fft.rfft2(torch.stack([x * bell, y * bell, bell]), s=size)
+    return size, torch.fft.rfft2(torch.stack([x * push, y * push, bell]), s=size)

@@ -145,6 +145,22 @@ def test_a_clamped_frame_stops_the_widening_where_a_free_edge_moves_most() -> No
     assert np.abs(extra["free"][4, 5]).max() < 1e-9
 
 
+def test_a_layer_with_recoil_pushes_less_by_twice_its_share_however_it_is_summed() -> None:
+    fine = Probes.grid(41, 41, size=(0.04, 0.04), center=(0, 0, 0.005), radius=0.0005)
+    layers = {"published": Layer(), "half": Layer(recoil=0.25), "none": Layer(recoil=0.5)}
+    sensors = {name: _taxel(probes=fine, points=0, layer=layer, dilate_spread=3e5) for name, layer in layers.items()}
+    sensors["direct"] = _taxel(probes=fine, points=0, layer=layers["half"], dilate_spread=3e5, dilation="direct")
+    suite = _suite(sensors)
+    assert sensors["half"].way == "fft"
+    _press(suite, (0, 0, -0.001))
+    # Σ x · u is the displaced area: ∫ r² (1 − κ λ r²) e^(−λ r²) r dr is 1 − 2κ of the published one.
+    place = np.array(fine.position)[:, :2]
+    area = {name: float((place * suite.read(name)[0].flatten(0, 1).numpy()[:, :2]).sum()) for name in sensors}
+    assert area["half"] == pytest.approx(0.5 * area["published"], rel=2e-3)
+    assert abs(area["none"]) < 2e-3 * area["published"]
+    np.testing.assert_allclose(suite.read("direct"), suite.read("half"), atol=2e-6 * float(suite.read("half").max()))
+
+
 def test_noise_and_radius_error_act_on_the_measured_branch_only() -> None:
     noise = Noise(radius=3e-4, gain=(0.5, 0.5), hysteresis=0.5)
     suite = _suite({"clean": _taxel(), "noisy": _taxel(noise=noise)})
@@ -160,6 +176,8 @@ def test_noise_and_radius_error_act_on_the_measured_branch_only() -> None:
         (lambda: _taxel(dilation="fast"), "separable"),
         (lambda: Layer(poisson=0.7), "between 0 and 0.5"),
         (lambda: Layer(frame=(0.0, 1.0)), "half widths"),
+        (lambda: Layer(recoil=-0.1), "recoil lies between"),
+        (lambda: _taxel(layer=Layer(recoil=0.5), dilation="separable"), "no separable dilation"),
     ],
 )
 def test_mistakes_are_named(make: Any, message: str) -> None:

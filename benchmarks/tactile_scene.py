@@ -1,0 +1,228 @@
+"""What the tactile benchmarks measure: the published pyramid, its sensors, and states of it, kept in a file.
+
+One sensor of 10 × 10 taxels on the top of ``box0``, which ``box1`` half covers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brainbench.geometry import Mesh
+from robotics_bridge.physics import (
+    Geometry,
+    HandState,
+    MujocoEngine,
+    MujocoWarpEngine,
+    Scene,
+    initial_velocities,
+    pyramid,
+)
+from robotics_bridge.sensors import (
+    ContactAudio,
+    ContactDepthProbe,
+    ContactProbe,
+    ElastomerTaxel,
+    KinematicTaxel,
+    Noise,
+    Probes,
+    ProximityTaxel,
+    SensorSuite,
+    SurfaceDistanceProbe,
+    TemperatureGrid,
+)
+from robotics_bridge.sensors.audio_materials import Modes
+
+FULL = Noise.preset("published-force")
+CLASSES = ("kinematic", "depth", "contact", "distance", "proximity", "elastomer", "temperature", "audio")
+CELLS = {"temperature": 8, "audio": 160}
+"""Numbers of a reading of the sensors that are no taxels."""
+CONTACT = ("geom", "distance", "position", "normal", "force")
+State = Mapping[str, np.ndarray]
+
+
+def grid(count: int, radius: float = 0.004) -> Probes:
+    """About ``count`` taxels over the top face of a box."""
+    side = round(count**0.5)
+    return Probes.grid(side, max(1, round(count / side)), size=(0.2, 0.2), center=(0, 0, 0.125), radius=radius)
+
+
+def sensors(name: str, count: int = 100, points: int = 500, noise: Noise | None = None) -> dict[str, Any]:
+    """The published sensor of a class on ``box0``, tracking ``box1``."""
+    common: dict[str, Any] = {"link": "box0", "probes": grid(count), "track": ("box1",)}
+    if noise is not None:
+        common["noise"] = noise
+    makers = {
+        "distance": lambda: SurfaceDistanceProbe(**common),
+        "contact": lambda: ContactProbe(**common),
+        "depth": lambda: ContactDepthProbe(**common),
+        "kinematic": lambda: KinematicTaxel(**common),
+        "proximity": lambda: ProximityTaxel(**common, points=points),
+        "elastomer": lambda: ElastomerTaxel(**common, points=points),
+        "temperature": temperature,
+        "audio": _audio,
+    }
+    return {name: makers[name]()}
+
+
+def temperature(link: str = "box0") -> TemperatureGrid:
+    """The published grid of 2 × 2 × 2 cells."""
+    return TemperatureGrid(link=link, cells=(2, 2, 2))
+
+
+def _audio() -> ContactAudio:
+    modes = Modes(tuple(200.0 * k for k in range(1, 17)), (40.0,) * 16, (1.0,) * 16)
+    return ContactAudio(link="box0", modes=modes, samples=160)
+
+
+def engine_of(envs: int, device: str) -> Any:
+    """The engine of a device with the pyramid in its published start."""
+    model = pyramid()
+    if device == "cpu":
+        engine = MujocoEngine(model, envs, contacts=128)
+    else:
+        engine = MujocoWarpEngine(model, envs, device=device, contacts=128)
+    engine.set(qvel=initial_velocities(envs, model.nv))
+    return engine
+
+
+def snapshot(state: HandState) -> dict[str, np.ndarray]:
+    """Copy a state to the host; contacts sorted by environment."""
+    count = min(int(state.contact_count.numpy()[0]), state.contact_env.shape[0])
+    env = state.contact_env.numpy()[:count]
+    order = np.argsort(env, kind="stable")
+    kept = {name: getattr(state, f"contact_{name}").numpy()[:count][order] for name in CONTACT}
+    return {"pose": state.pose.numpy(), "velocity": state.velocity.numpy(), "env": env[order], **kept}
+
+
+def restore(found: State, envs: int, device: str, target: HandState | None = None) -> HandState:
+    """A state of ``envs`` environments on a device that repeats those of a snapshot."""
+    small, links = found["pose"].shape[:2]
+    order = np.arange(envs) % small
+    start = np.searchsorted(found["env"], np.arange(small + 1))
+    rows = [np.arange(start[s], start[s + 1]) for s in range(small)]
+    chosen = np.concatenate([rows[e] for e in order]).astype(int)
+    owner = np.repeat(np.arange(envs), [len(rows[e]) for e in order])
+    if target is None:
+        target = HandState.empty(envs, links, (len(found["env"]) // small + 16) * envs, device)
+    target.set_pose(found["pose"][order])
+    target.set_velocity(found["velocity"][order])
+    rest = {name: found[name][chosen] for name in CONTACT if name != "geom"}
+    target.set_contacts(owner, found["geom"][chosen], **rest)
+    return target
+
+
+def settled(envs: int, device: str, steps: int, brought: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+    """A snapshot of the settled pyramid, computed here or read from what was brought along."""
+    if brought is not None:
+        return {name.removeprefix("settled."): brought[name] for name in brought if name.startswith("settled.")}
+    engine = engine_of(envs, device)
+    engine.step(steps)
+    return snapshot(engine.state)
+
+
+def scene_of() -> Scene:
+    """The pyramid's geometries."""
+    return Scene.from_mujoco(pyramid())
+
+
+CHECKED = 8
+"""Environments and updates of the comparison of devices."""
+RESTARTED = [3, 5]
+
+
+def checked_sensors() -> dict[str, Any]:
+    """Sensors whose readings are compared between devices, clean and noisy."""
+    noise = Noise(white=1e-3, walk=1e-3)
+    config = {name: made for kind in CLASSES[:6] for name, made in sensors(kind, points=300).items()}
+    config |= {f"{name} noisy": replace(made, noise=noise) for name, made in config.items()}
+    config["kinematic raycast"] = replace(config["kinematic"], query="raycast")
+    config["kinematic engine"] = replace(config["kinematic"], total="engine")
+    return config | sensors("temperature") | sensors("audio")
+
+
+def episode(steps: int = CHECKED) -> list[dict[str, np.ndarray]]:
+    """Snapshots of a falling pyramid, from the processor's engine."""
+    engine = engine_of(CHECKED, "cpu")
+    engine.step(30)
+    found = []
+    for _ in range(steps):
+        engine.step()
+        found.append(snapshot(engine.state))
+    return found
+
+
+def replay(states: list[dict[str, np.ndarray]], device: str) -> dict[str, np.ndarray]:
+    """Readings [updates, B, ...] of the checked sensors over an episode, with a reset in its middle."""
+    config = checked_sensors()
+    suite = SensorSuite(scene_of(), config, num_envs=CHECKED, device=device)
+    state = restore(states[0], CHECKED, device)
+    read: dict[str, list[np.ndarray]] = {name: [] for name in config}
+    for number, found in enumerate(states):
+        restore(found, CHECKED, device, state)
+        suite.update(state)
+        if number == len(states) // 2:
+            suite.reset(RESTARTED)
+        for name, kept in read.items():
+            kept.append(suite.read(name).cpu().numpy().copy())
+    return {name: np.stack(kept) for name, kept in read.items()}
+
+
+def write_input(path: Path, steps: int) -> None:
+    """Write a settled state, an episode and its readings on this processor, to be taken to a GPU machine."""
+    states = episode()
+    arrays = {f"settled.{name}": value for name, value in settled(64, "cpu", steps, None).items()}
+    arrays |= {f"episode{k}.{name}": value for k, state in enumerate(states) for name, value in state.items()}
+    arrays |= {f"reading.{name}": value for name, value in replay(states, "cpu").items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def read_input(path: Path) -> dict[str, np.ndarray]:
+    """Read what :func:`write_input` wrote."""
+    with np.load(path, allow_pickle=False) as kept:
+        return {name: kept[name] for name in kept.files}
+
+
+def brought_episode(brought: Mapping[str, np.ndarray]) -> tuple[list[dict[str, np.ndarray]], dict[str, np.ndarray]]:
+    """The episode and its readings among what was brought along."""
+    states = []
+    for k in range(CHECKED):
+        head = f"episode{k}."
+        states.append({name.removeprefix(head): brought[name] for name in brought if name.startswith(head)})
+    readings = {name.removeprefix("reading."): brought[name] for name in brought if name.startswith("reading.")}
+    return states, readings
+
+
+def bumpy_box(edge: float, triangles: int) -> Mesh:
+    """A box whose faces are cut into about as many triangles."""
+    side = max(1, round((triangles / 12) ** 0.5))
+    points = np.linspace(-0.5, 0.5, side + 1) * edge
+    corners, faces = [], []
+    u, v = (axis.ravel() for axis in np.meshgrid(points, points, indexing="ij"))
+    for axis in range(3):
+        for sign in (-1, 1):
+            start = len(corners) * (side + 1) ** 2
+            sheet = np.zeros(((side + 1) ** 2, 3))
+            sheet[:, axis], sheet[:, (axis + 1) % 3], sheet[:, (axis + 2) % 3] = sign * edge / 2, u, v
+            corners.append(sheet)
+            for i in range(side):
+                for j in range(side):
+                    a = start + i * (side + 1) + j
+                    b, c, d = a + side + 1, a + side + 2, a + 1
+                    faces += [(a, b, c), (a, c, d)] if sign > 0 else [(a, c, b), (a, d, c)]
+    rounded = np.round(np.concatenate(corners), 9).astype(np.float64)
+    merged, index = np.unique(rounded, axis=0, return_inverse=True)
+    return Mesh(merged, index.reshape(-1)[np.array(faces)])
+
+
+def with_mesh(scene: Scene, name: str, triangles: int) -> Scene:
+    """The scene with one box replaced by triangles."""
+    number = scene.geometry_index(name)
+    old = scene.geometries[number]
+    new = Geometry(name=old.name, link=old.link, kind="mesh", mesh=bumpy_box(0.25, triangles))
+    return replace(scene, geometries=(*scene.geometries[:number], new, *scene.geometries[number + 1 :]))
