@@ -60,6 +60,7 @@ class MujocoEngine:
         self.num_envs = num_envs
         varied = check_fields(models[0], fields or {}, num_envs)
         self._models = [models[order[env % len(order)]] for env in range(num_envs)]
+        self._own_models = bool(varied)
         if varied:
             self._models = [
                 _with_fields(m, {k: v[env] for k, v in varied.items()}) for env, m in enumerate(self._models)
@@ -105,6 +106,51 @@ class MujocoEngine:
                 ) from None
             for data, row in zip(self._data, rows, strict=True):
                 getattr(data, name)[...] = row
+
+    def model_of(self, env: int) -> Any:
+        """Return the ``mujoco.MjModel`` of one environment."""
+        return self._models[env]
+
+    def set_fields(self, env: int, values: Mapping[str, ArrayLike]) -> None:
+        """Write model fields of one environment; derived constants are the caller's business.
+
+        Raises:
+            UsageError: the engine was made without ``fields``, so that environments share their model.
+        """
+        if not self._own_models:
+            raise UsageError("The environments share one model; make the engine with fields={...} to change them.")
+        for name, value in values.items():
+            getattr(self._models[env], name)[...] = value
+
+    def integration_state(self) -> NDArray[np.float64]:
+        """Return all that the next step of every environment depends on, [B, n]."""
+        mujoco = mujoco_module()
+
+        kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        rows = np.zeros((self.num_envs, mujoco.mj_stateSize(self.model, kind)))
+        for env, row in enumerate(rows):
+            mujoco.mj_getState(self._models[env], self._data[env], row, kind)
+        return rows
+
+    def set_integration_state(self, rows: NDArray[np.float64]) -> None:
+        """Take up what :meth:`integration_state` returned."""
+        mujoco = mujoco_module()
+
+        kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        for env, row in enumerate(rows):
+            mujoco.mj_setState(self._models[env], self._data[env], row, kind)
+
+    def kinematics(self) -> None:
+        """Refresh poses and velocities of the state at the current positions; contacts stay those of the last step."""
+        mujoco = mujoco_module()
+
+        def work(env: int) -> None:
+            model, data = self._models[env], self._data[env]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+
+        self._each(work)
 
     def step(self, steps: int = 1) -> None:
         """Advance every environment and refresh the state."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import MissingDependencyError, UsageError
+from brainbench.errors import MissingDependencyError, UsageError, unknown_name
 from robotics_bridge._device import pick_device, warp
 from robotics_bridge.physics._fields import check_fields, differing_fields
 from robotics_bridge.physics._state_kernels import mujoco_kernels
@@ -65,6 +65,7 @@ class MujocoWarpEngine:
         order = list(assignment) or list(range(len(models)))
         varied = differing_fields(models, order, num_envs) if len(models) > 1 else {}
         varied |= check_fields(self.model, fields or {}, num_envs)
+        self._varied = tuple(varied)
         with wp.ScopedDevice(self._device):
             self._m = _put_model(self._engine, self.model, varied, num_envs)
             contacts = contacts or 16 + 9 * int(np.count_nonzero(self.model.body_weldid))
@@ -113,6 +114,25 @@ class MujocoWarpEngine:
     def ctrl(self) -> torch.Tensor:
         """Controls [B, nu], a view."""
         return warp().to_torch(self._d.ctrl)
+
+    def field(self, name: str) -> torch.Tensor:
+        """Return a model field [B, ...], a view to write to; derived constants are the caller's business.
+
+        Raises:
+            UsageError: the field does not differ between environments here.
+        """
+        array = getattr(self._m, name, None)
+        if array is None or array.shape[0] != self.num_envs or (self.num_envs == 1 and name not in self._varied):
+            raise unknown_name("field that differs between environments", name, self._varied)
+        return warp().to_torch(array)
+
+    def kinematics(self) -> None:
+        """Refresh poses and velocities of the state at the current positions; contacts stay those of the last step."""
+        wp = warp()
+        with wp.ScopedDevice(self._device):
+            for stage in (self._engine.kinematics, self._engine.com_pos, self._engine.com_vel):
+                stage(self._m, self._d)
+            self._fill_links()
 
     def set(self, **values: ArrayLike | torch.Tensor) -> None:
         """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
@@ -168,10 +188,14 @@ class MujocoWarpEngine:
         self._engine.step(self._m, self._d)
         self._fill()
 
-    def _fill(self) -> None:
+    def _fill_links(self) -> None:
         wp, d, state, kernels = warp(), self._d, self.state, mujoco_kernels()
         poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
         wp.launch(kernels.links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
+
+    def _fill(self) -> None:
+        wp, d, state, kernels = warp(), self._d, self.state, mujoco_kernels()
+        self._fill_links()
         pyramidal = int(self.model.opt.cone == 0)
         c = d.contact
         inputs = [d.nacon, c.worldid, c.frame, c.dim, c.efc_address, d.efc.force, pyramidal]

@@ -1,0 +1,118 @@
+"""The goals of a batch of environments and how far each object is from its own. Letters: B environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from robotics_bridge.tasks.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.tasks.task import Task
+
+
+class GoalState:
+    """Buffers of goals, of rotation since the start, and of what happened in the last step."""
+
+    def __init__(self, task: Task, num_envs: int, device: torch.device) -> None:
+        import torch
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
+
+        self.goal, self._dt = task.goal, task.step_dt
+        self.quat, self.previous = zeros(4), zeros(4)
+        self.quat[:, 0] = self.previous[:, 0] = 1.0
+        """Goal, and orientation one step before [B, 4] (w, x, y, z)."""
+        self.angle, self.angle_before, self.left = zeros(), zeros(), zeros()
+        self.reached, self.missed = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
+        self.count, self.rate, self.off_axis, self.turned = zeros(), zeros(), zeros(), zeros()
+        self.on_axis = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self._axis = None
+        if self.goal is not None and self.goal.axis is not None:
+            self._axis = torch.tensor(self.goal.axis, device=device)
+            self._axis = self._axis / self._axis.norm()
+        self._turn = None if task.turn_axis is None else torch.tensor(task.turn_axis, device=device)
+        window = task.turn_window if self._turn is not None else 1
+        self._ring = torch.full((window, num_envs), float("inf"), device=device)
+        self._step = 0
+        self.turned_before = torch.full((num_envs,), float("inf"), device=device)
+
+    def reset(self, mask: torch.Tensor, quat: torch.Tensor, draw: Any) -> None:
+        """Start new episodes in some environments [B] bool, whose objects have orientations ``quat`` [B, 4]."""
+        import torch
+
+        self.previous.copy_(torch.where(mask.unsqueeze(1), quat, self.previous))
+        for name in ("count", "rate", "off_axis", "turned"):
+            getattr(self, name).masked_fill_(mask, 0.0)
+        self.on_axis |= mask
+        for name in ("reached", "missed"):
+            getattr(self, name).masked_fill_(mask, value=False)
+        self._ring.masked_fill_(mask, float("inf"))
+        if self.goal is not None:
+            self._set(mask, self.goal.first(quat, draw(2, 0.0, 1.0)), quat, draw)
+
+    def update(self, quat: torch.Tensor) -> None:
+        """Judge the orientations [B, 4] after a control step."""
+        step = multiply(quat, conjugate(self.previous))
+        self.previous.copy_(quat)
+        if self._turn is not None:
+            twist, _ = twist_and_swing(step, rotate(quat, self._turn))
+            self.turned += twist
+            place = self._step % self._ring.shape[0]
+            self.turned_before = self._ring[place].clone()
+            self._ring[place] = self.turned
+            self._step += 1
+        if self.goal is None:
+            return
+        error = multiply(self.quat, conjugate(quat))
+        self.angle_before.copy_(self.angle)
+        self.angle.copy_(angle_of(error))
+        if self._axis is not None:
+            twist, _ = twist_and_swing(step, self._axis)
+            self.rate.copy_(twist / self._dt)
+            _, swing = twist_and_swing(error, self._axis)
+            self.off_axis.copy_(swing)
+            self.on_axis.copy_(swing <= getattr(self.goal, "allowed_off_axis", float("inf")))
+        self.left -= self._dt
+        self.reached.copy_(self.angle < self.goal.threshold)
+        self.missed.copy_((self.left <= 0) & ~self.reached)
+        self.count += self.reached
+
+    def advance(self, quat: torch.Tensor, draw: Any) -> None:
+        """Propose the next goals where the present ones are reached or their time is up."""
+        if self.goal is not None:
+            following = self.goal.following(quat, self.quat, draw(2, 0.0, 1.0))
+            self._set(self.reached | self.missed, following, quat, draw)
+
+    def _set(self, mask: torch.Tensor, goal: torch.Tensor, quat: torch.Tensor, draw: Any) -> None:
+        import torch
+
+        self.quat.copy_(torch.where(mask.unsqueeze(1), goal, self.quat))
+        angle = angle_of(multiply(self.quat, conjugate(quat)))
+        self.angle.copy_(torch.where(mask, angle, self.angle))
+        deadline = None if self.goal is None else self.goal.deadline
+        if deadline is None:
+            self.left.fill_(float("inf"))
+        else:
+            self.left.copy_(torch.where(mask, draw(1, *deadline)[:, 0], self.left))
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return all memory."""
+        import torch
+
+        own = {name: value.clone() for name, value in self._memory().items()}
+        return {**own, "step": torch.tensor(self._step)}
+
+    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
+        """Take up what :meth:`state_dict` returned."""
+        for name, value in self._memory().items():
+            value.copy_(values[name])
+        self._step = int(values["step"])
+
+    def _memory(self) -> dict[str, torch.Tensor]:
+        names = ("quat", "previous", "angle", "angle_before", "left", "reached", "missed", "count", "rate", "off_axis")
+        own = {name: getattr(self, name) for name in (*names, "turned", "on_axis")}
+        return {**own, "ring": self._ring}

@@ -1,0 +1,63 @@
+"""Adapter to rsl_rl's ``VecEnv``: observations as a TensorDict of the groups of table 4.7."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from brainbench.errors import missing_dependency
+
+if TYPE_CHECKING:
+    import torch
+    from tensordict import TensorDict
+
+    from robotics_bridge.envs.env import Env
+
+
+class RslRlEnv:
+    """What rsl_rl's runners and algorithms call; it keeps no state of its own.
+
+    RND reads ``env.unwrapped.step_dt``, so ``unwrapped`` is the native environment.
+
+    Raises:
+        MissingDependencyError: tensordict is not installed.
+    """
+
+    def __init__(self, env: Env) -> None:
+        try:
+            import tensordict  # noqa: F401
+        except ImportError as error:
+            raise missing_dependency("tensordict", extra="policies", purpose="Learning with rsl_rl") from error
+        self.unwrapped = env
+        """The native environment."""
+        self.num_envs, self.num_actions, self.device = env.num_envs, env.num_actions, env.device
+        self.max_episode_length = env.max_episode_length
+        self.cfg: dict[str, Any] = {"task": env.task.name, "hand": env.hand.name, "observe": env.observe}
+        """What rsl_rl's logger keeps."""
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps [B] of the running episodes."""
+        return self.unwrapped.episode_length_buf
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        # rsl_rl assigns a new tensor to start episodes at random ages.
+        self.unwrapped.episode_length_buf.copy_(value)
+
+    def get_observations(self) -> TensorDict:
+        """Return the present observations, group → [B, ...]."""
+        from tensordict import TensorDict
+
+        groups = {name: value.clone() for name, value in self.unwrapped.observations.items()}
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)  # type: ignore[arg-type]
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance; returns observations, reward [B], done [B] and ``time_outs``, ``log``, ``info``."""
+        _, reward, terminated, truncated, info = self.unwrapped.step(actions)
+        extras = {"time_outs": truncated, "log": info["log"], "info": info}
+        return self.get_observations(), reward, terminated | truncated, extras
+
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Start new episodes everywhere (rsl_rl itself never calls this)."""
+        self.unwrapped.reset()
+        return self.get_observations(), {}

@@ -1,0 +1,197 @@
+"""What the taxels of a hand feel during a control step, as one tensor, and where each of its columns sits.
+
+Letters: B environment, S physics step of a control step, N column (active taxel, or link for ``agg_*``), C channel,
+L link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robotics_bridge._device import mujoco_module, warp
+from robotics_bridge.hands.observations import (
+    PATCH_FORCE_SCALE,
+    TAXELS_IN_CONTACT,
+    observation_type,
+    sensors_for,
+)
+from robotics_bridge.sensors import SensorSuite
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+    from robotics_bridge.hands import Hand
+    from robotics_bridge.physics.scene import Scene
+    from robotics_bridge.physics.state import HandState
+    from robotics_bridge.tasks.scenes import TaskModel
+
+
+@dataclass(frozen=True, eq=False)
+class TactileLayout:
+    """Where the columns of a tactile observation sit. Readings are in the link frame, torques about its origin."""
+
+    observe: str
+    """Observation type (table 4.3)."""
+    placement: str
+    resolution: str
+    noisy: bool
+    units: str
+    channels: int
+    """C."""
+    links: tuple[str, ...]
+    """L links with taxels."""
+    link: NDArray[np.int64]
+    """[N] number of the link of each column."""
+    position: NDArray[np.float64]
+    """[N, 3] in the link frame (m); the mean of a link's taxels for ``agg_*``."""
+    normal: NDArray[np.float64]
+    """[N, 3] outward, link frame."""
+    radius: NDArray[np.float64]
+    """[N] sensing radius (m)."""
+    rest: NDArray[np.float64]
+    """[L, 7] poses of the links in the palm's frame at the task's rest position (x y z, qx qy qz qw)."""
+    base_position: NDArray[np.float64]
+    """[N, 3] in the palm's frame at rest (m)."""
+    base_normal: NDArray[np.float64]
+    """[N, 3]."""
+
+
+class Touch:
+    """The tactile sensors of an environment, read after every physics step.
+
+    Args:
+        model: physics of the task.
+        hand: the hand.
+        scene: what the engine simulates.
+        observe: an observation type other than ``none``.
+        placement: ``hand``, ``fingers``, ``tips`` or ``palm``.
+        resolution: ``low``, ``med`` or ``high``.
+        noisy: with the published imperfections.
+        num_envs: B.
+        substeps: S.
+        device: Warp device.
+        seed: of the noise.
+        knobs: further settings of the sensor class.
+
+    Raises:
+        UsageError: a name is unknown.
+    """
+
+    def __init__(
+        self,
+        model: TaskModel,
+        hand: Hand,
+        scene: Scene,
+        *,
+        observe: str,
+        placement: str,
+        resolution: str,
+        noisy: bool,
+        num_envs: int,
+        substeps: int,
+        device: Any,
+        seed: int,
+        knobs: dict[str, Any],
+    ) -> None:
+        import torch
+
+        kind = observation_type(observe)
+        taxels = hand.layout(resolution, placement)
+        taxels = {link: probes for link, probes in taxels.items() if probes.active.any()}
+        sensors = sensors_for(observe, taxels, noisy=noisy, track=model.objects, **knobs)
+        self.suite = SensorSuite(scene, sensors, num_envs=num_envs, device=device, seed=seed)
+        self._name, self._substeps = observe, substeps
+        active = {link: np.flatnonzero(probes.active) for link, probes in taxels.items()}
+        counts = [len(active[link]) for link in taxels]
+        links = np.repeat(np.arange(len(counts)), counts)
+        position, normal = (
+            np.concatenate([getattr(probes, name)[active[link]] for link, probes in taxels.items()])
+            for name in ("position", "normal")
+        )
+        radius = np.concatenate([next(iter([sensors[link]])).probes.radius[active[link]] for link in taxels])  # type: ignore[attr-defined]
+        where = torch.device("cpu") if str(device) == "cpu" else warp().device_to_torch(device)
+        self._parts: list[tuple[Any, torch.Tensor, torch.Tensor]] = []
+        starts = dict(zip(taxels, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
+        for runtime in self.suite.runtimes:
+            source = np.concatenate([place.start + active[name] for name, place in runtime.places.items()])
+            target = np.concatenate([starts[name] + np.arange(len(active[name])) for name in runtime.places])
+            planes = warp().to_torch(runtime.measured())
+            self._parts.append((planes, torch.as_tensor(source, device=where), torch.as_tensor(target, device=where)))
+        width: int = 3 if observe == "force" else int(self._parts[0][0].shape[0])
+        self._taxels = torch.zeros(num_envs, len(links), width, device=where)
+        self._pool = None
+        columns = len(links)
+        if kind.per_link:
+            columns = len(taxels)
+            pool = np.zeros((len(links), columns, kind.channels))
+            pool[np.arange(len(links)), links] = 1.0 if observe == "agg_bool" else PATCH_FORCE_SCALE * normal[:, ::-1]
+            self._pool = torch.as_tensor(pool, dtype=torch.float32, device=where).flatten(1)
+            mean = np.zeros((columns, len(links)))
+            mean[links, np.arange(len(links))] = 1.0 / np.array(counts)[links]
+            position, radius = mean @ position, mean @ radius
+            normal = mean @ normal
+            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+            links = np.arange(columns)
+        self.reading = torch.zeros(num_envs, substeps, columns, kind.channels, device=where)
+        """[B, S, N, C] of the last control step, oldest first; zeros after a reset."""
+        rest = rest_poses(model, hand.palm, tuple(taxels))
+        self.layout = TactileLayout(
+            observe=observe, placement=placement, resolution=resolution, noisy=noisy,
+            units=type(next(iter(sensors.values()))).units, channels=kind.channels, links=tuple(taxels), link=links,
+            position=position, normal=normal, radius=radius, rest=rest,
+            base_position=rest[links, :3] + _turn(rest[links, 3:], position),
+            base_normal=_turn(rest[links, 3:], normal),
+        )  # fmt: skip
+
+    def update(self, state: HandState, dt: float, substep: int) -> None:
+        """Read the sensors after a physics step of duration dt (s)."""
+        self.suite.update(state, dt)
+        for planes, source, target in self._parts:
+            part = planes[: self._taxels.shape[2]].index_select(2, source).permute(1, 2, 0)
+            if len(self._parts) == 1:
+                self._taxels = part
+            else:
+                self._taxels.index_copy_(1, target, part)
+        if self._pool is None:
+            self.reading[:, substep] = self._taxels
+            return
+        pooled = self._taxels[..., 0] @ self._pool
+        if self._name == "agg_bool":
+            pooled = (pooled > TAXELS_IN_CONTACT).float()
+        self.reading[:, substep] = pooled.unflatten(1, self.reading.shape[2:])
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Begin new episodes in some environments [B] bool."""
+        self.suite.reset(mask)
+        self.reading.masked_fill_(mask[:, None, None, None], 0.0)
+
+
+def rest_poses(model: TaskModel, base: str, links: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return the poses [L, 7] (x y z, qx qy qz qw) of links in the frame of a base link, joints at rest."""
+    mujoco = mujoco_module()
+    first = model.models[0]
+    data = mujoco.MjData(first)
+    for name, angle in zip(model.joints, model.rest, strict=True):
+        data.qpos[first.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(first, data)
+    home = first.body(base).id
+    matrix = data.xmat[home].reshape(3, 3)
+    found = np.zeros((len(links), 7))
+    inverse, relative = np.zeros(4), np.zeros(4)
+    mujoco.mju_negQuat(inverse, data.xquat[home])
+    for row, name in zip(found, links, strict=True):
+        body = first.body(name).id
+        row[:3] = matrix.T @ (data.xpos[body] - data.xpos[home])
+        mujoco.mju_mulQuat(relative, inverse, data.xquat[body])
+        row[3:] = (*relative[1:], relative[0])
+    return found
+
+
+def _turn(quaternion: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    u, w = quaternion[:, :3], quaternion[:, 3:]
+    t = 2 * np.cross(u, vector)
+    return vector + w * t + np.cross(u, t)

@@ -1,0 +1,87 @@
+"""What orientation an object shall take: goals that step on, and goals with a deadline.
+
+A goal is a frozen configuration that proposes orientations; the environment keeps them. Letters: B environment.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from robotics_bridge.tasks.rotations import about, multiply, tilted
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal(abc.ABC):
+    """An orientation to reach; a new one is proposed as soon as it is."""
+
+    threshold: float = 0.1
+    """Angle below which the goal counts as reached [rad]."""
+    limit: int | None = None
+    """Reached goals that end an episode; None goes on."""
+    deadline: tuple[float, float] | None = None
+    """Range of the time after which another goal is proposed [s]; None waits for ever."""
+    axis: tuple[float, float, float] | None = None
+    """World axis of the commanded rotation; None for goals about any axis."""
+
+    @abc.abstractmethod
+    def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        """Return the goals [B, 4] (w, x, y, z) of new episodes.
+
+        Args:
+            quat: orientation of the object [B, 4].
+            draw: uniform random numbers in [0, 1) [B, 2].
+        """
+
+    @abc.abstractmethod
+    def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        """Return the goals [B, 4] that follow the present ones ``goal`` [B, 4]; other arguments as for the first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteppingRotation(Goal):
+    """Each goal lies one step further about a fixed world axis than the last."""
+
+    axis: tuple[float, float, float] | None = (-1.0, 0.0, 0.0)
+    step: float = 1.570795
+    """Angle from goal to goal [rad]."""
+    allowed_off_axis: float = math.pi / 6
+    """Tilt against the axis up to which rotation counts [rad]."""
+    limit: int | None = 15
+
+    def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        """Return the orientations one step from those of the object."""
+        return self.following(quat, quat, draw)
+
+    def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        """Return the goals one step further."""
+        import torch
+
+        del draw
+        axis = torch.tensor(self.axis, dtype=quat.dtype, device=quat.device)
+        turn = about(axis, torch.tensor(self.step, dtype=quat.dtype, device=quat.device))
+        return multiply(turn.expand_as(goal), goal)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimedRotation(Goal):
+    """Each goal is the object's orientation at the time, tilted at random about x and y, to be reached in time."""
+
+    tilt: tuple[float, float] = (-0.7853975, 0.7853975)
+    """Range of both angles [rad]."""
+    deadline: tuple[float, float] | None = (4.0, 6.0)
+
+    def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        """Return tilted orientations of the object."""
+        return self.following(quat, quat, draw)
+
+    def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        """Return tilted orientations of the object."""
+        del goal
+        angles = self.tilt[0] + (self.tilt[1] - self.tilt[0]) * draw
+        return multiply(tilted(angles[:, 0], angles[:, 1]), quat)

@@ -1,0 +1,118 @@
+"""hot_ball: rummage a tilted bin for the one hot ball of eight, known by touch alone.
+
+Section 4.6.3 of the thesis gives the bin, the balls, temperatures, latch, metric and times; rewards, materials and how
+the hand is carried are not published and ours. The hand hangs from slides along x, y and z, fingers down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from robotics_bridge.tasks import terms
+from robotics_bridge.tasks.objects import ball
+from robotics_bridge.tasks.registry import register
+from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
+from robotics_bridge.tasks.task import Noise, Placement, Reward, Success, Task
+from robotics_bridge.tasks.thermometers import Thermal, Thermometers
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.envs.env import Env
+    from robotics_bridge.tasks.moment import Moment
+
+SIDE, WALL, HEIGHT, TILT = 0.5, 0.0125, 0.25, math.radians(10)
+"""Outer edge of the bin, thickness of its walls and floor, its height [m], and how far it leans about y [rad]."""
+BALLS, DIAMETER = 8, 0.08
+CELLS = tuple(
+    (conductivity, emissivity, heat)
+    for conductivity in (1.0, 10.0, 100.0, 150.0)
+    for emissivity in (0.5, 0.85)
+    for heat in (500.0, 5000.0)
+)
+"""Conductivity, emissivity and heat generation of the sixteen cells of figure 4.8."""
+_SITES = tuple((0.13 * (i - 1), 0.13 * (j - 1), -0.13 * (i - 1) * math.sin(TILT)) for i in range(3) for j in range(3))
+
+
+def bin_walls(spec: Any) -> None:
+    """Add the tilted bin, its floor's middle at the origin."""
+    from robotics_bridge._device import mujoco_module
+
+    mujoco = mujoco_module()
+    body = spec.worldbody.add_body(name="bin", quat=(math.cos(TILT / 2), 0.0, math.sin(TILT / 2), 0.0))
+    edge, half = SIDE / 2, WALL / 2
+    walls = [((0.0, 0.0, -half), (edge, edge, half))]
+    for sign in (-1, 1):
+        walls.append(((sign * (edge - half), 0.0, HEIGHT / 2), (half, edge, HEIGHT / 2)))
+        walls.append(((0.0, sign * (edge - half), HEIGHT / 2), (edge, half, HEIGHT / 2)))
+    for index, (position, size) in enumerate(walls):
+        body.add_geom(name=f"bin_{index}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=position, size=size)
+
+
+def thermometers(thermal: Thermal) -> Callable[[Env], Thermometers]:
+    """Return what makes the thermometers of this material."""
+    return lambda env: Thermometers(env, thermal)
+
+
+def extra(m: Moment, *, name: str) -> torch.Tensor:
+    """Return what the thermometers add to a moment: ``progress``, ``latched`` or ``holding`` [B]."""
+    return m.extras[name]
+
+
+def reach(m: Moment, *, sigma: float) -> torch.Tensor:
+    """Return exp(−d/σ) of the distance d (m) from the nearest finger tip to the hot ball's centre."""
+    return (-m.extras["reach"] / sigma).exp()
+
+
+@register("hot_ball", "published")
+def published() -> Task:
+    """Return the task of section 4.6.3 at the cell of figure 4.8 that succeeds (150 W/(m·K), 0.5, 500 W/m²)."""
+    return with_thermal(Thermal())
+
+
+def with_thermal(thermal: Thermal) -> Task:
+    """Return the task for fingers and balls of other materials."""
+    down = ((-0.02, 0.0, 0.42), (0.0, 1.0, 0.0, 0.0))
+    return Task(
+        name="hot_ball",
+        text="find the hot ball among eight by touch and stay in contact",
+        objects=(ball(DIAMETER / 2),),
+        copies=BALLS,
+        placement=Placement(height=0.01, x=(-0.015, 0.015), y=(-0.015, 0.015), sites=_SITES),
+        hand_poses={"xhand1": down, "sharpa": down},
+        carriage={
+            "x": ((-0.2, 0.2), 2000.0, 120.0), "y": ((-0.2, 0.2), 2000.0, 120.0), "z": ((-0.2, 0.05), 2000.0, 120.0),
+        },
+        furniture=bin_walls,
+        watch=thermometers(thermal),
+        rewards={
+            "reach": Reward(1.0, reach, {"sigma": 0.1}),
+            "warmth": Reward(5.0, extra, {"name": "progress"}),
+            "holding": Reward(20.0, extra, {"name": "holding"}),
+            "action_rate_penalty": Reward(-0.002, terms.action_rate),
+            "joint_limits_penalty": Reward(-20.0, terms.beyond_limits),
+            "work_penalty": Reward(-0.0002, terms.work),
+        },
+        # Success is S > 0: one control step of latched contact.
+        success=Success(metric="contact", threshold=0.025),
+        episode=20.0,
+        noise=Noise(position=0.005, velocity=0.005),
+        groups={
+            "actor": ("priv_proprio", "priv_obj_state", "priv_thermal"),
+            "critic": ("priv_proprio", "priv_obj_state", "priv_thermal"),
+            "rnd_state": ("priv_proprio", "priv_obj_state", "priv_thermal"),
+            "teacher": ("priv_proprio", "priv_obj_state", "priv_thermal"),
+            "student": ("proprio", "thermal"),
+        },
+        teacher=TeacherSettings(iterations=5000),
+        student=StudentSettings(iterations=2000),
+    )  # fmt: skip
+
+
+@register("hot_ball")
+def default() -> Task:
+    """Return the task on which we train: the published one."""
+    return replace(published())

@@ -1,0 +1,66 @@
+"""in_hand_repose: the whole hand turns a block to orientations given one after the other, each with a deadline.
+
+Values of ``published`` are those of the thesis (tables 4.4, 4.5, 4.7–4.9) and, where it is silent, of the settings
+released with it (neuroagents-lab/tactile-genesis).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from robotics_bridge.tasks import terms
+from robotics_bridge.tasks.goals import TimedRotation
+from robotics_bridge.tasks.in_palm_rotate import PALM_UP
+from robotics_bridge.tasks.objects import PRIMITIVES
+from robotics_bridge.tasks.registry import register
+from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
+from robotics_bridge.tasks.task import Ending, Noise, ObjectRandomisation, Placement, Push, Reward, Success, Task
+
+
+@register("in_hand_repose", "published")
+def published() -> Task:
+    """Return the published task."""
+    return Task(
+        name="in_hand_repose",
+        text="turn a block in the open hand to given orientations",
+        objects=PRIMITIVES,
+        placement=Placement(height=0.5, x=(-0.02, 0.02), y=(-0.02, 0.02), yaw=(-3.14159, 3.14159)),
+        hand_poses={"xhand1": ((0.07, 0.0, 0.475), PALM_UP), "sharpa": ((0.07, -0.015, 0.48), PALM_UP)},
+        goal=TimedRotation(threshold=0.1, tilt=(-0.7853975, 0.7853975), deadline=(4.0, 6.0)),
+        rewards={
+            "success_bonus": Reward(500.0, terms.goal_reached),
+            "track_orientation_gaussian": Reward(2.0, terms.orientation_gaussian, {"sigma": 0.4}),
+            "track_orientation_inv_l2": Reward(2.0, terms.orientation_inverse, {"rot_eps": 0.001}),
+            "rotation_progress": Reward(0.2, terms.approach, {"clip": (-15.0, 5.0), "negative_scale": -2.0}),
+            "obj_force_penalty": Reward(-5.0, terms.squeezed, {"threshold": 5.0, "clip": 20.0}),
+            "is_dropped": Reward(-100.0, terms.ended, {"names": ("obj_dropped",)}),
+            "goal_timeout_penalty": Reward(-200.0, terms.goal_missed),
+            "surface_distance_reward": Reward(0.5, terms.near_surface, {"nearest_k": 2, "sigma": 0.05}),
+            "action_rate_penalty": Reward(-1e-5, terms.action_rate),
+            "joint_limits_penalty": Reward(-20.0, terms.beyond_limits),
+            "work_penalty": Reward(-0.001, terms.work),
+        },
+        endings={"obj_dropped": Ending(terms.below, {"height": 0.46})},
+        success=Success(metric="goals", threshold=1.0),
+        episode=20.0,
+        object_changes=ObjectRandomisation(friction=(0.3, 2.0), mass_offset=(0.0, 0.1), each_reset=False),
+        push=Push(x=(-1.0, 1.0), y=(-1.0, 1.0), z=(-1.0, 1.0), interval=(2.0, 4.0)),
+        noise=Noise(position=0.005, velocity=0.01),
+        goal_terms=("orientation", "difference", "angle"),
+        groups={
+            "actor": ("goal", "priv_proprio", "priv_obj_state"),
+            "critic": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
+            "rnd_state": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
+            "teacher": ("goal", "priv_proprio", "priv_obj_state"),
+            "student": ("proprio", "goal"),
+        },
+        # The released teacher of this task was trained without curiosity.
+        teacher=TeacherSettings(iterations=20000, rnd_weight=0.0),
+        student=StudentSettings(iterations=6000, learning_rate=1e-4, gradient_length=2),
+    )
+
+
+@register("in_hand_repose")
+def default() -> Task:
+    """Return the task on which we train: the published one."""
+    return replace(published())

@@ -1,0 +1,74 @@
+"""in_palm_rotate: thumb and middle finger roll a block on the open palm, quarter turn by quarter turn.
+
+Values of ``published`` are those of the thesis (tables 4.4, 4.5, 4.7–4.9) and, where it is silent, of the settings
+released with it (neuroagents-lab/tactile-genesis).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from robotics_bridge.tasks import terms
+from robotics_bridge.tasks.goals import SteppingRotation
+from robotics_bridge.tasks.objects import PRIMITIVES
+from robotics_bridge.tasks.registry import register
+from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
+from robotics_bridge.tasks.task import Ending, Noise, ObjectRandomisation, Placement, Push, Reward, Success, Task
+
+PALM_UP = (0.7071067811865476, 0.0, -0.7071067811865475, 0.0)
+"""The palm faces up, the fingers point along −x."""
+GOALS = 15
+
+
+@register("in_palm_rotate", "published")
+def published() -> Task:
+    """Return the published task."""
+    return Task(
+        name="in_palm_rotate",
+        text="roll a block about the fingers' axis, thumb and middle finger only",
+        objects=PRIMITIVES,
+        placement=Placement(height=0.5, x=(-0.02, 0.02), y=(-0.02, 0.02), yaw=(-0.2617991666, 0.2617991666)),
+        hand_poses={"xhand1": ((0.07, 0.0, 0.475), PALM_UP), "sharpa": ((0.07, -0.015, 0.48), PALM_UP)},
+        moves=("thumb", "mid"),
+        goal=SteppingRotation(axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333),
+        rewards={
+            "success_bonus": Reward(150.0, terms.goal_reached),
+            "rotation_progress": Reward(2.0, terms.rotation_progress, {"clip": 6.0, "penalty_scale": 5.0}),
+            "surface_distance_reward": Reward(0.1, terms.near_surface, {"nearest_k": 1, "sigma": 0.04}),
+            "is_dropped": Reward(-100.0, terms.ended, {"names": ("obj_dropped",)}),
+            "off_axis_orientation_penalty": Reward(-1.0, terms.off_axis),
+            "obj_dist_penalty": Reward(-100.0, terms.far_from, {"target": (0.0, 0.0, 0.5), "margin": 0.02}),
+            "obj_force_penalty": Reward(-5.0, terms.squeezed, {"threshold": 1.0, "clip": 20.0}),
+            "action_rate_penalty": Reward(-0.0005, terms.action_rate),
+            "joint_limits_penalty": Reward(-40.0, terms.beyond_limits),
+            "work_penalty": Reward(-0.005, terms.work),
+        },
+        endings={
+            "obj_dropped": Ending(terms.below, {"height": 0.45}),
+            "reached_max_consecutive_successes": Ending(terms.enough_goals, {"count": GOALS}),
+        },
+        success=Success(metric="goals", threshold=1.0),
+        episode=10.0,
+        object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1)),
+        push=Push(x=(-1.0, 1.0), y=(-1.0, 1.0), z=(-1.0, 1.0), interval=(2.0, 4.0)),
+        noise=Noise(position=0.005, velocity=0.005),
+        goal_terms=("angle",),
+        auxiliary=("aux_obj_size", "aux_goal_dist"),
+        groups={
+            "actor": ("goal", "priv_proprio", "priv_obj_state"),
+            "critic": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
+            "rnd_state": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
+            "teacher": ("goal", "priv_proprio", "priv_obj_state"),
+            # Table 4.7 gives the student the goal; the released settings of this task leave it out.
+            "student": ("proprio", "goal"),
+        },
+        decoders=(Decoder("aux_obj_size", 1.0, 20.0, (128, 64)), Decoder("aux_goal_dist", 1.0, 1.0, (128, 64))),
+        teacher=TeacherSettings(iterations=6000),
+        student=StudentSettings(iterations=6000, learning_rate=1e-4, gradient_length=2, max_grad_norm=2.0),
+    )
+
+
+@register("in_palm_rotate")
+def default() -> Task:
+    """Return the task on which we train: the published one."""
+    return replace(published())

@@ -1,0 +1,77 @@
+"""One moment of all environments, as reward terms see it. Letters: B environment, J joint, A action, F finger tip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(eq=False)
+class Moment:
+    """Tensors at the end of a control step, before any environment is reset. World axes, SI units."""
+
+    dt: float
+    """Duration of a control step (s)."""
+    joint_names: tuple[str, ...]
+    joint_position: torch.Tensor
+    """[B, J] (rad)."""
+    joint_velocity: torch.Tensor
+    """[B, J] (rad/s)."""
+    joint_low: torch.Tensor
+    """[J] limits (rad)."""
+    joint_high: torch.Tensor
+    """[J]."""
+    start_joints: torch.Tensor
+    """[B, J] positions at the start of the episode (rad)."""
+    power: torch.Tensor
+    """[B] mean of Σ|torque · speed| over the control step (W)."""
+    action: torch.Tensor
+    """[B, A]."""
+    last_action: torch.Tensor
+    """[B, A] of the step before."""
+    object_position: torch.Tensor
+    """[B, 3] of the object that counts (m)."""
+    object_quat: torch.Tensor
+    """[B, 4] (w, x, y, z)."""
+    object_velocity: torch.Tensor
+    """[B, 3] (m/s)."""
+    object_spin: torch.Tensor
+    """[B, 3] angular velocity (rad/s)."""
+    start_position: torch.Tensor
+    """[B, 3] of the object at the start of the episode (m)."""
+    object_force: torch.Tensor
+    """[B] size of the net normal contact force on the object (N)."""
+    tip_force: torch.Tensor
+    """[B, F, 3] net normal contact force on finger tips, link frame (N)."""
+    surface_distance: torch.Tensor
+    """[B, F] from finger tips to the object (m)."""
+    step_count: torch.Tensor
+    """[B] control steps since the start of the episode."""
+    goal_angle: torch.Tensor
+    """[B] angle to the goal (rad)."""
+    previous_goal_angle: torch.Tensor
+    """[B] the same one step before, to the same goal."""
+    reached: torch.Tensor
+    """[B] bool: the goal was reached in this step."""
+    missed: torch.Tensor
+    """[B] bool: the goal's deadline passed in this step."""
+    goals_reached: torch.Tensor
+    """[B] goals of this episode so far."""
+    axis_rate: torch.Tensor
+    """[B] rotation about the commanded axis in this step (rad/s)."""
+    off_axis: torch.Tensor
+    """[B] tilt against the commanded axis (rad)."""
+    on_axis: torch.Tensor
+    """[B] bool: the tilt is within what the goal allows."""
+    turned: torch.Tensor
+    """[B] rotation about ``task.turn_axis`` since the start of the episode (rad)."""
+    turned_before: torch.Tensor
+    """[B] the same ``task.turn_window`` steps ago; infinite before."""
+    endings: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    """Name → [B] bool: conditions of the task that end the episode in this step."""
+    extras: dict[str, Any] = field(default_factory=dict)
+    """What a task's own ``watch`` adds."""

@@ -1,0 +1,168 @@
+"""Objects that hands hold: shapes made of primitives, so that environments can differ in numbers alone.
+
+Metres, kilograms. A shape is a few solids on one body; shapes of one task share the same list of solids, where a shape
+that lacks one has it as a grain of a tenth of a millimetre inside another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from brainbench.errors import UsageError
+from robotics_bridge._device import mujoco_module
+
+GRAIN = 1e-4
+"""Half size of the stand-in for a solid that a shape lacks [m]."""
+_SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A primitive in the body's frame."""
+
+    kind: str
+    """``box``, ``cylinder``, ``capsule`` or ``sphere``."""
+    size: tuple[float, ...]
+    """Half edges; radius and half length; radius [m]."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation (w, x, y, z)."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in _SIZES:
+            raise UsageError(f"A solid is one of {', '.join(_SIZES)}; received {self.kind!r}.")
+        if len(self.size) != _SIZES[self.kind] or not all(math.isfinite(s) and s > 0 for s in self.size):
+            raise UsageError(f"A {self.kind} has {_SIZES[self.kind]} positive size(s) in metres; received {self.size}.")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One object: its solids and its outer measures."""
+
+    name: str
+    solids: tuple[Solid, ...]
+    extent: tuple[float, float, float]
+    """Edges of the box around it, along the body's axes [m]."""
+    bottom: float
+    """How far below the body's origin it reaches when upright [m]."""
+
+    def scaled(self, factor: float) -> Shape:
+        """Return the shape with all lengths multiplied."""
+        solids = tuple(
+            replace(
+                solid,
+                size=tuple(factor * s for s in solid.size),
+                position=(factor * solid.position[0], factor * solid.position[1], factor * solid.position[2]),
+            )
+            for solid in self.solids
+        )
+        x, y, z = self.extent
+        name = f"{self.name}×{factor:.3g}"
+        return Shape(name, solids, (factor * x, factor * y, factor * z), factor * self.bottom)
+
+
+def box(x: float, y: float, z: float) -> Shape:
+    """Return a block with these edges [m]."""
+    return Shape(f"box {x:g} {y:g} {z:g}", (Solid("box", (x / 2, y / 2, z / 2)),), (x, y, z), z / 2)
+
+
+def cylinder(radius: float, height: float) -> Shape:
+    """Return an upright cylinder [m]."""
+    solid = Solid("cylinder", (radius, height / 2))
+    return Shape(f"cylinder {radius:g} {height:g}", (solid,), (2 * radius, 2 * radius, height), height / 2)
+
+
+def ball(radius: float) -> Shape:
+    """Return a ball [m]."""
+    return Shape(f"ball {radius:g}", (Solid("sphere", (radius,)),), (2 * radius, 2 * radius, 2 * radius), radius)
+
+
+_UPRIGHT_Y = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
+"""Turns the z axis of a primitive onto the body's y axis."""
+
+
+def screwdriver(length: float, handle_length: float, handle_radius: float, shaft_radius: float) -> Shape:
+    """Return a screwdriver along the body's y axis, tip at the origin, handle above [m].
+
+    The handle is a cylinder, the shaft a capsule that ends in the tip.
+    """
+    if not 0 < handle_length < length:
+        raise UsageError(f"The handle is shorter than the tool; received {handle_length} m of {length} m.")
+    handle = Solid("cylinder", (handle_radius, handle_length / 2), (0.0, length - handle_length / 2, 0.0), _UPRIGHT_Y)
+    free = length - handle_length
+    shaft = Solid(
+        "capsule", (shaft_radius, (free - shaft_radius) / 2), (0.0, (free + shaft_radius) / 2, 0.0), _UPRIGHT_Y
+    )
+    wide = 2 * max(handle_radius, shaft_radius)
+    return Shape(f"screwdriver {handle_radius:g}", (handle, shaft), (wide, length, wide), 0.0)
+
+
+def with_sizes(shapes: Sequence[Shape], span: tuple[float, float], steps: int = 8) -> tuple[Shape, ...]:
+    """Return every shape at several sizes, evenly over a range of factors; (1, 1) leaves them as they are."""
+    if span == (1.0, 1.0):
+        return tuple(shapes)
+    if not 0 < span[0] <= span[1]:
+        raise UsageError(f"Factors of size are a positive range (low, high); received {span}.")
+    factors = [span[0] + (span[1] - span[0]) * index / (steps - 1) for index in range(steps)]
+    return tuple(shape.scaled(factor) for factor in factors for shape in shapes)
+
+
+def slots(shapes: Sequence[Shape]) -> tuple[str, ...]:
+    """Return the kinds of solids that hold every shape: as many of each kind as any shape has."""
+    kinds = sorted({solid.kind for shape in shapes for solid in shape.solids})
+    most = {kind: max(sum(s.kind == kind for s in shape.solids) for shape in shapes) for kind in kinds}
+    return tuple(kind for kind in kinds for _ in range(most[kind]))
+
+
+def add_object(spec: Any, name: str, shape: Shape, kinds: Sequence[str], *, density: float, **contact: Any) -> None:
+    """Add a free body with the solids of a shape to a ``mujoco.MjSpec``.
+
+    Args:
+        spec: changed in place.
+        name: of the body; its solids are ``<name>_<number>``.
+        shape: what it looks like.
+        kinds: as :func:`slots` gives them for all shapes of the task.
+        density: kg/m³.
+        **contact: settings of the geometries, e.g. ``friction``.
+    """
+    mujoco = mujoco_module()
+    types = {
+        "box": mujoco.mjtGeom.mjGEOM_BOX,
+        "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+        "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    }
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint(name=name)
+    waiting = list(shape.solids)
+    middle = shape.solids[0]
+    for index, kind in enumerate(kinds):
+        solid = next((s for s in waiting if s.kind == kind), None)
+        if solid is not None:
+            waiting.remove(solid)
+        used = solid or Solid(kind, (GRAIN,) * _SIZES[kind], middle.position)
+        # What the shape takes part in decides: friction of the object alone, whatever the hand is made of.
+        body.add_geom(
+            name=f"{name}_{index}", type=types[kind], size=[*used.size, 0.0, 0.0][:3], pos=used.position,
+            quat=used.quaternion, density=density if solid is not None else 0.0, priority=1, **contact,
+        )  # fmt: skip
+
+
+CUBES = tuple(
+    box(*(edge / 1000 for edge in edges))
+    for edges in (
+        (36, 40, 42), (42, 42, 42), (35, 35, 35), (40, 40, 40), (45, 45, 45), (42, 42, 42), (34, 35, 40),
+        (31, 38, 42), (38, 45, 41), (39, 33, 44), (41, 37, 30), (42, 34, 43), (43, 39, 35), (40, 41, 36), (44, 39, 35),
+    )
+)  # fmt: skip
+"""The published blocks of the two reorientation tasks (released settings of the thesis)."""
+PRIMITIVES = (*CUBES, cylinder(0.020, 0.042), cylinder(0.017, 0.038))
+"""Blocks and cylinders."""
+SCREWDRIVERS = (
+    screwdriver(0.2032, 0.0960, 0.0218, 0.0035), screwdriver(0.2032, 0.0960, 0.0223, 0.0040),
+    screwdriver(0.2032, 0.1090, 0.0195, 0.0030), screwdriver(0.2032, 0.1000, 0.0210, 0.0028),
+)  # fmt: skip
+"""Four tools of 8 inches; handle lengths and radii measured on the released meshes."""

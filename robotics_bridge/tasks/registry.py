@@ -1,0 +1,68 @@
+"""The registry of tasks: one file per task, one decorator per configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+
+from brainbench.errors import UsageError, unknown_name
+from robotics_bridge.tasks.task import Task
+
+Maker = Callable[[], Task]
+_MADE: dict[str, dict[str, Maker]] = {}
+_OWN = ("in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball")
+
+
+def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
+    """Register a function without arguments that returns a :class:`Task`.
+
+    Args:
+        name: of the task.
+        config: of this configuration of it; every task needs ``default``.
+
+    Raises:
+        UsageError: the task has such a configuration already.
+
+    Example::
+
+        @register("balance")
+        def balance() -> Task:
+            return Task(name="balance", ...)
+    """
+
+    def keep(maker: Maker) -> Maker:
+        own = name in _OWN and not maker.__module__.startswith("robotics_bridge.tasks.")
+        if own or config in _MADE.get(name, {}):
+            raise UsageError(f"There is a task {name!r} with a configuration {config!r} already; take another name.")
+        _MADE.setdefault(name, {})[config] = maker
+        return maker
+
+    return keep
+
+
+def forget(name: str) -> None:
+    """Remove a task that was registered."""
+    if name not in _MADE or name in _OWN:
+        raise unknown_name("task of yours", name, [n for n in _MADE if n not in _OWN])
+    del _MADE[name]
+
+
+def list_tasks() -> tuple[str, ...]:
+    """Return the names of all registered tasks."""
+    return (*_OWN, *(name for name in _MADE if name not in _OWN))
+
+
+def load(name: str, config: str = "default") -> Task:
+    """Return a task in one of its configurations (``default``, ``published``, …).
+
+    Raises:
+        UsageError: there is no such task or configuration.
+    """
+    if name in _OWN:
+        import_module(f"robotics_bridge.tasks.{name}")
+    if name not in _MADE:
+        hint = "A task of your own: import its file first (or `brainbench policy … --task-file FILE`)."
+        raise unknown_name("task", name, list_tasks(), hint=hint)
+    if config not in _MADE[name]:
+        raise unknown_name(f"configuration of task {name}", config, _MADE[name])
+    return _MADE[name][config]()

@@ -1,0 +1,91 @@
+"""Rotations of batches as torch tensors: quaternions (w, x, y, z), axes, angles. The last dimension is the vector."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+
+def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return the quaternions [..., 4] of turning by b first, then by a."""
+    import torch
+
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def conjugate(q: torch.Tensor) -> torch.Tensor:
+    """Return the inverse turns [..., 4] of unit quaternions."""
+    import torch
+
+    return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
+
+
+def rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """Return vectors [..., 3] turned by unit quaternions [..., 4]."""
+    import torch
+
+    u, w = q[..., 1:], q[..., :1]
+    v = v.expand(u.shape)
+    t = 2 * torch.linalg.cross(u, v)
+    return v + w * t + torch.linalg.cross(u, t)
+
+
+def about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """Return the quaternions [..., 4] of turns by angles [...] (rad) about unit axes [..., 3]."""
+    import torch
+
+    half = 0.5 * angle.unsqueeze(-1)
+    return torch.cat((torch.cos(half), torch.sin(half) * axis), dim=-1)
+
+
+def angle_of(q: torch.Tensor) -> torch.Tensor:
+    """Return the angle [...] (rad, 0 to pi) by which unit quaternions turn."""
+    import torch
+
+    return 2 * torch.atan2(q[..., 1:].norm(dim=-1), q[..., 0].abs())
+
+
+def twist_and_swing(q: torch.Tensor, axis: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Split turns into the signed angle [...] about an axis [..., 3] and the angle [...] of the rest (rad).
+
+    A turn is its twist about the axis followed by a swing about an axis perpendicular to it.
+    """
+    import torch
+
+    along = (q[..., 1:] * axis).sum(dim=-1)
+    twist = 2 * torch.atan2(along, q[..., 0])
+    twist = torch.remainder(twist + torch.pi, 2 * torch.pi) - torch.pi
+    swing = 2 * torch.acos(torch.sqrt(q[..., 0] ** 2 + along**2).clamp(max=1.0))
+    return twist, swing
+
+
+def six_numbers(q: torch.Tensor) -> torch.Tensor:
+    """Return the first two columns of the rotation matrices as [..., 6] (Zhou et al. 2019)."""
+    import torch
+
+    x = torch.zeros_like(q[..., 1:])
+    x[..., 0] = 1.0
+    y = torch.zeros_like(x)
+    y[..., 1] = 1.0
+    return torch.cat((rotate(q, x), rotate(q, y)), dim=-1)
+
+
+def tilted(turn_x: torch.Tensor, turn_y: torch.Tensor) -> torch.Tensor:
+    """Return the quaternions [..., 4] of a turn about x by angles [...], then about the fixed y (rad)."""
+    import torch
+
+    x = torch.tensor([1.0, 0.0, 0.0], device=turn_x.device)
+    y = torch.tensor([0.0, 1.0, 0.0], device=turn_x.device)
+    return multiply(about(y, turn_y), about(x, turn_x))

@@ -1,0 +1,278 @@
+"""Builds the physics of a task: the hand on its place, furniture, and one model per shape of the object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from robotics_bridge._device import mujoco_module
+from robotics_bridge.hands.hand import Hand, palmar_directions
+from robotics_bridge.tasks.objects import Shape, add_object, slots, with_sizes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.tasks.task import Pose, Task
+
+_STIFFNESS, _DAMPING, _ARMATURE, _EFFORT = 2.0, 0.2, 0.01, 2.0
+"""Drive of a joint for which the hand's file names none: N·m/rad, N·m·s/rad, kg·m², N·m."""
+_PALM_TOP = 0.4975
+"""Height of an upturned palm below objects that start at 0.5 m."""
+_TIPS = {
+    "right_hand_thumb_rota_link2": (0.0, 0.042, 0.007), "right_hand_index_rota_link2": (0.008, 0.0, 0.035),
+    "right_hand_mid_link2": (0.008, 0.0, 0.035), "right_hand_ring_link2": (0.008, 0.0, 0.035),
+    "right_hand_pinky_link2": (0.008, 0.0, 0.035), "right_thumb_DP": (0.02, 0.005, 0.0005),
+    "right_index_DP": (0.018, 0.005, 0.0001), "right_middle_DP": (0.018, 0.005, 0.0001),
+    "right_ring_DP": (0.018, 0.005, 0.0001), "right_pinky_DP": (0.018, 0.005, 0.0001),
+}  # fmt: skip
+"""Finger tip → point from which the distance to the object is taken [m, link frame] (released settings)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TaskModel:
+    """Compiled physics of a task for one hand."""
+
+    models: Sequence[Any]
+    """``mujoco.MjModel`` per shape; they differ in numbers only."""
+    shapes: tuple[Shape, ...]
+    objects: tuple[str, ...]
+    """Names of the free bodies."""
+    joints: tuple[str, ...]
+    """Driven joints J: those of the hand in the order of its drives, then slides of the carriage."""
+    moved: tuple[str, ...]
+    """Joints A that the policy moves."""
+    stiffness: NDArray[np.float64]
+    """[J] (N·m/rad or N/m)."""
+    damping: NDArray[np.float64]
+    effort: NDArray[np.float64]
+    """[J] largest torque (N·m) or force (N)."""
+    rest: NDArray[np.float64]
+    """[J] positions at the start and of joints that are held (rad or m)."""
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    """[J] limits."""
+    tips: Mapping[str, tuple[float, float, float]]
+    """Finger tip → point (m, link frame)."""
+
+
+def build(task: Task, hand: Hand) -> TaskModel:
+    """Compile a task for a hand.
+
+    Raises:
+        UsageError: a finger that the task moves, or a joint it names, does not exist on this hand.
+    """
+    shapes = with_sizes(task.objects, task.object_changes.size)
+    names = tuple("object" if task.copies == 1 else f"object{index}" for index in range(task.copies))
+    bare, drives = _hand_spec(task, hand)
+    kinds = slots(shapes)
+    models = []
+    for shape in shapes:
+        spec = bare.copy()
+        for name in names:
+            add_object(
+                spec, name, shape, kinds, density=task.density, condim=3, friction=(task.friction, 0.005, 0.0001)
+            )
+        models.append(spec.compile())
+    first = models[0]
+    joints = tuple(drives)
+    ids = [first.joint(name).id for name in joints]
+    limited = first.jnt_limited[ids].astype(bool)
+    low = np.where(limited, first.jnt_range[ids, 0], -np.pi)
+    high = np.where(limited, first.jnt_range[ids, 1], np.pi)
+    given = task.joints.get(hand.name, {})
+    for name in given:
+        if name not in joints:
+            raise UsageError(f"Task {task.name!r} sets the joint {name!r}, which hand {hand.name!r} does not have.")
+    rest = np.array([given.get(name, 0.0) for name in joints])
+    stiffness, damping, effort = (np.array([drives[name][column] for name in joints]) for column in range(3))
+    return TaskModel(
+        models=models, shapes=shapes, objects=names, joints=joints, moved=_moved(task, hand, joints),
+        stiffness=stiffness, damping=damping, effort=effort, rest=np.clip(rest, low, high), low=low, high=high,
+        tips=_tips(hand),
+    )  # fmt: skip
+
+
+def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, float, float]]]:
+    """Return the scene without objects and the drives: joint → stiffness, damping, effort."""
+    mujoco = mujoco_module()
+    spec = hand.mjspec()
+    option, solver = spec.option, task.solver
+    option.timestep, option.iterations, option.ls_iterations = solver.timestep, solver.iterations, solver.line_search
+    option.tolerance, option.integrator = solver.tolerance, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # An environment that diverges shows it; MuJoCo would put it back silently.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    palm = spec.body(hand.palm)
+    palm.pos, palm.quat = task.hand_poses[hand.name] if hand.name in task.hand_poses else palm_up(hand)
+    drives = _drives(hand)
+    while spec.actuators:
+        spec.delete(spec.actuators[0])
+    for joint in spec.joints:
+        if joint.name in drives:
+            joint.armature = joint.armature or _ARMATURE
+    slides = {}
+    for axis, ((low, high), stiffness, damping) in task.carriage.items():
+        direction = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[axis]
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, np.array(palm.quat, dtype=float))
+        name = f"carriage_{axis}"
+        palm.add_joint(
+            name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=matrix.reshape(3, 3).T @ direction, range=(low, high),
+            limited=True, armature=1.0,
+        )  # fmt: skip
+        slides[name] = (stiffness, damping, 10 * stiffness)
+    if slides:
+        # A robot arm bears the weight of the hand.
+        for body in spec.bodies:
+            body.gravcomp = 1.0
+    drives |= slides
+    for name, (_, _, effort) in drives.items():
+        spec.add_actuator(
+            name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_NONE, gainprm=[1.0] + [0.0] * 9, forcelimited=True,
+            forcerange=(-effort, effort),
+        )  # fmt: skip
+    for first, second in _apart(spec):
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+    if task.furniture is not None:
+        task.furniture(spec)
+    return spec, drives
+
+
+def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
+    """Return joint → stiffness, damping and effort: those of its position servo, or a weak drive of ours."""
+    model = hand.model
+    servos: dict[int, int] = {}
+    for index in range(model.nu):
+        if int(model.actuator_trntype[index]) == 0 and model.actuator_biasprm[index, 1] < 0:
+            servos.setdefault(int(model.actuator_trnid[index, 0]), index)
+    order = [*servos, *(j for j in range(model.njnt) if j not in servos and int(model.jnt_type[j]) in (2, 3))]
+    found = {}
+    for joint in order:
+        effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _EFFORT
+        stiffness, damping = _STIFFNESS, _DAMPING
+        if joint in servos:
+            index = servos[joint]
+            stiffness = float(-model.actuator_biasprm[index, 1])
+            damping = float(-model.actuator_biasprm[index, 2])
+            limited = bool(model.actuator_forcelimited[index])
+            effort = float(model.actuator_forcerange[index, 1]) if limited else 10 * stiffness
+        found[model.joint(joint).name] = (stiffness, damping, effort)
+    return found
+
+
+def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the joints of the fingers that a task moves, in the drives' order, and the carriage."""
+    if not task.moves:
+        return tuple(joints)
+    chosen = [name for name in hand.fingers if name.lower().startswith(task.moves)]
+    missing = [part for part in task.moves if not any(name.lower().startswith(part) for name in hand.fingers)]
+    if missing:
+        # Fingers of a hand from a file are named by their tips, in whatever language.
+        chosen = [
+            n for n in hand.fingers if any(part in link.lower() for part in task.moves for link in hand.fingers[n])
+        ]
+        if not chosen:
+            raise UsageError(
+                f"Task {task.name!r} moves {', '.join(task.moves)}; the fingers of hand {hand.name!r} are "
+                f"{', '.join(hand.fingers)}. Change the task with dataclasses.replace(task, moves=(...))."
+            )
+    links = {link for name in chosen for link in hand.fingers[name]}
+    model = hand.model
+    roots = set()
+    for index in range(model.njnt):
+        body = int(model.jnt_bodyid[index])
+        below = {model.body(b).name for b in range(model.nbody) if _is_below(model, b, body)}
+        if below & links and not below >= set(hand.fingers):
+            others = {link for name in hand.fingers if name not in chosen for link in hand.fingers[name]}
+            if not below & others:
+                roots.add(model.joint(index).name)
+    return tuple(name for name in joints if name in roots or name.startswith("carriage_"))
+
+
+def _is_below(model: Any, body: int, ancestor: int) -> bool:
+    while body > 0:
+        if body == ancestor:
+            return True
+        body = int(model.body_parentid[body])
+    return False
+
+
+def _tips(hand: Hand) -> dict[str, tuple[float, float, float]]:
+    layout = hand.layout("low", "tips")
+    found = {}
+    for tip in hand.tips:
+        if tip in _TIPS and hand.spec is not None:
+            found[tip] = _TIPS[tip]
+        elif tip in layout and layout[tip].active.any():
+            probes = layout[tip]
+            x, y, z = probes.position[probes.active].mean(axis=0).tolist()
+            found[tip] = (x, y, z)
+        else:
+            found[tip] = (0.0, 0.0, 0.0)
+    return found
+
+
+def palm_up(hand: Hand) -> Pose:
+    """Return the pose that turns the palm of a hand up below the object's place, fingers along −x.
+
+    Raises:
+        UsageError: the joints do not tell which side the palm is.
+    """
+    from robotics_bridge.hands.scenes import _towards_fingers
+
+    mujoco = mujoco_module()
+    facing = palmar_directions(hand.model, hand.palm, hand.fingers)
+    if hand.palm not in facing:
+        raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")
+    up = facing[hand.palm]
+    pad = hand.layout("low", "palm").get(hand.palm)
+    surface = pad.position[pad.active].mean(axis=0) if pad is not None else np.zeros(3)
+    step = _towards_fingers(hand, surface, up)
+    forward = step / np.linalg.norm(step)
+    # Columns: where the palm's own directions (forward, up × forward, up) go in the world.
+    own = np.stack([forward, np.cross(up, forward), up], axis=1)
+    world = np.stack([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]], axis=1)
+    matrix = world @ own.T
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, matrix.ravel())
+    x, y, z = (np.array([0.0, 0.0, _PALM_TOP]) - matrix @ (surface + 0.4 * step)).tolist()
+    w, a, b, c = quaternion.tolist()
+    return (x, y, z), (w, a, b, c)
+
+
+def _apart(spec: Any, samples: int = 1500, margin: float = 2e-3) -> list[tuple[str, str]]:
+    """Return pairs of the hand's bodies that never come within a margin (m), found in random poses."""
+    mujoco = mujoco_module()
+    trial = spec.copy()
+    for geom in trial.geoms:
+        geom.margin = margin
+    model = trial.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    low = np.where(model.jnt_limited, model.jnt_range[:, 0], -np.pi)
+    high = np.where(model.jnt_limited, model.jnt_range[:, 1], np.pi)
+    hinges = np.isin(model.jnt_type, (2, 3))
+    address = model.jnt_qposadr[hinges]
+    met: set[tuple[int, int]] = set()
+    for sample in range(samples):
+        share = rng.random(hinges.sum())
+        # Fingers meet most when bent far: half of the poses are at the ends of the ranges.
+        share = np.round(share * 2) / 2 if sample % 2 else share
+        data.qpos[address] = low[hinges] + (high - low)[hinges] * share
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        for first, second in model.geom_bodyid[data.contact.geom].tolist():
+            met.add((min(first, second), max(first, second)))
+    bodies = [body for body in range(1, model.nbody) if model.body_geomnum[body]]
+    known = {(min(int(s) >> 16, int(s) & 0xFFFF), max(int(s) >> 16, int(s) & 0xFFFF)) for s in model.exclude_signature}
+    return [
+        (model.body(first).name, model.body(second).name)
+        for place, first in enumerate(bodies)
+        for second in bodies[place + 1 :]
+        if (first, second) not in met and (first, second) not in known
+    ]

@@ -1,0 +1,110 @@
+"""How a task is learned: optimisation of teacher and student (thesis, tables 4.4 and 4.5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeacherSettings:
+    """PPO of the privileged teacher, upper half of table 4.4."""
+
+    num_envs: int = 8192
+    steps_per_env: int = 24
+    iterations: int = 6000
+    learning_rate: float = 1e-3
+    epochs: int = 5
+    minibatches: int = 4
+    discount: float = 0.998
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    desired_kl: float = 0.01
+    """Aim of the adaptive learning rate."""
+    entropy: float = 2e-3
+    value_loss: float = 1.0
+    max_grad_norm: float = 1.0
+    hidden: tuple[int, ...] = (512, 256, 128)
+    initial_std: float = 1.0
+    std_type: str = "log"
+    """How the policy's standard deviation is kept (text above table 4.4; the released settings say ``log``)."""
+    rnd_weight: float = 100.0
+    """Of the curiosity reward, per second; 0 trains without it."""
+    rnd_outputs: int = 8
+    rnd_learning_rate: float = 1e-3
+
+    def config(self, groups: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+        """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``).
+
+        Args:
+            groups: observation set → observation groups.
+        """
+        network = {
+            "class_name": "MLPModel",
+            "hidden_dims": list(self.hidden),
+            "activation": "elu",
+            "obs_normalization": True,
+        }
+        spread = {"class_name": "GaussianDistribution", "init_std": self.initial_std, "std_type": self.std_type}
+        algorithm: dict[str, Any] = {
+            "class_name": "PPO",
+            "num_learning_epochs": self.epochs,
+            "num_mini_batches": self.minibatches,
+            "learning_rate": self.learning_rate,
+            "schedule": "adaptive",
+            "gamma": self.discount,
+            "lam": self.gae_lambda,
+            "entropy_coef": self.entropy,
+            "desired_kl": self.desired_kl,
+            "max_grad_norm": self.max_grad_norm,
+            "value_loss_coef": self.value_loss,
+            "use_clipped_value_loss": True,
+            "clip_param": self.clip,
+        }
+        sets = {name: list(groups[name]) for name in ("actor", "critic")}
+        if self.rnd_weight:
+            sets["rnd_state"] = list(groups["rnd_state"])
+            algorithm["rnd_cfg"] = {
+                "weight": self.rnd_weight,
+                "reward_normalization": True,
+                "state_normalization": True,
+                "learning_rate": self.rnd_learning_rate,
+                "num_outputs": self.rnd_outputs,
+                "predictor_hidden_dims": [-1],
+                "target_hidden_dims": [-1],
+            }
+        return {
+            "num_steps_per_env": self.steps_per_env,
+            "obs_groups": sets,
+            "actor": {**network, "distribution_cfg": spread},
+            "critic": dict(network),
+            "algorithm": algorithm,
+            "multi_gpu": None,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudentSettings:
+    """DAgger distillation of the tactile student, lower half of table 4.4."""
+
+    iterations: int = 6000
+    learning_rate: float = 1e-4
+    epochs: int = 5
+    gradient_length: int = 2
+    """Steps through which gradients flow back in time."""
+    clip: float | None = None
+    max_grad_norm: float | None = None
+    loss: str = "mse"
+    """``mse`` or ``inv_var_mse`` (each action weighted by the inverse of its variance)."""
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """A head that predicts an observation group from the student's latent (table 4.5)."""
+
+    target: str
+    """Name of the group."""
+    weight: float = 1.0
+    scale: float = 1.0
+    """Factor on the target."""
+    hidden: tuple[int, ...] = field(default=(128, 64))

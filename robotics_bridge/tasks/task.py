@@ -1,0 +1,242 @@
+"""A task as data: scene, rewards, endings, randomisation, observations, learning. SI units, radians."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from brainbench.errors import UsageError, unknown_name
+from robotics_bridge.tasks.goals import Goal
+from robotics_bridge.tasks.objects import PRIMITIVES, Shape
+from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
+
+if TYPE_CHECKING:
+    from robotics_bridge.tasks.watch import Watch
+
+Range = tuple[float, float]
+"""Lower and upper bound of a uniform distribution."""
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+"""Position (m) and quaternion (w, x, y, z)."""
+
+
+@dataclass(frozen=True)
+class Reward:
+    """A term of the reward."""
+
+    weight: float
+    """Per second."""
+    term: Callable[..., Any]
+    """A function of :mod:`robotics_bridge.tasks.terms`, or one of your own of the same form."""
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """A condition that ends an episode before its time is up."""
+
+    condition: Callable[..., Any]
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorRandomisation:
+    """Imperfections of the drives, drawn anew at every reset (thesis, text above table 4.9)."""
+
+    stiffness: Range = (0.95, 1.05)
+    """Factor on the gain of the position error."""
+    damping: Range = (0.95, 1.05)
+    """Factor on the gain of the velocity."""
+    strength: Range = (0.95, 1.05)
+    """Factor on the torque."""
+    position_bias: Range = (-0.01, 0.01)
+    """Error of the measured joint position [rad]."""
+    deadband: Range = (0.0, 0.005)
+    """Error below which the drive does nothing [rad]."""
+    backlash: Range = (0.0, 0.01)
+    """Play of the gears [rad]."""
+    kick_ratio: Range = (0.9, 1.1)
+    """Factor on ``kick``."""
+    kick: float = 0.0
+    """Constant torque in the direction of the error [N·m]; the released settings have 0."""
+    torque_noise: float = 0.1
+    """Half width of white noise in every physics step, in units of the joint's effort."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectRandomisation:
+    """Differences between objects (thesis, table 4.9)."""
+
+    friction: Range = (1.0, 1.0)
+    """Factor on the object's friction, which decides in all its contacts."""
+    mass_offset: Range = (0.0, 0.0)
+    """Added to the object's mass [kg]."""
+    size: Range = (1.0, 1.0)
+    """Factor on all lengths, spread evenly over environments; drawn once."""
+    each_reset: bool = True
+    """Draw friction and mass anew at every reset, or once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Push:
+    """A random force on the object, for one control step each time (thesis, table 4.9)."""
+
+    x: Range = (0.0, 0.0)
+    y: Range = (0.0, 0.0)
+    z: Range = (0.0, 0.0)
+    """[N]."""
+    interval: Range = (2.0, 4.0)
+    """Time from one push to the next [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """Where the object starts: its lowest point at a height, with random position and yaw."""
+
+    height: float = 0.5
+    """Of the object's lowest point [m]."""
+    x: Range = (0.0, 0.0)
+    y: Range = (0.0, 0.0)
+    """Of its origin [m]."""
+    yaw: Range = (0.0, 0.0)
+    """About the vertical [rad]."""
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation at yaw 0 (w, x, y, z)."""
+    sites: tuple[tuple[float, float, float], ...] = ()
+    """Places of several objects, taken in random order [m]; x, y and height are added."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solver:
+    """How exactly physics is solved (as in the released settings)."""
+
+    timestep: float = 0.005
+    decimation: int = 5
+    """Physics steps in a control step."""
+    iterations: int = 50
+    line_search: int = 50
+    tolerance: float = 1e-5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Gaussian noise of the measured proprioception (released settings)."""
+
+    position: float = 0.005
+    """[rad]."""
+    velocity: float = 0.005
+    """On the velocity as observed, after its factor of 0.2."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Success:
+    """What counts as success of an episode."""
+
+    metric: str
+    """``goals`` reached, rotation ``turned`` (rad) or seconds of ``contact`` with the target."""
+    threshold: float = 1.0
+    """Smallest value of the metric that is a success."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Everything that makes a task. Change one with ``dataclasses.replace``.
+
+    Raises:
+        UsageError: a name, a group or a number is not valid.
+    """
+
+    name: str
+    text: str
+    """One line for people."""
+    rewards: Mapping[str, Reward]
+    endings: Mapping[str, Ending] = field(default_factory=dict)
+    success: Success = Success(metric="goals")
+    episode: float = 10.0
+    """Longest duration [s]."""
+    # --- scene ---
+    objects: tuple[Shape, ...] = PRIMITIVES
+    """Shapes of the object, spread over environments in turn."""
+    copies: int = 1
+    """Objects in the scene; more than one are equal but for what ``watch`` makes of them."""
+    density: float = 200.0
+    """Of objects [kg/m³]; the value that the published engine takes by default."""
+    friction: float = 1.0
+    """Of objects, before randomisation."""
+    placement: Placement = Placement()
+    hand_poses: Mapping[str, Pose] = field(default_factory=dict)
+    """Hand → pose of its palm; of other hands, the palm is turned up below the object."""
+    joints: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Hand → joint → position at rest [rad]; 0 where absent."""
+    moves: tuple[str, ...] = ()
+    """Beginnings of the names of fingers that the policy moves; empty: all. The others are held."""
+    furniture: Callable[[Any], None] | None = None
+    """Adds fixed things to the ``mujoco.MjSpec`` of the scene."""
+    carriage: Mapping[str, tuple[Range, float, float]] = field(default_factory=dict)
+    """Slides that carry the palm: world axis (x, y, z) → range [m], stiffness [N/m], damping [N·s/m]."""
+    starts: str | None = None
+    """``grasps``: start from sampled grasps instead of the placement."""
+    solver: Solver = Solver()
+    # --- control ---
+    action_ratio: float = 0.5
+    """Part of a joint's range by which an action of 1 moves its target away from rest."""
+    # --- randomness ---
+    actuators: ActuatorRandomisation | None = ActuatorRandomisation()
+    object_changes: ObjectRandomisation = ObjectRandomisation()
+    push: Push | None = None
+    noise: Noise = Noise()
+    # --- what is to be reached ---
+    goal: Goal | None = None
+    turn_axis: tuple[float, float, float] | None = None
+    """Axis of the object whose rotation is counted (its own frame)."""
+    turn_window: int = 60
+    """Steps over which stagnation is judged."""
+    watch: Callable[..., Watch] | None = None
+    """Makes the part of the task that keeps a state of its own (hot_ball's thermometers)."""
+    # --- learning ---
+    goal_terms: tuple[str, ...] = ()
+    """Contents of the group ``goal``: ``orientation``, ``difference``, ``angle``."""
+    distances_in: str = "priv_obj_props"
+    """Group that holds the distances from finger tips to the object."""
+    auxiliary: tuple[str, ...] = ()
+    """Further groups for decoders: ``aux_obj_size``, ``aux_goal_dist``, ``aux_obj_tilt``, ``aux_rotation_progress``."""
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Observation set (actor, critic, rnd_state, teacher, student) → groups."""
+    decoders: tuple[Decoder, ...] = ()
+    teacher: TeacherSettings = field(default_factory=TeacherSettings)
+    student: StudentSettings = field(default_factory=StudentSettings)
+
+    def __post_init__(self) -> None:
+        if not (self.episode > 0 and math.isfinite(self.episode)):
+            raise UsageError(f"An episode of task {self.name!r} has a positive length (s); received {self.episode!r}.")
+        if not self.objects or self.copies < 1:
+            raise UsageError(f"Task {self.name!r} needs at least one object.")
+        for name, (low, high) in self._ranges().items():
+            if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+                raise UsageError(f"{name} of task {self.name!r} is a range (low, high); received {(low, high)}.")
+        for names in self.groups.values():
+            for name in names:
+                if name not in GROUPS:
+                    raise unknown_name("observation group", name, GROUPS)
+        if self.solver.decimation < 1 or not self.solver.timestep > 0:
+            raise UsageError(f"Task {self.name!r} needs a positive time step and decimation.")
+
+    @property
+    def step_dt(self) -> float:
+        """Duration of a control step (s)."""
+        return self.solver.timestep * self.solver.decimation
+
+    def _ranges(self) -> dict[str, Range]:
+        found: dict[str, Range] = {}
+        for part in (self.actuators, self.object_changes, self.push, self.placement):
+            numbers = vars(part).items() if part is not None else ()
+            found |= {name: value for name, value in numbers if isinstance(value, tuple) and len(value) == 2}
+        return found
+
+
+GROUPS = (
+    "proprio", "tactile", "link_pose", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props", "priv_thermal",
+    "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",
+)  # fmt: skip
+"""Observation groups (table 4.7 and the decoders' targets)."""

@@ -1,0 +1,151 @@
+"""Reward terms and conditions that end an episode: small functions of one moment of all environments.
+
+A term takes a :class:`~robotics_bridge.tasks.moment.Moment` and its parameters and returns one number per environment
+[B]. Weights are per second: the environment multiplies by its weight and by the time of a control step, as
+manager-based environments do. Formulas behind the names of table 4.8 are not published; those here are ours.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.tasks.moment import Moment
+
+
+def goal_reached(m: Moment) -> torch.Tensor:
+    """Return 1 in the step in which the goal is reached."""
+    return m.reached.float()
+
+
+def orientation_gaussian(m: Moment, *, sigma: float) -> torch.Tensor:
+    """Return exp(−(θ/σ)²) of the angle θ to the goal."""
+    return (-((m.goal_angle / sigma) ** 2)).exp()
+
+
+def orientation_inverse(m: Moment, *, rot_eps: float) -> torch.Tensor:
+    """Return 1 / (θ + ε) of the angle θ to the goal (1/rad)."""
+    return 1 / (m.goal_angle + rot_eps)
+
+
+def rotation_progress(m: Moment, *, clip: float, penalty_scale: float) -> torch.Tensor:
+    """Return the rate about the commanded axis (rad/s), up to ±clip.
+
+    Forward rotation counts while the object is tilted no more than the goal allows; backward rotation always,
+    ``penalty_scale`` times.
+    """
+    rate = m.axis_rate.clamp(-clip, clip)
+    return rate.clamp(min=0) * m.on_axis.float() + penalty_scale * rate.clamp(max=0)
+
+
+def approach(m: Moment, *, clip: tuple[float, float], negative_scale: float) -> torch.Tensor:
+    """Return how fast the angle to the goal shrinks (rad/s), within bounds; growth counts ``negative_scale`` times."""
+    rate = ((m.previous_goal_angle - m.goal_angle) / m.dt).clamp(*clip)
+    return rate.clamp(min=0) + abs(negative_scale) * rate.clamp(max=0)
+
+
+def near_surface(m: Moment, *, nearest_k: int, sigma: float) -> torch.Tensor:
+    """Return the mean of exp(−d/σ) over the k finger tips that are nearest to the object."""
+    nearest = m.surface_distance.clamp(min=0).topk(nearest_k, dim=1, largest=False).values
+    return (-nearest / sigma).exp().mean(dim=1)
+
+
+def ended(m: Moment, *, names: tuple[str, ...]) -> torch.Tensor:
+    """Return 1 where the episode ended for one of these reasons; per second, as all terms."""
+    total = m.endings[names[0]]
+    for name in names[1:]:
+        total = total | m.endings[name]
+    return total.float()
+
+
+def off_axis(m: Moment) -> torch.Tensor:
+    """Return the tilt against the commanded axis (rad)."""
+    return m.off_axis
+
+
+def far_from(m: Moment, *, target: tuple[float, float, float] | None, margin: float) -> torch.Tensor:
+    """Return the distance (m) of the object from a place (or from where its episode began) beyond a margin."""
+    import torch
+
+    home = m.start_position if target is None else torch.tensor(target, device=m.object_position.device)
+    return ((m.object_position - home).norm(dim=1) - margin).clamp(min=0)
+
+
+def squeezed(m: Moment, *, threshold: float, clip: float) -> torch.Tensor:
+    """Return the contact force on the object (N) beyond a threshold, at most ``clip``."""
+    return (m.object_force - threshold).clamp(0, clip)
+
+
+def goal_missed(m: Moment) -> torch.Tensor:
+    """Return 1 in the step in which the deadline of a goal passes."""
+    return m.missed.float()
+
+
+def action_rate(m: Moment) -> torch.Tensor:
+    """Return the squared change of the action."""
+    return ((m.action - m.last_action) ** 2).sum(dim=1)
+
+
+def beyond_limits(m: Moment) -> torch.Tensor:
+    """Return by how much joints lie beyond their limits, summed (rad)."""
+    over = (m.joint_position - m.joint_high).clamp(min=0) + (m.joint_low - m.joint_position).clamp(min=0)
+    return over.sum(dim=1)
+
+
+def work(m: Moment) -> torch.Tensor:
+    """Return the mean mechanical power of the joints, Σ|τ ω| (W)."""
+    return m.power
+
+
+def spin(m: Moment, *, local_axis: tuple[float, float, float], low: float, high: float) -> torch.Tensor:
+    """Return the object's angular velocity about its own axis (rad/s), within bounds."""
+    import torch
+
+    from robotics_bridge.tasks.rotations import rotate
+
+    axis = rotate(m.object_quat, torch.tensor(local_axis, device=m.object_quat.device))
+    return (m.object_spin * axis).sum(dim=1).clamp(low, high)
+
+
+def alignment(m: Moment, local_up: tuple[float, float, float]) -> torch.Tensor:
+    """Return the cosine [B] between an axis of the object and the vertical."""
+    import torch
+
+    from robotics_bridge.tasks.rotations import rotate
+
+    return rotate(m.object_quat, torch.tensor(local_up, device=m.object_quat.device))[:, 2]
+
+
+def leaning(m: Moment, *, local_up: tuple[float, float, float], margin: float) -> torch.Tensor:
+    """Return 1 − cosine of the tilt of an axis of the object against the vertical, beyond a margin."""
+    return (1 - alignment(m, local_up) - margin).clamp(min=0)
+
+
+def pose_change(m: Moment, *, excluded: str) -> torch.Tensor:
+    """Return the squared deviation (rad²) of joints from their start; those named ``excluded`` are free."""
+    import torch
+
+    keep = torch.tensor([excluded not in name for name in m.joint_names], device=m.joint_position.device)
+    return (((m.joint_position - m.start_joints) ** 2) * keep).sum(dim=1)
+
+
+def below(m: Moment, *, height: float) -> torch.Tensor:
+    """Return where [B] the object's origin lies lower than a height (m)."""
+    return m.object_position[:, 2] < height
+
+
+def enough_goals(m: Moment, *, count: int) -> torch.Tensor:
+    """Return where [B] so many goals were reached."""
+    return m.goals_reached >= count
+
+
+def fallen(m: Moment, *, local_up: tuple[float, float, float], min_alignment: float) -> torch.Tensor:
+    """Return where [B] an axis of the object is no longer upright."""
+    return alignment(m, local_up) < min_alignment
+
+
+def stagnant(m: Moment, *, angle: float) -> torch.Tensor:
+    """Return where [B] the object turned by less than an angle (rad) during the last ``task.turn_window`` steps."""
+    return (m.turned - m.turned_before).abs() < angle

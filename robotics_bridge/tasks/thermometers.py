@@ -1,0 +1,228 @@
+"""Thermometers on the fingers, the heat latch and the success metric of hot_ball (thesis 4.41, 4.42).
+
+Letters: B environment, F finger link with a grid, K ball.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from brainbench.errors import UsageError
+from robotics_bridge._device import warp
+from robotics_bridge.sensors import Body, SensorSuite, TemperatureGrid, ThermalMaterial
+from robotics_bridge.sensors.temperature import link_temperature
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.envs.env import Env
+    from robotics_bridge.tasks.moment import Moment
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thermal:
+    """What fingers and balls are made of. The first four numbers are the axes of figure 4.8 and section 4.6.3."""
+
+    conductivity: float = 150.0
+    """Of the fingers [W/(m·K)]."""
+    emissivity: float = 0.5
+    heat: float = 500.0
+    """Made inside the fingers, per area of a layer of cells [W/m²] (4.36)."""
+    ambient: float = 22.0
+    """Of the room, the hand and all balls but one at the start [°C]."""
+    hot: float = 45.0
+    """Of the target ball [°C]."""
+    margin: float = 0.12
+    """The latch fires at a progress of 1 − margin (42.2 °C)."""
+    cells: tuple[int, int, int] = (4, 4, 4)
+    """Of the grid on each finger link; not published."""
+    density: float = 2700.0
+    """Of the fingers [kg/m³]; not published (aluminium)."""
+    specific_heat: float = 900.0
+    """[J/(kg·K)]; not published (aluminium)."""
+    ball: str | ThermalMaterial = "aluminium"
+    """Of the balls; not published."""
+    conduction: Literal["physical", "thesis"] = "thesis"
+    """Contact law: the published heuristic (4.38, 4.39), or with the resistance of ball and cells."""
+    convection: float = 10.0
+    """[W/(m²·K)]; not published."""
+
+    def __post_init__(self) -> None:
+        if not self.hot > self.ambient:
+            raise UsageError(f"The target is hotter than the room; received {self.hot} and {self.ambient} °C.")
+        if not 0 < self.margin < 1:
+            raise UsageError(f"The latch's margin lies between 0 and 1; received {self.margin!r}.")
+
+    @property
+    def material(self) -> ThermalMaterial:
+        """Of the fingers."""
+        return ThermalMaterial(self.conductivity, self.density, self.specific_heat, self.emissivity)
+
+    @property
+    def threshold(self) -> float:
+        """Temperature at which the latch fires [°C]."""
+        return self.ambient + (1 - self.margin) * (self.hot - self.ambient)
+
+
+def progress(temperature: torch.Tensor, thermal: Thermal) -> torch.Tensor:
+    """Return the normalised progress of readings (°C), 0 at ambient to 1 at the target's temperature (4.41)."""
+    return ((temperature - thermal.ambient) / (thermal.hot - thermal.ambient)).clamp(0.0, 1.0)
+
+
+class Thermometers:
+    """Temperature grids on every finger link, which ball is hot, the latch, and the time of latched contact.
+
+    Args:
+        env: the environments; ``env.target`` says which ball is hot.
+        thermal: materials and temperatures.
+        chooses: draw the hot ball anew at every reset; otherwise follow ``env.target``.
+    """
+
+    def __init__(self, env: Env, thermal: Thermal, *, chooses: bool = True) -> None:
+        import torch
+
+        wp, scene = warp(), env.world.engine.scene
+        self._env, self.thermal, self._chooses = env, thermal, chooses
+        links = [link for link in env.hand.links("fingers") if scene.geometries_of(link)]
+        balls = env.model.objects
+        bodies = {name: Body(thermal.ball, thermal.ambient) for name in balls}
+        sensors = {}
+        for link in links:
+            plain = TemperatureGrid(link=link, cells=thermal.cells)
+            low, high = plain.corners(scene)
+            # Published: the source divided by the thickness of a cell gives power per volume (4.36).
+            source = thermal.heat / float((high - low)[2] / thermal.cells[2])
+            sensors[link] = TemperatureGrid(
+                link=link, cells=thermal.cells, material=thermal.material, base_temperature=thermal.ambient,
+                ambient_temperature=thermal.ambient, source=source, bodies=bodies,
+                other=Body("plastic", thermal.ambient), conduction=thermal.conduction, convection=thermal.convection,
+            )  # fmt: skip
+        self.suite = SensorSuite(scene, sensors, num_envs=env.num_envs, device=env.world.warp_device)
+        self._links = links
+        self._heat = link_temperature(self.suite, links[0])
+        numbers = [scene.link_index(name) for name in balls]
+        self._balls = torch.as_tensor(numbers, device=env.device)
+        # 0 where a geometry is no tip and no ball, 1 for tips, 2 + k for ball k.
+        roles = np.zeros(len(scene.geometries), dtype=np.int32)
+        for tip in env.model.tips:
+            roles[list(scene.geometries_of(tip))] = 1
+        for index, name in enumerate(balls):
+            roles[list(scene.geometries_of(name))] = 2 + index
+        self._roles = wp.array(roles, dtype=wp.int32, device=env.world.warp_device)
+        self._touch = wp.zeros((env.num_envs, len(balls)), dtype=wp.int32, device=env.world.warp_device)
+        self._touched = wp.to_torch(self._touch)
+        zeros = torch.zeros(env.num_envs, device=env.device)
+        self.latched = zeros.bool()
+        """[B] whether the latch has fired in this episode."""
+        self.latch_time = zeros.clone()
+        """[B] when it fired (s); infinite before."""
+        self.contact = zeros.clone()
+        """[B] seconds of latched contact S (4.42)."""
+        self.touching = zeros.bool()
+        """[B] whether a finger tip touches the hot ball now."""
+        self.age = zeros.clone()
+        self._apply(torch.ones_like(self.latched))
+
+    def temperature(self) -> torch.Tensor:
+        """Return the highest cell temperature [B, F] of every finger link (°C)."""
+        import torch
+
+        return torch.stack([self.suite.read(link).flatten(1).amax(dim=1) for link in self._links], dim=1)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Begin new episodes: cold fingers, another hot ball."""
+        import torch
+
+        if self._chooses:
+            balls = len(self._balls)
+            drawn = (self._env._draw(1, 0.0, 1.0)[:, 0] * balls).long().clamp(max=balls - 1)
+            self._env.target.copy_(torch.where(mask, drawn, self._env.target))
+        self._apply(mask)
+        self.suite.reset(mask)
+        self.latched &= ~mask
+        self.touching &= ~mask
+        self.latch_time.masked_fill_(mask, float("inf"))
+        self.contact.masked_fill_(mask, 0.0)
+        self.age.masked_fill_(mask, 0.0)
+
+    def during(self, dt: float) -> None:
+        """Let heat flow for a physics step of dt (s)."""
+        self.suite.update(self._env.world.state, dt)
+
+    def after(self, moment: Moment) -> None:
+        """Read the thermometers at the end of a control step, and tell the rewards."""
+        self.judge(moment.dt)
+        import torch
+
+        rows = torch.arange(self._env.num_envs, device=self._env.device)
+        tips = self._env.world.state.pose_torch[:, self._env._tip_links, :3]
+        target = self._env.object_pose[rows, self._env.target, :3]
+        moment.extras["progress"] = progress(self.temperature().amax(dim=1), self.thermal)
+        moment.extras["holding"] = (self.latched & self.touching).float()
+        moment.extras["latched"] = self.latched.float()
+        moment.extras["reach"] = (tips - target.unsqueeze(1)).norm(dim=2).amin(dim=1)
+
+    def judge(self, dt: float) -> None:
+        """Advance latch and metric by a control step of dt (s)."""
+        import torch
+
+        from robotics_bridge.envs._actuation_kernels import environment_kernels
+
+        wp, state = warp(), self._env.world.state
+        self._touch.zero_()
+        wp.launch(
+            environment_kernels().meets, dim=state.contact_env.shape[0],
+            inputs=[
+                state.contact_count, state.contact_geom, state.contact_env, state.contact_distance, self._roles,
+                self._touch,
+            ],
+            device=self._env.world.warp_device,
+        )  # fmt: skip
+        self.age += dt
+        self.touching.copy_(self._touched.gather(1, self._env.target.unsqueeze(1))[:, 0] > 0)
+        fires = (self.temperature().amax(dim=1) >= self.thermal.threshold) & ~self.latched
+        self.latch_time.copy_(torch.where(fires, self.age, self.latch_time))
+        self.latched |= fires
+        self.contact += dt * (self.latched & self.touching)
+
+    def metric(self) -> torch.Tensor:
+        """Return the seconds of latched contact S [B] so far (4.42)."""
+        return self.contact
+
+    def observe(self, group: str) -> torch.Tensor:
+        """Return ``thermal`` (all cells, as progress) or ``priv_thermal`` (progress per link, latch, touch)."""
+        import torch
+
+        t = self.thermal
+        if group == "thermal":
+            cells = torch.cat([self.suite.read(link).flatten(1) for link in self._links], dim=1)
+            return ((cells - t.ambient) / (t.hot - t.ambient)).nan_to_num().float()
+        flags = torch.stack((self.latched.float(), self.touching.float()), dim=1)
+        return torch.cat((progress(self.temperature(), t).nan_to_num().float(), flags), dim=1)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return latch and metric; the temperatures themselves begin anew."""
+        own: dict[str, Any] = {name: getattr(self, name) for name in _MEMORY}
+        return {name: value.clone() for name, value in own.items()}
+
+    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
+        """Take up what :meth:`state_dict` returned."""
+        for name in _MEMORY:
+            getattr(self, name).copy_(values[name])
+        self._apply(self.latched | True)
+
+    def _apply(self, mask: torch.Tensor) -> None:
+        """Make the target ball hot."""
+        import torch
+
+        hot = torch.nn.functional.one_hot(self._env.target, len(self._balls))
+        value = self.thermal.ambient + (self.thermal.hot - self.thermal.ambient) * hot
+        known = self._heat[:, self._balls]
+        self._heat[:, self._balls] = torch.where(mask.unsqueeze(1), value.to(known.dtype), known)
+
+
+_MEMORY = ("latched", "latch_time", "contact", "touching", "age")
