@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-import yaml
 
 from brainbench.errors import DataError, UsageError
 from robotics_bridge.policies.sweep import PUBLISHED, read_sweep
@@ -13,6 +12,7 @@ ENTRY = '[[entries]]\ntask = "t"\nhand = "xhand1"\nplacements = ["tips"]\n'
 
 @pytest.mark.shared
 def test_the_published_sweep_is_the_product_that_the_released_settings_describe(reference) -> None:
+    yaml = pytest.importorskip("yaml")
     document = yaml.safe_load((reference / "tasks" / "distill_configs.yaml").read_text())
     menu = document["defaults"]
     sweep = read_sweep()

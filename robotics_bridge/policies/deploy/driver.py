@@ -1,0 +1,69 @@
+"""What a robot hand must offer to run a policy, and what it tells. Radians, seconds; pressure in the maker's unit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class HandReading:
+    """One report of a hand. Letters: J joint, F finger."""
+
+    sequence: int
+    """Number of the report, counted by the hand."""
+    time: float
+    """When it was measured, by the hand's clock [s]."""
+    arrived: float
+    """When it came, by the controller's clock [s]."""
+    position: NDArray[np.float64]
+    """Joint positions [J] (rad), in the driver's order."""
+    velocity: NDArray[np.float64]
+    """Joint velocities [J] (rad/s)."""
+    pressure: NDArray[np.float64]
+    """Summed contact force of each finger tip [F, 3], as the maker's ``calc_pressure`` gives it."""
+
+
+@dataclass
+class LinkCounters:
+    """What happened to the reports of a hand on their way."""
+
+    received: int = 0
+    lost: int = 0
+    """Numbers that were skipped and did not come later."""
+    late: int = 0
+    """Came after a newer one, and were not used."""
+    damaged: int = 0
+    """Not readable, and not used."""
+    errors: list[str] = field(default_factory=list)
+    """First errors of the connection."""
+
+
+class Driver(Protocol):
+    """A hand, real or simulated. Nothing here blocks longer than sending a message takes."""
+
+    joints: tuple[str, ...]
+    """Names of the joints J."""
+    fingers: tuple[str, ...]
+    """Names of the fingers F with a sensing tip."""
+    counters: LinkCounters
+
+    def read(self) -> HandReading | None:
+        """Return the newest report, the same one again if nothing came, or None before the first."""
+        ...
+
+    def send(self, targets: NDArray[np.float64]) -> None:
+        """Ask the position drives for targets [J] (rad)."""
+        ...
+
+    def stop(self) -> None:
+        """Hold where the hand is, and refuse targets until it is connected anew."""
+        ...
+
+    def close(self) -> None:
+        """End the connection."""
+        ...
