@@ -25,12 +25,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from zoo_jobs import Job, all_jobs
+from zoo_jobs import PASS, Job, all_jobs
 
 _log = logging.getLogger("train_zoo")
 ROOT = Path(__file__).resolve().parent.parent
-CLOSING = 75.0
-"""Seconds before the end when training stops; then the last networks are evaluated, scored and packed."""
 LEAVING = 12.0
 """Seconds before the end when all that still runs is ended."""
 MOST_FAULTS = 12
@@ -61,6 +59,8 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--batch", type=int, default=256, help="sweeps per step")
     told.add_argument("--precision", default="auto", help="bf16, float32, or what is safe and fast on the device")
     told.add_argument("--epochs", type=int, help="epochs at most, whatever the job says")
+    told.add_argument("--short", type=float, help="short trainings on a processor: times the steps of zoo_jobs.SHORT")
+    told.add_argument("--closing", type=float, default=75.0, help="seconds before the end when training stops")
     told.add_argument("--only", help="substring of the names of jobs to train")
     told.add_argument("--jobs", type=int, help="only so many jobs")
     told.add_argument("--resume", type=Path, help="folder with the tar files of an earlier call")
@@ -93,7 +93,7 @@ def campaign(args: argparse.Namespace) -> None:
     """Make the data, keep a few processes per GPU at work, bring every result back as soon as it is there."""
     started = time.time()
     end = args.end or started + 60 * args.minutes
-    args.until = end - CLOSING
+    args.until = end - args.closing
     gpus = 0 if args.device == "cpu" else count_gpus()
     args.work.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(args.work / "claims", ignore_errors=True)
@@ -311,6 +311,8 @@ class Worker:
 
         if self.args.epochs:
             job = dataclasses.replace(job, epochs=min(job.epochs, self.args.epochs))
+        if self.args.short and job.objective != "untrained":
+            job = job.short(self.args.short)
         if self.args.learning_rate:
             job = dataclasses.replace(job, learning_rate=self.args.learning_rate)
         started = time.monotonic()
@@ -325,6 +327,7 @@ class Worker:
             deadline=self.deadline,
             precision=self._precision(job),
             batch=self.args.batch,
+            steps=PASS if self.args.short else None,
             last_call=self.args.last,
         )
         told = ""

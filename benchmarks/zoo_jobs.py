@@ -35,6 +35,17 @@ WEIGHTS = {
     "resnet18-small": 0.5,
 }
 """How training time is divided among the small networks, by what a step costs."""
+SHORT = {
+    "zhuang-intersection-ln-small": (130, 130),
+    "zhuang-small": (340, 280),
+    "zhuang-small+mamba": (200, 150),
+    "s4-small+gpt": (260, 210),
+    "resnet18-small+gpt": (380, 300),
+    "resnet18-small": (1100, 900),
+}
+"""Steps (supervised, SimCLR) of a short training on a processor: one to three minutes of one core each."""
+PASS = 15
+"""Steps of a pass of a short training."""
 SEEDS = 3
 FULL_EPOCHS = 20
 
@@ -66,6 +77,11 @@ class Job:
         # The published sizes without recurrence over areas are several times cheaper.
         own = WEIGHTS.get(self.model, 1.0 if self.model.startswith("zhuang") else 0.35)
         return own * (1.3 if self.objective == "simclr" else 0.7)
+
+    def short(self, factor: float) -> Job:
+        """Return the job as a short training, of so many times the steps of :data:`SHORT`; epochs are passes then."""
+        steps = factor * SHORT[self.model][self.objective == "simclr"]
+        return dataclasses.replace(self, epochs=max(1, round(steps / PASS)))
 
     @property
     def name(self) -> str:

@@ -103,10 +103,19 @@ class Trainer:
         epochs: Passes over the training sweeps.
         precision: ``bf16`` (mixed) or ``float32`` (TF32 where the device has it).
         batch: Sweeps per step.
+        steps: Steps of a pass, for trainings of few epochs; a whole epoch when None. All counts of epochs but
+            :attr:`done` are then counts of passes.
     """
 
     def __init__(
-        self, job: Job, data: Resident, device: torch.device, epochs: int, precision: str, batch: int = 256
+        self,
+        job: Job,
+        data: Resident,
+        device: torch.device,
+        epochs: int,
+        precision: str,
+        batch: int = 256,
+        steps: int | None = None,
     ) -> None:
         self.job, self.data, self.device, self.precision = job, data, device, precision
         self.config = dataclasses.replace(job.config(epochs), precision=precision, batch_size=batch)
@@ -127,7 +136,8 @@ class Trainer:
         self.augmentation = Augmentation(self.config.augmentation, self.config.masking)
         self.generator = torch.Generator(device).manual_seed(job.seed)
         self._checked = min(EVALUATED, len(data.validation))
-        self.steps, self.checks = max(1, len(data.train) // batch), math.ceil(len(data.validation) / self._checked)
+        whole = max(1, len(data.train) // batch)
+        self.steps, self.checks = min(steps or whole, whole), math.ceil(len(data.validation) / self._checked)
         options: dict[str, Any] = {"device": device}
         self.cursor = torch.zeros(1, dtype=torch.long, **options)
         self.order = torch.zeros(self.steps, min(batch, len(data.train)), dtype=torch.long, **options)
@@ -140,6 +150,11 @@ class Trainer:
         self.epoch, self.best, self.best_epoch = 0, math.inf, None
         self.kept: dict[str, torch.Tensor] = {}
         self.seconds = 0.0
+
+    def done(self, passes: int | None) -> float | None:
+        """Return how many epochs so many passes are; whole numbers where a pass is an epoch."""
+        whole = max(1, len(self.data.train) // self.order.shape[1])
+        return passes if passes is None or self.steps == whole else round(passes * self.steps / whole, 1)
 
     def prepare(self, *, fused: bool = True, graphs: bool = True) -> None:
         """Warm up and capture the training step and the validation step; the network is as new afterwards."""
@@ -307,7 +322,7 @@ def job_seed(seed: int, epoch: int) -> int:
 def publish(trainer: Trainer, out: Path) -> dict[str, Any]:
     """Write a network in half precision, load it again, probe and evaluate it; return what was found."""
     job, model, config, data, device = trainer.job, trainer.model, trainer.config, trainer.data, trainer.device
-    options, epochs, best_epoch = trainer.options, trainer.epoch, trainer.best_epoch
+    options, epochs, best_epoch = trainer.options, trainer.done(trainer.epoch), trainer.done(trainer.best_epoch)
 
     def write(evaluation: Any) -> None:
         info = checkpoint_info(
@@ -378,6 +393,7 @@ def run_job(
     deadline: float,
     precision: str = "bf16",
     batch: int = 256,
+    steps: int | None = None,
     last_call: bool = False,
 ) -> str:
     """Train a job to its end, or until the deadline; return ``finished``, ``diverged`` or ``stopped``.
@@ -390,6 +406,7 @@ def run_job(
         deadline: time.monotonic() at which it stops and saves its state.
         precision: ``bf16`` or ``float32``.
         batch: Sweeps per step.
+        steps: Steps of a pass; see :class:`Trainer`.
         last_call: Nobody will go on with it: let the schedule end at the deadline.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -404,14 +421,14 @@ def run_job(
         _log.warning("%s: the state belongs to other data; starting anew", job.name)
         state = None
     precision = str(state["precision"]) if state else precision
-    trainer = prepared_trainer(job, data, device, job.epochs, precision, batch)
+    trainer = prepared_trainer(job, data, device, job.epochs, precision, batch, steps)
     if state:
         trainer.load(out / STATE)
     prepared = time.monotonic() - started
     log = (out / LOG).open("a", encoding="utf-8")
 
     def note(**values: Any) -> None:
-        log.write(json.dumps({"job": job.name, "epoch": trainer.epoch, **values}) + "\n")
+        log.write(json.dumps({"job": job.name, "epoch": trainer.done(trainer.epoch), **values}) + "\n")
         log.flush()
 
     note(kind="start", prepared=prepared, steps=trainer.steps, precision=precision)
@@ -442,7 +459,9 @@ def run_job(
         if time.monotonic() - saved > SAVED:
             trainer.save(out / STATE)
             saved = time.monotonic()
-    trainer.config = dataclasses.replace(job.config(max(1, trainer.epoch)), precision=precision, batch_size=batch)
+    trainer.config = dataclasses.replace(
+        job.config(max(1, math.ceil(trainer.done(trainer.epoch) or 0))), precision=precision, batch_size=batch
+    )
     began = time.monotonic()
     result = trainer.finish(out)
     result |= {
@@ -466,11 +485,11 @@ def run_job(
 
 
 def prepared_trainer(
-    job: Job, data: Resident, device: torch.device, epochs: int, precision: str, batch: int
+    job: Job, data: Resident, device: torch.device, epochs: int, precision: str, batch: int, steps: int | None
 ) -> Trainer:
     """Return a trainer, in the fastest way that works here."""
     for fused, graphs in ((True, True), (False, True), (False, False)):
-        trainer = Trainer(job, data, device, epochs, precision, batch)
+        trainer = Trainer(job, data, device, epochs, precision, batch, steps)
         try:
             trainer.prepare(fused=fused, graphs=graphs)
         except Exception:  # compilers and drivers fail in many ways

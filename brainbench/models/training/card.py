@@ -18,8 +18,8 @@ def checkpoint_info(
     config: TrainingConfig,
     classes: tuple[str, ...],
     *,
-    epochs_done: int,
-    best_epoch: int | None,
+    epochs_done: float | None,
+    best_epoch: float | None,
     evaluation: Evaluation | None,
     drawn_biases: int = 0,
 ) -> dict[str, Any]:
