@@ -135,6 +135,8 @@ class _Run:
         tactile = self.student.core.tactile
         self.front = tactile.frozen_part if tactile is not None else None
         self.observations: dict[str, torch.Tensor] = env.reset()
+        # First episodes end at different times, so that no rollout holds only beginnings.
+        env.episode_length_buf.copy_(torch.randint_like(env.episode_length_buf, int(env.max_episode_length)))
         self.memory = self.student.zeros(env.num_envs)
         self.touched = self.front.init_state(env.num_envs) if self.front is not None else self.memory[:, :0]
         self.kept: list[tuple[int, Rollout]] = []
@@ -356,7 +358,8 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "brainbench_student": 1,
         "distill": config.plain(),
         "network": student.config,
-        "groups": {name: list(shape) for name, shape in student.shapes.items()},
+        # A list: the order counts, and JSON keeps that of lists alone.
+        "groups": [[name, list(shape)] for name, shape in student.shapes.items()],
         "actions": env.num_actions,
         "deployment": {
             "task": config.task,
@@ -399,7 +402,7 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
     config = DistillConfig.of(described["distill"])
-    shapes = {name: tuple(shape) for name, shape in described["groups"].items()}
+    shapes = {name: tuple(shape) for name, shape in described["groups"]}
     with torch.random.fork_rng(devices=[]):
         student = build_student(config, shapes, list(shapes), int(described["actions"]))
     try:

@@ -86,7 +86,8 @@ def export_policy(
         "policy": name or type(policy).__name__,
         "format": format,
         "file": target.name,
-        "inputs": {key: list(shape) for key, shape in policy.shapes.items()},
+        # A list: the order counts, and JSON keeps that of lists alone.
+        "inputs": [[key, list(shape)] for key, shape in policy.shapes.items()],
         "state": policy.core.state_size,
         "reset": "a state of zeros is the one before the first step" if format == "onnx" else "call reset()",
         "network": policy.config,

@@ -102,7 +102,7 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
     found = read_json(contract)
     if not isinstance(found, dict) or not {"inputs", "format", "deployment"} <= set(found):
         raise DataError(f"{str(contract)!r} is not the contract of a policy.")
-    groups = {name: tuple(int(size) for size in shape) for name, shape in found["inputs"].items()}
+    groups = {name: tuple(int(size) for size in shape) for name, shape in found["inputs"]}
     missing = {"rate", "hand", "joints", "action_map", "frozen"} - set(found["deployment"])
     if missing:
         raise UsageError(

@@ -23,7 +23,7 @@ class TouchWorld:
             names=("a", "b"), default=np.zeros(2), scale=np.ones(2), low=-np.ones(2), high=np.ones(2)
         )
         self.touch = observation_type(observe).sensor is not None
-        student = ("proprio", "tactile") if self.touch else ("proprio",)
+        student = ("proprio", "goal", "tactile") if self.touch else ("proprio", "goal")
         self.task = SimpleNamespace(
             groups={"student": student},
             decoders=(SimpleNamespace(target="aux_aim", weight=0.5, scale=2.0, hidden=(16,)),),
@@ -39,7 +39,7 @@ class TouchWorld:
             self.tactile = None
         self.generator = torch.Generator().manual_seed(seed)
         self.place, self.aim = torch.zeros(num_envs, 2), torch.zeros(num_envs, 2)
-        self.age = torch.zeros(num_envs, dtype=torch.long)
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
         self.observations = self.reset()
         self.observation_shapes = {name: tuple(value.shape[1:]) for name, value in self.observations.items()}
 
@@ -47,12 +47,12 @@ class TouchWorld:
         chosen = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
         fresh = torch.randn(self.num_envs, 2, generator=self.generator)
         self.aim[chosen], self.place[chosen] = fresh[chosen], 0.0
-        self.age[chosen] = torch.randint(0, 4, (self.num_envs,), generator=self.generator)[chosen]
+        self.episode_length_buf[chosen] = 0
         self.observations = self._observe()
         return self.observations
 
     def _observe(self) -> dict[str, torch.Tensor]:
-        found = {"proprio": self.place.clone(), "aux_aim": self.aim.clone()}
+        found = {"proprio": self.place.clone(), "goal": torch.ones(self.num_envs, 1), "aux_aim": self.aim.clone()}
         if self.touch:
             touch = torch.zeros(self.num_envs, *self.shape)
             touch[:, :, 3, 0], touch[:, :, 20, 0] = 0.2 * self.aim[:, :1], 0.2 * self.aim[:, 1:]
@@ -61,8 +61,8 @@ class TouchWorld:
 
     def step(self, action: torch.Tensor):
         self.place = self.place + 0.2 * action
-        self.age += 1
-        over = self.age >= self.max_episode_length
+        self.episode_length_buf += 1
+        over = self.episode_length_buf >= self.max_episode_length
         self.reset(over)
         reward = -(self.place - self.aim).norm(dim=1)
         return self.observations, reward, torch.zeros_like(over), over, {"log": {}}
@@ -71,12 +71,17 @@ class TouchWorld:
         return {"episodes": 1.0, "success": 0.5}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        own = {"place": self.place, "aim": self.aim, "age": self.age, "generator": self.generator.get_state()}
+        own = {
+            "place": self.place,
+            "aim": self.aim,
+            "episode_length_buf": self.episode_length_buf,
+            "generator": self.generator.get_state(),
+        }
         own |= {f"observations.{name}": value for name, value in self.observations.items()}
         return {name: value.clone() for name, value in own.items()}
 
     def load_state_dict(self, values: dict[str, torch.Tensor]) -> None:
-        for name in ("place", "aim", "age"):
+        for name in ("place", "aim", "episode_length_buf"):
             setattr(self, name, values[name].clone())
         self.generator.set_state(values["generator"])
         start = "observations."
