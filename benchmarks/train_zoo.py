@@ -293,7 +293,8 @@ class Worker:
 
     def _needed(self, job: Job) -> float:
         """Return the seconds without which a job is not worth beginning."""
-        return 0.6 * self._budget(job) if self.args.last and job.objective != "untrained" else 25.0
+        whole = self.args.last and not self.args.short and job.objective != "untrained"
+        return 0.6 * self._budget(job) if whole else 25.0
 
     def _budget(self, job: Job) -> float:
         return job.weight * (self.args.full_seconds if job.full else self.args.small_seconds)
