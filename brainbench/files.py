@@ -52,9 +52,17 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def to_plain(value: Any) -> Any:
-    """Turn dataclasses, mappings, arrays and paths into JSON types; a float without value is null."""
+    """Turn dataclasses, mappings, arrays and paths into JSON types; a float without value is null.
+
+    A field that came later than files and hashes which exist (its metadata say ``later=True``) appears only where it
+    is used, so that those stay what they are.
+    """
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
+        return {
+            field.name: to_plain(getattr(value, field.name))
+            for field in fields(value)
+            if not (field.metadata.get("later") and getattr(value, field.name) == field.default)
+        }
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

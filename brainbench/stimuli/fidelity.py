@@ -7,10 +7,10 @@ Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import resources
-from typing import Literal
+from typing import Any, Literal
 
 from brainbench.errors import UsageError, unknown_name
 from brainbench.fidelity import TradeoffPoint, cheapest
@@ -36,6 +36,9 @@ class Fidelity:
     by about π ζ / ``steps_per_period``."""
     precision: Literal["single", "double"] = "single"
     """Arithmetic of the ``rod`` backend; the others always use double precision."""
+    solver: Literal["dynamic", "quasistatic"] = field(default="dynamic", metadata={"later": True})
+    """``quasistatic`` leaves out inertia and damping: whiskers are in balance at every time step. For slow sweeps; of
+    the backends ``rod`` alone knows it, and ``steps_per_period`` means nothing in it."""
 
     def __post_init__(self) -> None:
         if not 2 <= self.links <= MOST_LINKS:
@@ -45,6 +48,8 @@ class Fidelity:
         if not 1e-7 <= self.time_step <= 5e-3:
             raise UsageError(f"time_step must lie between 1e-7 and 5e-3 s; received {self.time_step!r}.")
 
+        if self.solver not in SOLVERS:
+            raise unknown_name("solver", str(self.solver), SOLVERS)
         if self.precision not in PRECISIONS:
             raise unknown_name("precision", str(self.precision), PRECISIONS)
         if self.steps_per_period is not None and not 4 <= self.steps_per_period <= 1e4:
@@ -64,6 +69,25 @@ class Fidelity:
         return cls(**_PRESETS[name])
 
     @classmethod
+    def parse(cls, text: str) -> Fidelity:
+        """Return a preset with some values replaced, as ``balanced`` or ``fast,links=12,solver=quasistatic``.
+
+        Values stand in SI units, as the fields of this class; ``none`` stands for None.
+
+        Raises:
+            UsageError: there is no such preset or field, or a value lies outside its range.
+        """
+        preset, *changes = (item.strip() for item in text.split(","))
+        names = {item.name: item for item in fields(cls)}
+        values: dict[str, Any] = {}
+        for change in changes:
+            name, _, value = (part.strip() for part in change.partition("="))
+            if name not in names:
+                raise unknown_name("fidelity setting", name, names)
+            values[name] = _value(name, value)
+        return replace(cls.preset(preset), **values)
+
+    @classmethod
     def auto(cls, *, error: float = 0.05, backend: str = "mujoco") -> Fidelity:
         """Return the cheapest measured setting of a backend whose relative error is at most ``error``.
 
@@ -79,7 +103,7 @@ class Fidelity:
 
     def step(self, frequency: float) -> float:
         """Time step [s] of a whisker whose first mode has this frequency [Hz]."""
-        if self.steps_per_period is None:
+        if self.steps_per_period is None or self.solver == "quasistatic":
             return self.time_step
         return min(self.time_step, 1 / (self.steps_per_period * frequency))
 
@@ -100,7 +124,20 @@ class Fidelity:
         return count
 
 
+def _value(name: str, text: str) -> Any:
+    if text == "none":
+        return None
+    if name in ("precision", "solver"):
+        return text
+    try:
+        return int(text) if name == "links" else float(text)
+    except ValueError as error:
+        kind = "a whole number" if name == "links" else "a number"
+        raise UsageError(f"{name} takes {kind}; received {text!r}.") from error
+
+
 PRECISIONS = ("single", "double")
+SOLVERS = ("dynamic", "quasistatic")
 MOST_LINKS = 100
 """Links per whisker that are allowed; cost grows with the cube, and error is far below 0.1 % before."""
 

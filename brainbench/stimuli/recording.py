@@ -72,7 +72,7 @@ def record(
 
     times = np.atleast_1d(np.asarray(times, dtype=float))
     fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
-    fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+    fidelity = Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
     engine = get_backend(backend) if isinstance(backend, str) else backend
     jobs = [replace(job, times=times) for job in scene.jobs()]
     path = None

@@ -74,7 +74,7 @@ def simulate(
     """
     chosen = _checked(scenes)
     fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
-    fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+    fidelity = Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
     engine = get_backend(backend) if isinstance(backend, str) else backend
     path = cache_path(chosen, fidelity, engine.name) if cache and isinstance(backend, str) else None
     if path is not None and path.exists():

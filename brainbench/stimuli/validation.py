@@ -391,7 +391,7 @@ def _settling_time(whisker: Whisker) -> float:
 
 
 def _fidelity(fidelity: Fidelity | str) -> Fidelity:
-    return Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+    return Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
 
 
 def _run(backend: str, job: Job, fidelity: Fidelity) -> Trace:

@@ -1,8 +1,11 @@
 """Presets and the measured table behind them."""
 
+from dataclasses import replace
+
 import pytest
 
 from brainbench.errors import UsageError
+from brainbench.files import to_plain
 from brainbench.stimuli.fidelity import Fidelity, list_presets, measured
 
 
@@ -67,3 +70,32 @@ def test_impossible_settings_are_refused(values, message):
 def test_an_unknown_preset_suggests_the_nearest():
     with pytest.raises(UsageError, match="did you mean 'balanced'"):
         Fidelity.preset("balance")
+
+
+def test_a_preset_in_a_text_may_be_changed_value_by_value():
+    assert Fidelity.parse("balanced") == Fidelity.preset("balanced")
+    changed = Fidelity.parse("fast, links=12, time_step=5e-4, steps_per_period=none, solver=quasistatic")
+    assert changed == replace(
+        Fidelity.preset("fast"), links=12, time_step=5e-4, steps_per_period=None, solver="quasistatic"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("balancd", "balanced"),
+        ("fast,link=3", "'links'"),
+        ("fast,links=many", "links takes a whole number; received 'many'"),
+        ("fast,time_step=", "time_step takes a number; received ''"),
+        ("fast,solver=static", "quasistatic"),
+        ("fast,time_step=1", "between 1e-7 and 5e-3"),
+    ],
+)
+def test_a_wrong_text_is_answered_in_words(text, message):
+    with pytest.raises(UsageError, match=message):
+        Fidelity.parse(text)
+
+
+def test_a_value_that_came_later_leaves_old_hashes_alone():
+    assert "solver" not in to_plain(Fidelity())
+    assert to_plain(Fidelity(solver="quasistatic"))["solver"] == "quasistatic"

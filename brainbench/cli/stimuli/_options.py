@@ -14,8 +14,14 @@ if TYPE_CHECKING:
     from brainbench.stimuli import Recipe, Scene
 
 WhiskersOption = Annotated[str, typer.Option(help="Whiskers to simulate: all, C0-C3, C2,D1, …")]
-FidelityOption = Annotated[str, typer.Option(help="Simulation preset: fast, balanced or accurate.")]
-BackendOption = Annotated[str, typer.Option(help="Physics engine: mujoco, or bullet (see its documentation).")]
+FidelityOption = Annotated[
+    str,
+    typer.Option(
+        help="Simulation preset: fast, balanced or accurate; single values may follow, as in "
+        "fast,links=12,time_step=5e-4,solver=quasistatic."
+    ),
+]
+BackendOption = Annotated[str, typer.Option(help="Physics engine: rod (our own), mujoco, or bullet.")]
 StimulusOption = Annotated[
     str | None, typer.Option("--stimulus", "-s", help="Label of the stimulus; needed where there are several.")
 ]

@@ -73,7 +73,7 @@ def sweep(
     )
     scenes = SweepScenes(GRIDS[grid], {name: item.load for name, item in found.items()}, whiskers=whiskers)
     settings = Settings(
-        Fidelity.preset(fidelity),
+        Fidelity.parse(fidelity),
         backend=backend,
         device=device,
         split=split,  # type: ignore[arg-type]

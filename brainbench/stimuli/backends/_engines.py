@@ -120,8 +120,22 @@ def require_parts(jobs: Sequence[Job], backend: str) -> None:
             )
 
 
+def require_dynamic(fidelity: Fidelity, backend: str) -> None:
+    """Refuse the quasi-static solver.
+
+    Raises:
+        UsageError: it is asked for.
+    """
+    if fidelity.solver != "dynamic":
+        raise UsageError(
+            f"The backend {backend!r} has no solver {fidelity.solver!r}, only 'dynamic'; use the backend 'rod' for it."
+        )
+
+
 def warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:
     """Say when the time step alone damps a whisker at least twice as much as it should be damped."""
+    if fidelity.solver == "quasistatic":
+        return
     worst, wanted = 0.0, 0.0
     for whisker in {job.whisker for job in jobs}:
         chain = build_chain(whisker, 8)

@@ -37,6 +37,7 @@ from brainbench.stimuli.backends._engines import (
     MICRO,
     MILLI,
     passed_unseen,
+    require_dynamic,
     require_parts,
     strongest_force,
     too_strong,
@@ -88,6 +89,7 @@ class BulletBackend:
         if workers is not None and workers < 1:
             raise UsageError(f"workers must be at least 1; received {workers}.")
         engine()
+        require_dynamic(fidelity, self.name)
         require_parts(jobs, self.name)
         warn_overdamped(jobs, fidelity)
         traces = []

@@ -23,6 +23,7 @@ from brainbench.stimuli.backends._engines import (
     MICRO,
     MILLI,
     passed_unseen,
+    require_dynamic,
     require_parts,
     strongest_force,
     too_strong,
@@ -70,6 +71,7 @@ class MujocoBackend:
         """
         if workers is not None and workers < 1:
             raise UsageError(f"workers must be at least 1; received {workers}.")
+        require_dynamic(fidelity, self.name)
         require_parts(jobs, self.name)
         warn_overdamped(jobs, fidelity)
         traces: list[Trace | None] = [None] * len(jobs)

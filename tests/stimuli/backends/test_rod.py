@@ -182,3 +182,58 @@ def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same():
         np.testing.assert_array_equal(getattr(whole, name).numpy(), getattr(parts, name).numpy())
     for name in ("steps", "touching", "unsolved", "crowded", "depth", "doubt", "status"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
+
+
+@pytest.mark.parametrize("step", [2e-4, 2e-3])
+def test_without_inertia_a_whisker_is_in_balance_at_any_step(step):
+    still = Fidelity(links=20, time_step=step, solver="quasistatic")
+    found = validation.peg(C2, 0.5 * C2.arc_length, 0.2 * C2.arc_length, peg_radius=5e-5, backend="rod", fidelity=still)
+    assert found.moment_error < 5e-3
+    assert found.force_error < 5e-3
+
+
+def test_a_slow_sweep_gives_the_same_with_and_without_inertia_and_a_fast_one_does_not():
+    def passing(speed):
+        thing = _moving((Capsule((0.009, -0.002, -0.02), (0.009, -0.002, 0.02), 3e-4),), (0.0, speed, 0.0))
+        times = np.linspace(0.05, 1.0, 40) * 3.5e-3 / speed
+        dynamic, balance = (
+            _run(Job(C2, StillFollicle(), (thing,), times), Fidelity(links=10, time_step=1e-4, solver=solver))[0]
+            for solver in ("dynamic", "quasistatic")
+        )
+        return np.abs(dynamic.wrench - balance.wrench).max(axis=0)[5] / np.abs(balance.wrench).max(axis=0)[5]
+
+    assert passing(0.01) < 0.005
+    assert passing(1.0) > 0.05
+
+
+def test_a_weight_bends_a_whisker_without_inertia_as_it_does_with():
+    jobs = [Job(replace(C2, damping_ratio=1.0), StillFollicle(), (), np.array([0.05, 0.2]), gravity=(0.0, -9.81, 0.0))]
+    dynamic, balance = (
+        _run(jobs, Fidelity(links=10, time_step=1e-4, solver=solver))[0] for solver in ("dynamic", "quasistatic")
+    )
+    np.testing.assert_allclose(balance.wrench[-1], dynamic.wrench[-1], atol=1e-3 * np.abs(dynamic.wrench[-1]).max())
+
+
+def test_sweeps_through_the_fast_path_may_leave_inertia_out():
+    from brainbench.stimuli.backends.rod.fast import simulate_sweeps
+
+    objects = resolve_objects(["ellipsoid-1"], surfaces=True)
+    grid = SweepGrid(speed=(0.03,), rotation=(0.0,), distance=(0.005,), size=(0.03,))
+    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2")
+    moving, still = (
+        simulate_sweeps(scenes, [0], fidelity=Fidelity(links=10, time_step=5e-4, solver=solver))
+        for solver in ("dynamic", "quasistatic")
+    )
+    peak = np.abs(moving.wrench[..., 3:]).max()
+    assert 0 < np.median(np.abs(moving.wrench - still.wrench)[..., 3:][moving.wrench[..., 3:] != 0]) < 0.02 * peak
+
+
+@pytest.mark.parametrize("name", ["mujoco", "bullet"])
+def test_other_engines_refuse_to_leave_inertia_out(name):
+    from brainbench.stimuli import get_backend
+
+    if name == "bullet":
+        pytest.importorskip("pybullet")
+    job = Job(C2, StillFollicle(), (), np.array([0.01]))
+    with pytest.raises(UsageError, match="has no solver 'quasistatic', only 'dynamic'; use the backend 'rod'"):
+        get_backend(name).run([job], Fidelity(solver="quasistatic"))

@@ -22,6 +22,9 @@ DOUBTFUL = 0.05
 a result counts as unstable. Whiskers below it are within a few per cent of the converged solution (docs/stimuli.md)."""
 CROWDED = 0.02
 """Share of the steps with more contacts than :data:`CONTACTS` from which a result counts as unstable."""
+LIGHT = 5e-3
+"""Share of a whisker's mass that a quasi-static step keeps. It bounds the way of one step where there is no balance,
+as when a whisker slips off; what one step of 1 ms leaves of a slow mode is this share over (omega h)², below .5 %."""
 REST = 1e-6
 """Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
 FAR = 3.0

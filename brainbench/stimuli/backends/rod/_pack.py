@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.stimuli.backends._engines import MICRO, MILLI
+from brainbench.stimuli.backends.rod._limits import LIGHT
 from brainbench.stimuli.backends.rod._shapes import BOX, CAPSULE, CYLINDER, MESH, SPHERE
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
 
@@ -158,25 +159,31 @@ class Chains:
 
     capacity: int
     chains: list[Chain] = field(default_factory=list)
+    quasistatic: bool = False
 
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``Chains`` hold."""
         count = len(self.chains)
+        mass = LIGHT if self.quasistatic else 1.0
         build, inertia, taper = (np.zeros((self.capacity, count, 4)) for _ in range(3))
         for w, chain in enumerate(self.chains):
             n = chain.links
             lengths = chain.lengths * MILLI
             build[:n, w] = np.stack(
-                [lengths, np.cos(chain.rest_angles), np.sin(chain.rest_angles), chain.masses * MICRO], axis=1
+                [lengths, np.cos(chain.rest_angles), np.sin(chain.rest_angles), chain.masses * (mass * MICRO)],
+                axis=1,
             )
             inertia[:n, w] = np.stack(
-                [chain.centres * MILLI, *(chain.inertias.T * MICRO * MILLI**2), chain.stiffness * MICRO], axis=1
+                [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), chain.stiffness * MICRO],
+                axis=1,
             )
             radii = chain.whisker.radius(chain.nodes) * MILLI
             taper[:n, w] = np.stack(
                 [radii[:-1], radii[1:], chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI], axis=1
             )
-        beta = [2 * c.whisker.damping_ratio / c.frequencies()[0] * MILLI for c in self.chains]
+        beta = [
+            0 if self.quasistatic else 2 * c.whisker.damping_ratio / c.frequencies()[0] * MILLI for c in self.chains
+        ]
         return {
             "links": np.array([c.links for c in self.chains], dtype=np.int32),
             "beta": np.array(beta),

@@ -148,6 +148,7 @@ def solver(
         axes: mat33
         """Rotation of the results."""
         quasistatic: wp.int32
+        """Whether rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
         shape: wp.int32
 
     @wp.struct
@@ -611,6 +612,9 @@ def solver(
         slip_tries = int(8) + wp.min(0, lane)
         guess_tries = int(10) + wp.min(0, lane)
         rounds_most = int(wp.static(ROUNDS)) + wp.min(0, lane)
+        sweeps_most = int(wp.static(SWEEPS)) + wp.min(0, lane)
+        contacts_most = int(wp.static(CONTACTS)) + wp.min(0, lane)
+        sides = int(2) + wp.min(0, lane)
         object_speed = zero
         for s in range(shapes_from, shapes_to):
             object_speed = wp.max(object_speed, bodies.speed[s])
@@ -739,6 +743,8 @@ def solver(
                 left = left - h
                 if count == 1:
                     last = 1
+                    if opt.quasistatic == 1 and reading < readings.shape[0]:
+                        pending = reading
                 step_damping = wp.max(beta - h, zero)
                 pose0 = pose_at(tr, base, now)
                 pose1 = pose_at(tr, base, now + h)
@@ -855,7 +861,7 @@ def solver(
                                     )
                                 close[i] = touch.close
                                 closest = wp.min(closest, touch.clear)
-                                for which in range(2):
+                                for which in range(sides):
                                     offered = touch.between
                                     share = touch.share
                                     gap = touch.gap
@@ -1039,6 +1045,8 @@ def solver(
                     else:
                         rate = rate + vec2(a1, a2) * h
                         angle = q[i] + rate * h
+                        if opt.quasistatic == 1:
+                            rate = vec2(zero, zero)
                         qd[i] = rate
                         q[i] = angle
                         bend = wp.max(wp.abs(angle[0]), wp.abs(angle[1]))
@@ -1067,7 +1075,7 @@ def solver(
                         more = int(1)
                 for round_ in range(rounds_most):
                     if more == 1:
-                        for _ in range(wp.static(CONTACTS)):
+                        for _ in range(contacts_most):
                             if contacts < wp.static(CONTACTS):
                                 slot = int(-1)
                                 lowest = zero
@@ -1152,7 +1160,7 @@ def solver(
                         change = zero
                         moved_force = zero
                         whole_force = zero
-                        for sweep in range(wp.static(SWEEPS)):
+                        for sweep in range(sweeps_most):
                             if settled == 0:
                                 change = zero
                                 moved_force = zero
@@ -1454,7 +1462,8 @@ def solver(
                 first_reading = reading
                 break
             before = upto
-            pending = reading
+            if opt.quasistatic == 0:
+                pending = reading
             if status != 0:
                 break
         if wp.static(sliced) and paused != 0:

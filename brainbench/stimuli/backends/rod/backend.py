@@ -16,7 +16,7 @@ from brainbench.stimuli.backends._engines import MILLI, step_travel, strongest_f
 from brainbench.stimuli.backends._reach import Reach, reachable
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
-from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, FINEST, LOST, OK, WIDEST
+from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, FINEST, LIGHT, LOST, OK, WIDEST
 from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
 from brainbench.stimuli.chain import build_chain
 
@@ -177,7 +177,7 @@ def _simulate(
     # Compiling is once; it is no cost of a whisker.
     paused = time.thread_time()
     kernels = solver(real, capacity, batch.shapes.needs)
-    kernels.run.module.load(device)
+    kernels.run.module.load(device, block_dim=1 if device.is_cpu else None)
     started += time.thread_time() - paused
     readings = first.times * MILLI
     count, frames = len(lanes), len(readings)
@@ -196,7 +196,9 @@ def _simulate(
         setattr(out, name, empty(count, kind=wp.int32))
     options = kernels.Options()
     options.start = first.start * MILLI
-    options.gravity = kernels.vec3(*np.divide(first.gravity, MILLI).tolist())
+    options.quasistatic = int(fidelity.solver == "quasistatic")
+    weight = LIGHT if options.quasistatic else 1.0
+    options.gravity = kernels.vec3(*np.divide(first.gravity, MILLI * weight).tolist())
     options.axes = kernels.mat33(*np.eye(3).ravel().tolist())
     options.shape = int(record_shape)
     wp.launch(
@@ -231,7 +233,11 @@ def batch_structs(batch: _Batch, kernels: Any, device: Any) -> list[Any]:
         "load_stop": np.minimum([load[3] for load in batch.loads], 1e30),
     }
     return [
-        to_struct(kernels.Chains, Chains(batch.capacity, batch.chains).arrays(), device),
+        to_struct(
+            kernels.Chains,
+            Chains(batch.capacity, batch.chains, batch.fidelity.solver == "quasistatic").arrays(),
+            device,
+        ),
         to_struct(kernels.Tracks, batch.tracks.arrays(), device),
         to_struct(kernels.Bodies, batch.shapes.arrays(), device),
         to_struct(

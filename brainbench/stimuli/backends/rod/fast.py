@@ -88,6 +88,7 @@ class SweepLauncher:
         self.scenes, self.grid, self.fidelity = scenes, grid, fidelity
         self.seconds: dict[str, float] = {}
         """What the last launch spent on placing objects, uploading, and computing."""
+        self.quasistatic = fidelity.solver == "quasistatic"
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         mounts = list(scenes.array)
@@ -97,7 +98,9 @@ class SweepLauncher:
         self.kernels = solver(
             self.real, self.capacity, against, BOUNDS if bounds is None else bounds, sliced=self.sliced
         )
-        self._chains = to_struct(self.kernels.Chains, Chains(self.capacity, chains).arrays(), self.device)
+        self._chains = to_struct(
+            self.kernels.Chains, Chains(self.capacity, chains, self.quasistatic).arrays(), self.device
+        )
         self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in chains])
         self.readings = grid.frames.readings * MILLI
         self._bases = [_base_knot(mount, grid) for mount in mounts]
@@ -147,6 +150,7 @@ class SweepLauncher:
             setattr(out, name, wp.zeros(len(row), dtype=wp.int32, device=device))
         options = kernels.Options()
         options.axes = kernels.mat33(*self._head.ravel().tolist())
+        options.quasistatic = int(self.quasistatic)
         inputs = [
             self._chains,
             to_struct(kernels.Tracks, tracks.arrays(), device),
