@@ -19,6 +19,7 @@ from brainbench.cli import (
     export,
     leaderboard,
     models,
+    policy,
     power,
     recordings,
     score,
@@ -46,6 +47,7 @@ app.add_typer(models.app, name="models")
 app.add_typer(recordings.app, name="recordings")
 app.add_typer(stimuli.app, name="stimuli")
 app.add_typer(tactile.app, name="tactile")
+app.add_typer(policy.app, name="policy")
 app.add_typer(tradeoff.app, name="tradeoff")
 app.add_typer(leaderboard.app, name="leaderboard")
 

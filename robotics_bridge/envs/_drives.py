@@ -102,6 +102,11 @@ class Drives:
             own.copy_(torch.where(column, value, own))
         self.target.copy_(torch.where(column, position, self.target))
 
+    def seed(self, seed: int) -> None:
+        """Begin the torque noise anew."""
+        self._seed = seed & 0x3FFFFFFF
+        self._tick.zero_()
+
     def launch(self, substep: int) -> None:
         """Write the torques of one physics step to the world's ``ctrl``."""
         wp, a, device = warp(), self._arrays, self._world.warp_device

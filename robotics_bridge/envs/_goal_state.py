@@ -29,7 +29,7 @@ class GoalState:
         self.angle, self.angle_before, self.left = zeros(), zeros(), zeros()
         self.reached, self.missed = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.count, self.rate, self.off_axis, self.turned = zeros(), zeros(), zeros(), zeros()
-        self.on_axis = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.allowed_off_axis = float(getattr(task.goal, "allowed_off_axis", float("inf")))
         self._axis = None
         if self.goal is not None and self.goal.axis is not None:
             self._axis = torch.tensor(self.goal.axis, device=device)
@@ -47,7 +47,6 @@ class GoalState:
         self.previous.copy_(torch.where(mask.unsqueeze(1), quat, self.previous))
         for name in ("count", "rate", "off_axis", "turned"):
             getattr(self, name).masked_fill_(mask, 0.0)
-        self.on_axis |= mask
         for name in ("reached", "missed"):
             getattr(self, name).masked_fill_(mask, value=False)
         self._ring.masked_fill_(mask, float("inf"))
@@ -75,7 +74,6 @@ class GoalState:
             self.rate.copy_(twist / self._dt)
             _, swing = twist_and_swing(error, self._axis)
             self.off_axis.copy_(swing)
-            self.on_axis.copy_(swing <= getattr(self.goal, "allowed_off_axis", float("inf")))
         self.left -= self._dt
         self.reached.copy_(self.angle < self.goal.threshold)
         self.missed.copy_((self.left <= 0) & ~self.reached)
@@ -114,5 +112,5 @@ class GoalState:
 
     def _memory(self) -> dict[str, torch.Tensor]:
         names = ("quat", "previous", "angle", "angle_before", "left", "reached", "missed", "count", "rate", "off_axis")
-        own = {name: getattr(self, name) for name in (*names, "turned", "on_axis")}
+        own = {name: getattr(self, name) for name in (*names, "turned")}
         return {**own, "ring": self._ring}

@@ -111,7 +111,8 @@ class Env:
         self.max_episode_length = math.ceil(task.episode / self.step_dt)
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(seed)
-        self._keep_final = keep_final
+        self.keeps_final = keep_final
+        """Whether ``step`` returns the last observations of episodes."""
         self.drives = Drives(self.world, self.model, task.actuators, substeps=self.decimation, seed=seed)
         self.goals = GoalState(task, num_envs, self.device)
         self.touch = None
@@ -246,11 +247,16 @@ class Env:
         info = {"time_outs": truncated, "diverged": diverged, "log": self._account(parts, done, diverged)}
         info |= {"metric": self.metric.clone(), "return": self._return.clone(), "steps": self._steps.clone()}
         self.goals.advance(self._object_quat(), self._draw)
-        if self._keep_final:
+        if self.keeps_final:
             info["final_observations"] = {k: v.clone() for k, v in self._observe().items()}
         self._begin(done)
         self.observations = self._observe()
         return self.observations, reward, terminated, truncated, info
+
+    def seed(self, seed: int) -> None:
+        """Begin the random numbers anew, from the next reset on."""
+        self._generator.manual_seed(seed)
+        self.drives.seed(seed)
 
     def statistics(self) -> dict[str, float]:
         """Return means over the episodes that ended since the last call; waits for the device."""
@@ -460,7 +466,8 @@ class Env:
             object_force=size, tip_force=self.tip_force, surface_distance=self.surface_distance,
             step_count=self._steps, goal_angle=goals.angle, previous_goal_angle=goals.angle_before,
             reached=goals.reached, missed=goals.missed, goals_reached=goals.count, axis_rate=goals.rate,
-            off_axis=goals.off_axis, on_axis=goals.on_axis, turned=goals.turned, turned_before=goals.turned_before,
+            off_axis=goals.off_axis, allowed_off_axis=goals.allowed_off_axis, turned=goals.turned,
+            turned_before=goals.turned_before,
         )  # fmt: skip
 
     @property

@@ -65,8 +65,8 @@ class Moment:
     """[B] rotation about the commanded axis in this step (rad/s)."""
     off_axis: torch.Tensor
     """[B] tilt against the commanded axis (rad)."""
-    on_axis: torch.Tensor
-    """[B] bool: the tilt is within what the goal allows."""
+    allowed_off_axis: float
+    """Tilt that the goal allows (rad)."""
     turned: torch.Tensor
     """[B] rotation about ``task.turn_axis`` since the start of the episode (rad)."""
     turned_before: torch.Tensor

@@ -31,13 +31,12 @@ def orientation_inverse(m: Moment, *, rot_eps: float) -> torch.Tensor:
 
 
 def rotation_progress(m: Moment, *, clip: float, penalty_scale: float) -> torch.Tensor:
-    """Return the rate about the commanded axis (rad/s), up to ±clip.
+    """Return the rate about the commanded axis (rad/s), up to ±clip, while the tilt is within what the goal allows.
 
-    Forward rotation counts while the object is tilted no more than the goal allows; backward rotation always,
-    ``penalty_scale`` times.
+    Beyond that, the excess tilt (rad) costs ``penalty_scale`` times. Rotation to and fro adds up to nothing.
     """
-    rate = m.axis_rate.clamp(-clip, clip)
-    return rate.clamp(min=0) * m.on_axis.float() + penalty_scale * rate.clamp(max=0)
+    excess = (m.off_axis - m.allowed_off_axis).clamp(min=0)
+    return m.axis_rate.clamp(-clip, clip) * (excess <= 0).float() - penalty_scale * excess
 
 
 def approach(m: Moment, *, clip: tuple[float, float], negative_scale: float) -> torch.Tensor:

@@ -1,0 +1,131 @@
+"""``brainbench policy deploy``: run an exported policy on a hand, or on a simulated one behind a real socket."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit
+
+if TYPE_CHECKING:
+    from robotics_bridge.policies.deploy.session import DeployedPolicy
+
+
+def deploy(
+    policy: Annotated[Path, typer.Argument(help="A file of brainbench policy export; its contract lies beside it.")],
+    driver: Annotated[
+        str,
+        typer.Option(help="sim: a simulated hand of its own process; or HOST:PORT of a hand that speaks its protocol."),
+    ] = "sim",
+    seconds: Annotated[float, typer.Option(help="How long.")] = 10.0,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="Of the simulated hand: drop=0.2, jitter=0.03, silent-after=2, …")
+    ] = None,
+    goal: Annotated[list[float] | None, typer.Option(help="Numbers of the group 'goal', once for each.")] = None,
+    timeout: Annotated[float, typer.Option(help="Oldest report to act upon (s).")] = 0.1,
+    pressure: Annotated[float, typer.Option(help="Largest force of a finger tip, in the maker's unit.")] = 30.0,
+    threads: Annotated[int, typer.Option(help="Of the network's computations.")] = 1,
+    record: Annotated[Path | None, typer.Option(help="Folder to write the session to, as a LeRobot data set.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a policy at its rate with watchdog, limits and safe stop; print latencies and why it stopped, if it did.
+
+    Exit status 1: it was stopped for safety.
+    """
+    from robotics_bridge.policies.deploy import session
+    from robotics_bridge.policies.deploy.sim_hand import Faults, simulated_hand
+    from robotics_bridge.policies.deploy.udp import UdpDriver
+
+    deployed = session.read_deployed(policy)
+    faults = Faults.parse(fault or [])
+    sources = {}
+    if "goal" in deployed.groups:
+        size = deployed.groups["goal"][0]
+        sources["goal"] = session.constant(goal if goal is not None else [0.0] * size, size)
+    with contextlib.ExitStack() as stack:
+        if driver == "sim":
+            address, joints, fingers = stack.enter_context(
+                simulated_hand(deployed.hand, faults=faults, seconds=seconds + 60)
+            )
+        else:
+            address, joints, fingers = _remote(driver, deployed)
+        link = stack.enter_context(UdpDriver(address, joints, fingers))
+        tape = _Tape(deployed) if record is not None else None
+        controller = deployed.controller(
+            link, limits={"timeout": timeout, "pressure": pressure}, sources=sources, threads=threads, record=tape
+        )
+        report = controller.run(seconds)
+    facts: dict[str, Any] = {**vars(report)}
+    if record is not None and tape is not None and tape.episode.state:
+        facts["episode"] = str(tape.write(record, joints))
+    reason = f" ({report.reason})" if report.reason else ""
+    latency = report.latency
+    text = (
+        f"{report.status}{reason}: {report.ticks} ticks in {report.seconds:.1f} s\n"
+        f"control tick: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms, max {latency['max']:.2f} ms; "
+        f"{report.overruns} longer than a control step\n"
+        f"reports: {report.link['received']} received, {report.link['lost']} lost, {report.link['late']} late, "
+        f"{report.link['damaged']} damaged; targets limited in {report.limited} ticks\n"
+        f"{controller.latency.text()}"
+    )
+    emit(facts, text, as_json=as_json)
+    if report.status == "stopped":
+        raise typer.Exit(1)
+
+
+def _remote(text: str, deployed: DeployedPolicy) -> tuple[tuple[str, int], tuple[str, ...], tuple[str, ...]]:
+    from brainbench.errors import UsageError
+    from robotics_bridge import hands
+
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit():
+        raise UsageError(f"A driver is 'sim' or HOST:PORT; received {text!r}.")
+    hand = hands.load(deployed.hand)
+    return (host, int(port)), hand.joints, tuple(hand.fingers)
+
+
+class _Tape:
+    """Keeps a session for LeRobot; touch is one point per finger tip, where the hand senses it."""
+
+    def __init__(self, deployed: DeployedPolicy) -> None:
+        from robotics_bridge import hands
+        from robotics_bridge.policies._rays import rays_of
+        from robotics_bridge.policies.deploy.lerobot import Episode, TactilePoints
+
+        self.hand, self.rate = hands.load(deployed.hand), deployed.rate
+        layout = self.hand.layout("med", "tips")
+        self.rays = rays_of(self.hand, self.hand.layout("med", "hand"))
+        import numpy as np
+
+        fingers = tuple(self.hand.fingers)
+        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
+        self.rows = [fingers.index(tips[link]) for link in layout]
+        position, normal = (
+            np.stack([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()])
+            for name in ("position", "normal")
+        )
+        self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
+        self.episode = Episode(str(deployed.deployment.get("task", "deployed policy")))
+
+    def __call__(self, reading: Any, obs: Any, action: Any, targets: Any) -> None:
+        import numpy as np
+
+        from robotics_bridge.policies.deploy.lerobot import total_wrench
+
+        del obs, action
+        # The maker's pressure is about outward normals with axes z, y, x; a force on the skin points inward.
+        force = -reading.pressure[self.rows][:, ::-1]
+        points = np.concatenate([force, np.cross(self.points.position, force)], axis=1)
+        wrench = total_wrench(points, self.points.links, self.points.link, self.rays)
+        self.episode.add(reading.position, reading.velocity, targets, points, wrench)
+
+    def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
+        """Write the data set."""
+        from robotics_bridge.policies.deploy.lerobot import write_lerobot
+
+        return write_lerobot(
+            folder, [self.episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name
+        )

@@ -1,0 +1,65 @@
+"""``brainbench policy evaluate``: success rates of agents, with intervals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.policy._options import (
+    ConfigOption,
+    DeviceOption,
+    EnvsOption,
+    HandOption,
+    TaskArgument,
+    TaskFileOption,
+    agent_of,
+    make_env,
+)
+
+
+def evaluate(
+    task: TaskArgument,
+    agents: Annotated[
+        list[str] | None, typer.Argument(help="zero, random, or folders of training runs; zero and random always run.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Per agent and seed.")] = 100,
+    seeds: Annotated[int, typer.Option(help="Evaluation seeds.")] = 3,
+    envs: EnvsOption = 32,
+    hand: HandOption = "xhand1",
+    config: ConfigOption = "default",
+    task_file: TaskFileOption = None,
+    device: DeviceOption = "cpu",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the result as JSON here too.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare agents over whole episodes: success rate with its 95 % interval, metric, return and length."""
+    from brainbench.errors import UsageError
+    from brainbench.files import write_json
+    from robotics_bridge.policies.evaluate import evaluate as run
+
+    if seeds < 1:
+        raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
+    env = make_env(task, task_file=task_file, num_envs=envs, hand=hand, config=config, device=device)
+    names = list(dict.fromkeys(["zero", "random", *(agents or [])]))
+    found: list[dict[str, Any]] = []
+    with progress_bar() as progress:
+        for name in names:
+            result = run(
+                env, agent_of(name, env), episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress
+            )
+            found.append(result.summary())
+    if out is not None:
+        write_json(out, found)
+    rows = [
+        [
+            r["agent"], str(r["episodes"]), f"{r['success_rate']:.3f}",
+            "{:.3f}–{:.3f}".format(*r["success_interval"]), f"{r['metric']:.3g} ± {r['metric_half_width']:.2g}",
+            f"{r['returns']:.4g} ± {r['returns_half_width']:.2g}", f"{r['lengths']:.0f}", str(r["diverged"]),
+        ]
+        for r in found
+    ]  # fmt: skip
+    columns = ["agent", "episodes", "success", "95 %", env.task.success.metric, "return", "steps", "diverged"]
+    emit(found, table(env.task.text, columns, rows, right=tuple(range(1, 8))), as_json=as_json)

@@ -1,0 +1,30 @@
+"""``brainbench policy export``: a student as a file for a robot, with its contract."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Folder of a student (brainbench policy distill).")],
+    out: Annotated[Path | None, typer.Option(help="File to write; by default policy.onnx in the folder.")] = None,
+    format: Annotated[str, typer.Option(help="onnx or jit.")] = "onnx",
+    as_json: JsonOption = False,
+) -> None:
+    """Write a student with normalisers, taxel grid, encoder and head in one file, and compare it step by step."""
+    from robotics_bridge.policies.distill import load_student
+    from robotics_bridge.policies.export import STEPS, SUFFIXES, export_policy
+
+    student, described = load_student(run)
+    target = out or run / f"policy{SUFFIXES.get(format, '')}"
+    found = export_policy(student, target, format=format, deployment=described["deployment"], name=run.name)
+    text = (
+        f"{found.path}: {found.state_size:,} numbers of memory; {STEPS} steps with resets differ by at most "
+        f"{found.difference:.1e} of the largest action\n{found.contract}"
+    )
+    emit(found, text, as_json=as_json)

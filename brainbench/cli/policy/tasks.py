@@ -1,0 +1,31 @@
+"""``brainbench policy tasks``: what there is to do."""
+
+from __future__ import annotations
+
+from brainbench.cli._shared import JsonOption, emit, table
+
+
+def list_tasks(as_json: JsonOption = False) -> None:
+    """List the tasks with their success, length and observation groups."""
+    from robotics_bridge import tasks
+
+    found = []
+    for name in tasks.list_tasks():
+        task = tasks.load(name)
+        student = [*task.groups["student"], "tactile"]
+        found.append(
+            {
+                "task": name,
+                "text": task.text,
+                "seconds": task.episode,
+                "metric": task.success.metric,
+                "success_from": task.success.threshold,
+                "student": student,
+                "teacher": list(task.groups["actor"]),
+            }
+        )
+    rows = [
+        [f["task"], f["text"], f"{f['seconds']:g}", f"{f['metric']} ≥ {f['success_from']:.3g}", ", ".join(f["student"])]
+        for f in found
+    ]
+    emit(found, table("", ["task", "what to do", "s", "success", "student sees"], rows), as_json=as_json)

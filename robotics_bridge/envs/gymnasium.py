@@ -1,0 +1,135 @@
+"""Adapter to ``gymnasium.vector``: ``gymnasium.make_vec("brainbench/InPalmRotate-v0", num_envs=8)``.
+
+Autoreset mode is SAME_STEP: an episode that ends is followed by the first observation of the next one in the same
+call, with the last observation in ``info["final_obs"]``. Importing this module registers the ids.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.errors import UsageError, missing_dependency
+
+try:
+    import gymnasium
+    from gymnasium.vector import AutoresetMode, VectorEnv
+except ImportError as error:
+    raise missing_dependency("gymnasium", extra="policies", purpose="The gymnasium adapter") from error
+
+if TYPE_CHECKING:
+    from robotics_bridge.envs.env import Env
+
+IDS = {
+    "brainbench/InPalmRotate-v0": "in_palm_rotate",
+    "brainbench/InHandRepose-v0": "in_hand_repose",
+    "brainbench/Screwdriver-v0": "screwdriver",
+    "brainbench/HotBall-v0": "hot_ball",
+}
+"""Registered id → task."""
+REACH = 2.0
+"""Actions of this size reach any target from any rest position, as an action of 1 is half a joint's range."""
+
+
+class GymVectorEnv(VectorEnv):
+    """The environments of a task as numpy arrays; observations are a dictionary of the task's groups.
+
+    Args:
+        env: made with ``keep_final=True``.
+        groups: observation groups to show; all by default.
+
+    Raises:
+        UsageError: the environment does not keep final observations, or has no such group.
+    """
+
+    def __init__(self, env: Env, groups: tuple[str, ...] = ()) -> None:
+        if not env.keeps_final:
+            raise UsageError("Gymnasium needs the last observations of episodes: tasks.make(..., keep_final=True).")
+        missing = [name for name in groups if name not in env.observation_shapes]
+        if missing:
+            raise UsageError(
+                f"The task has no observation group {missing[0]!r}; it has {list(env.observation_shapes)}."
+            )
+        self.native = env
+        """The native environment."""
+        self.num_envs = env.num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+        self._groups = groups or tuple(env.observation_shapes)
+        infinite = float("inf")
+        spaces = {
+            name: gymnasium.spaces.Box(-infinite, infinite, env.observation_shapes[name], np.float32)
+            for name in self._groups
+        }
+        self.single_observation_space = gymnasium.spaces.Dict(spaces)
+        self.single_action_space = gymnasium.spaces.Box(-REACH, REACH, (env.num_actions,), np.float32)
+        batch = gymnasium.vector.utils.batch_space
+        self.observation_space = batch(self.single_observation_space, self.num_envs)
+        self.action_space = batch(self.single_action_space, self.num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start new episodes; ``options={"reset_mask": [B] bool}`` starts some.
+
+        Raises:
+            UsageError: seeds differ between environments, whose random numbers are drawn together.
+        """
+        import torch
+
+        super().reset(seed=None)
+        if isinstance(seed, list):
+            raise UsageError("Environments draw their random numbers together: give one seed, not a list.")
+        if seed is not None:
+            self.native.seed(seed)
+        mask = (options or {}).get("reset_mask")
+        chosen = None if mask is None else torch.as_tensor(np.asarray(mask, dtype=bool), device=self.native.device)
+        return self._numpy(self.native.reset(chosen)), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance by one control step with actions [B, A]."""
+        import torch
+
+        tensor = torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.native.device)
+        observations, reward, terminated, truncated, info = self.native.step(tensor)
+        ended = (terminated | truncated).cpu().numpy()
+        facts: dict[str, Any] = {"diverged": info["diverged"].cpu().numpy()}
+        if ended.any():
+            final = self._numpy(info["final_observations"])
+            rows = np.empty(self.num_envs, dtype=object)
+            for index in np.flatnonzero(ended):
+                rows[index] = {name: value[index] for name, value in final.items()}
+            facts |= {"final_obs": rows, "_final_obs": ended}
+            metric = {"metric": info["metric"].cpu().numpy(), "return": info["return"].cpu().numpy()}
+            facts |= {"final_info": metric, "_final_info": ended}
+        return (
+            self._numpy(observations),
+            reward.cpu().numpy().astype(np.float64),
+            terminated.cpu().numpy(),
+            truncated.cpu().numpy(),
+            facts,
+        )
+
+    def _numpy(self, observations: dict[str, Any]) -> dict[str, np.ndarray]:
+        return {name: observations[name].detach().cpu().numpy().copy() for name in self._groups}
+
+
+def make_vec(task: str, num_envs: int = 1, *, groups: tuple[str, ...] = (), **options: Any) -> GymVectorEnv:
+    """Return the environments of a task for gymnasium; options are those of :func:`robotics_bridge.tasks.make`."""
+    from robotics_bridge import tasks
+
+    return GymVectorEnv(tasks.make(task, num_envs=num_envs, keep_final=True, **options), groups)
+
+
+def register() -> None:
+    """Register the ids :data:`IDS` with gymnasium; doing so again changes nothing."""
+    for name, task in IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                id=name, vector_entry_point="robotics_bridge.envs.gymnasium:make_vec", kwargs={"task": task}
+            )
+
+
+register()

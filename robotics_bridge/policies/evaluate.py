@@ -1,0 +1,160 @@
+"""How well an agent does: whole episodes from fresh starts, with intervals. Letters: B environment, A action."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from brainbench.errors import UsageError, unknown_name
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.envs.env import Env
+
+AGENTS = ("zero", "random")
+"""Agents that every trained one is held against."""
+_Z = 1.959964
+"""Normal quantile of a 95 % interval."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes of one agent. The episodes of one evaluation are independent given the agent."""
+
+    agent: str
+    task: str
+    seeds: tuple[int, ...]
+    success: tuple[bool, ...]
+    """Of each episode."""
+    metric: tuple[float, ...]
+    """Of each episode: goals reached, rotation (rad) or seconds of contact."""
+    returns: tuple[float, ...]
+    """Undiscounted reward of each episode."""
+    lengths: tuple[int, ...]
+    """Control steps of each episode."""
+    diverged: int
+    """Episodes that ended because the physics diverged."""
+    per_seed: tuple[float, ...]
+    """Success rate of each seed."""
+
+    @property
+    def success_rate(self) -> float:
+        """Share of episodes that succeeded."""
+        return sum(self.success) / len(self.success)
+
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the success rate (Wilson 1927)."""
+        n, p = len(self.success), self.success_rate
+        middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)
+        half = _Z / (1 + _Z**2 / n) * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n * n))
+        return max(middle - half, 0.0), min(middle + half, 1.0)
+
+    def mean(self, name: str) -> tuple[float, float]:
+        """Return mean and half width of its 95 % interval of ``metric``, ``returns`` or ``lengths`` over episodes.
+
+        Raises:
+            UsageError: there is no such quantity.
+        """
+        if name not in ("metric", "returns", "lengths"):
+            raise unknown_name("quantity of an episode", name, ("metric", "returns", "lengths"))
+        values = [float(value) for value in getattr(self, name)]
+        mean = sum(values) / len(values)
+        spread = sum((value - mean) ** 2 for value in values) / max(len(values) - 1, 1)
+        return mean, _Z * math.sqrt(spread / len(values))
+
+    def summary(self) -> dict[str, Any]:
+        """Return what reports print, as plain numbers."""
+        low, high = self.interval()
+        facts: dict[str, Any] = {"agent": self.agent, "task": self.task, "episodes": len(self.success)}
+        facts |= {"seeds": list(self.seeds), "success_rate": self.success_rate, "success_interval": [low, high]}
+        facts |= {"success_per_seed": list(self.per_seed), "diverged": self.diverged}
+        for name in ("metric", "returns", "lengths"):
+            facts[name], facts[f"{name}_half_width"] = self.mean(name)
+        return facts
+
+
+def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch.Tensor]], torch.Tensor]:
+    """Return the agent ``zero`` (rest position) or ``random`` (standard normal actions, as an untrained policy).
+
+    Raises:
+        UsageError: there is no such agent.
+    """
+    import torch
+
+    if name not in AGENTS:
+        raise unknown_name("agent", name, AGENTS)
+    generator = torch.Generator(device=env.device)
+    generator.manual_seed(seed)
+    still = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+
+    def act(_: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        return still if name == "zero" else torch.randn(still.shape, generator=generator, device=env.device)
+
+    return act
+
+
+def evaluate(
+    env: Env,
+    policy: Callable[[Mapping[str, torch.Tensor]], torch.Tensor],
+    *,
+    episodes: int = 100,
+    seed: int | Sequence[int] = (0, 1, 2),
+    name: str = "policy",
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Evaluation:
+    """Run whole episodes and return how they went.
+
+    Each environment contributes equally many episodes, so that short ones are not counted more often.
+
+    Args:
+        env: the environments.
+        policy: observations → actions [B, A]; its ``reset(mask)``, if any, is called when episodes end.
+        episodes: at least so many for every seed.
+        seed: of the environments; several are run one after the other.
+        name: of the agent, for reports.
+        progress: called with seeds done, seeds and a word.
+
+    Raises:
+        UsageError: no episode or seed is asked for.
+    """
+    import torch
+
+    seeds = (seed,) if isinstance(seed, int) else tuple(seed)
+    if episodes < 1 or not seeds:
+        raise UsageError(f"An evaluation needs at least one episode and one seed; received {episodes} and {seeds}.")
+    each = math.ceil(episodes / env.num_envs)
+    forget = getattr(policy, "reset", None)
+    rows: list[list[Any]] = []
+    rates = []
+    for index, number in enumerate(seeds):
+        env.seed(number)
+        observations = env.reset()
+        if forget is not None:
+            forget(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+        left = torch.full((env.num_envs,), each, device=env.device)
+        found: list[list[Any]] = []
+        # Whoever is done waits for the slowest, so the device is asked once a step.
+        while bool((left > 0).any()):
+            observations, _, terminated, truncated, info = env.step(policy(observations))
+            done = terminated | truncated
+            if forget is not None:
+                forget(done)
+            table = torch.stack(
+                (info["metric"], info["return"], info["steps"].float(), info["diverged"].float()), dim=1
+            )
+            found += table[done & (left > 0)].tolist()
+            left -= done.long()
+        threshold = env.task.success.threshold
+        rates.append(sum(row[0] >= threshold for row in found) / len(found))
+        rows += found
+        if progress:
+            progress(index + 1, len(seeds), f"evaluating {name}")
+    metric, returns, lengths, diverged = zip(*rows, strict=True)
+    return Evaluation(
+        agent=name, task=env.task.name, seeds=seeds, success=tuple(m >= env.task.success.threshold for m in metric),
+        metric=metric, returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
+        per_seed=tuple(rates),
+    )  # fmt: skip

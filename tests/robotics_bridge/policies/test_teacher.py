@@ -1,0 +1,120 @@
+"""The teacher: one small run, killed and gone on with, and what a checkpoint holds."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from brainbench.errors import DataError, UsageError
+from robotics_bridge import tasks
+from robotics_bridge.envs import Env
+from robotics_bridge.policies import _tree
+from robotics_bridge.policies.teacher import RESUME, Trainer, load_teacher, newest, train
+from robotics_bridge.tasks.settings import TeacherSettings
+
+SMALL = TeacherSettings(num_envs=4, steps_per_env=6, iterations=4, epochs=2, minibatches=2, hidden=(16, 16))
+
+
+def _env(seed: int = 0, **changes: Any) -> Env:
+    return tasks.make(replace(tasks.load("in_palm_rotate"), **changes), num_envs=4, threads=1, seed=seed)
+
+
+def test_settings_become_those_of_rsl_rl() -> None:
+    task = tasks.load("in_palm_rotate", "published")
+    config = task.teacher.config(dict(task.groups))
+    assert config["algorithm"]["rnd_cfg"]["weight"] == 100.0
+    assert config["obs_groups"]["critic"] == ["goal", "priv_proprio", "priv_obj_state", "priv_obj_props"]
+    assert config["actor"]["hidden_dims"] == [512, 256, 128]
+    assert "rnd_cfg" not in replace(task.teacher, rnd_weight=0.0).config(dict(task.groups))["algorithm"]
+
+
+def test_a_run_that_stops_halfway_goes_on_exactly(tmp_path: Path) -> None:
+    whole = train(_env(), tmp_path / "whole", settings=SMALL, iterations=4, save_every=1)
+    train(_env(), tmp_path / "parts", settings=SMALL, iterations=2, save_every=1)
+    rest = train(_env(seed=9), tmp_path / "parts", settings=SMALL, iterations=4, save_every=1)
+    assert [row["iteration"] for row in rest.history] == [3, 4]
+    for one, two in zip(whole.history[2:], rest.history, strict=True):
+        for name in ("reward", "loss/value", "loss/rnd", "curiosity", "std"):
+            assert one[name] == two[name], name
+    first, second = (_tree.load(newest(tmp_path / part))["actor"] for part in ("whole", "parts"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    log = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in log] == [1, 2, 3, 4]
+    assert list((tmp_path / "parts").glob("events.out.tfevents*"))
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
+    text = f"""
+from pathlib import Path
+from tests.robotics_bridge.policies.test_teacher import SMALL, _env
+from robotics_bridge.policies.teacher import train
+train(_env(), Path({str(tmp_path / "killed")!r}), settings=SMALL, iterations=10000, save_every=1)
+"""
+    root = Path(__file__).parents[3]
+    process = subprocess.Popen([sys.executable, "-c", text], env={**os.environ, "PYTHONPATH": str(root)})
+    resume = tmp_path / "killed" / RESUME
+    deadline = time.monotonic() + 240
+    while time.monotonic() < deadline and not (resume.is_file() and len(list(resume.parent.glob("model_*"))) > 2):
+        time.sleep(0.2)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = int(_tree.load(resume)["iteration"])
+    rest = train(_env(), tmp_path / "killed", settings=SMALL, iterations=done + 1, save_every=1)
+    whole = train(_env(), tmp_path / "whole", settings=SMALL, iterations=done + 1, save_every=100)
+    assert rest.history[-1]["reward"] == whole.history[-1]["reward"]
+    assert rest.history[-1]["loss/value"] == whole.history[-1]["loss/value"]
+
+
+def test_a_trained_actor_acts_alike_after_loading(tmp_path: Path) -> None:
+    env = _env()
+    train(env, tmp_path, settings=SMALL, iterations=1)
+    policy = load_teacher(tmp_path, env)
+    action = policy(env.observations)
+    assert action.shape == (4, 5)
+    assert torch.equal(action, load_teacher(newest(tmp_path), env).act(env.observations))
+    policy.reset(torch.ones(4, dtype=torch.bool))
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1)
+    with pytest.raises(UsageError, match="Choose another folder"):
+        train(_env(), tmp_path, settings=replace(SMALL, epochs=3), iterations=2)
+
+
+def test_a_policy_of_another_task_is_refused(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1)
+    other = tasks.make("in_hand_repose", num_envs=2, threads=1)
+    with pytest.raises(DataError, match="does not fit this environment"):
+        load_teacher(tmp_path, other)
+    with pytest.raises(DataError, match="holds no trained policy"):
+        newest(tmp_path / "nothing")
+
+
+def test_curiosity_is_scaled_by_the_control_step() -> None:
+    trainer = Trainer(_env(), replace(SMALL, rnd_weight=100.0))
+    assert trainer.algorithm.rnd is not None
+    assert trainer.algorithm.rnd.initial_weight == pytest.approx(100.0 * 0.025)
+
+
+def test_trees_of_tensors_and_numbers_survive_a_file(tmp_path: Path) -> None:
+    tree = {"a": torch.arange(3), "b": [1.5, None, (torch.ones(2, 2), "x")], "state": {0: {"step": torch.tensor(2.0)}}}
+    _tree.save(tmp_path / "tree.safetensors", tree)
+    back = _tree.load(tmp_path / "tree.safetensors")
+    assert torch.equal(back["a"], tree["a"])
+    assert back["b"][:2] == [1.5, None]
+    assert torch.equal(back["b"][2][0], torch.ones(2, 2))
+    assert float(back["state"][0]["step"]) == 2.0
+    (tmp_path / "broken.safetensors").write_bytes(b"no tensors")
+    with pytest.raises(DataError, match="damaged"):
+        _tree.load(tmp_path / "broken.safetensors")
