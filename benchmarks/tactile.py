@@ -222,7 +222,7 @@ def part_peer(options: argparse.Namespace) -> Iterable[Row]:
     alone = (time.process_time() - start) / steps / envs * 1e6
     bare = genesis("none")
     yield {"case": "none", "ours_us": alone, "genesis_us": bare}
-    for name in CLASSES[:-1]:
+    for name in options.only or CLASSES[:-1]:
         suite = SensorSuite(engine.scene, sensors(name), num_envs=envs)
         seconds = []
         for _ in range(steps):
@@ -266,6 +266,7 @@ def main() -> None:
     parser.add_argument("--taxels", type=int, nargs="+", default=[100, 1000, 10_000])
     parser.add_argument("--settle", type=int, default=200, help="steps before anything is measured")
     parser.add_argument("--genesis-python", help="interpreter of an environment with genesis-world 1.4.5")
+    parser.add_argument("--only", nargs="+", choices=CLASSES[:-1], help="classes set beside Genesis")
     parser.add_argument("--write-input", type=Path)
     parser.add_argument("--input", type=Path)
     parser.add_argument("--from", type=Path, nargs="+", dest="records")

@@ -221,16 +221,19 @@ class _Gatherer:
                 c.dist.copy(),
                 c.pos.copy(),
                 c.frame[:, :3].copy(),
-                self._force(data, c),
+                c.efc_address.copy(),
+                c.dim.copy(),
+                data.efc_force.copy(),
             )
 
-    def _force(self, data: Any, contact: Any) -> NDArray[np.float64]:
+    def _forces(self, found: Sequence[tuple[NDArray[Any], ...]]) -> NDArray[np.float64]:
         """Normal force of every contact: with a pyramidal cone the sum of its edges."""
-        address, dim = contact.efc_address, contact.dim
-        forces = np.concatenate([[0.0], np.cumsum(data.efc_force)])
+        address, dim = (np.concatenate([parts[index] for parts in found]) for index in (4, 5))
+        before = np.cumsum([0, *(len(parts[6]) for parts in found)])
+        total = np.concatenate([[0.0], *(parts[6] for parts in found)]).cumsum()
         rows = np.where((dim > 1) & (self._model.opt.cone == 0), 2 * (dim - 1), 1)
-        first = np.maximum(address, 0)
-        return np.where(address >= 0, forces[np.minimum(first + rows, len(forces) - 1)] - forces[first], 0.0)
+        first = np.maximum(address, 0) + np.repeat(before[:-1], [len(parts[4]) for parts in found])
+        return np.where(address >= 0, total[np.minimum(first + rows, len(total) - 1)] - total[first], 0.0)
 
     def finish(self) -> None:
         omega = self._twist[..., :3]
@@ -244,7 +247,8 @@ class _Gatherer:
         room = state.contact_env.shape[0]
         if found:
             env = np.repeat(owners, [len(parts[1]) for parts in found])
-            columns = [np.concatenate(list(column))[:room] for column in zip(*found, strict=True)]
+            columns = [np.concatenate([parts[index] for parts in found])[:room] for index in range(4)]
+            columns.append(self._forces(found)[:room])
             keep = len(columns[0])
             state.contact_env.numpy()[:keep] = env[:keep]
             names = ("geom", "distance", "position", "normal", "force")

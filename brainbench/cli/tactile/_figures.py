@@ -120,7 +120,7 @@ def draw_forces(
                 radii = np.r_[np.full(7, 0.00045), np.linspace(0.0011, 0.00015, 5)]
                 marks.append(tube(line, radii, np.broadcast_to(color, line.shape)))
     solid, shown, seen = Triangles.joined(hand), Triangles.joined(marks), Triangles.joined(held)
-    camera = Camera(view=(0.95, -0.45, 0.95))
+    camera = Camera(view=(0.95, -0.55, 0.75))
     lens = camera.lens(np.concatenate([solid.corners.reshape(-1, 3), seen.corners.reshape(-1, 3)]), SIZE)
     fine = lens.supersampled(_SAMPLES)
     everything = Triangles.joined([solid, shown])
@@ -134,14 +134,29 @@ def draw_forces(
     flat = image.reshape(-1, 3)
     flat[veil.pixels[front]] = 0.24 * colors[front] + 0.76 * flat[veil.pixels[front]]
     image = image.reshape(lens.size[1], _SAMPLES, lens.size[0], _SAMPLES, 3).mean(axis=(1, 3))
-    figure = pyplot.figure(figsize=(SIZE[0] / 110, SIZE[1] / 110))
-    axes = figure.add_axes((0, 0, 1, 1))
-    axes.imshow(np.clip(image, 0, 1))
+    image = _trimmed(np.clip(image, 0, 1))
+    inches = image.shape[1] / 110, image.shape[0] / 110 + 0.75
+    figure = pyplot.figure(figsize=inches)
+    axes = figure.add_axes((0, 0.75 / inches[1], 1, 1 - 0.75 / inches[1]))
+    axes.imshow(image)
     axes.set_axis_off()
     scale = pyplot.cm.ScalarMappable(pyplot.Normalize(0, peak), _part(palette))
-    bar = figure.colorbar(scale, cax=figure.add_axes((0.06, 0.08, 0.22, 0.02)), orientation="horizontal")
-    bar.set_label("force on a taxel (N)")
+    bar = figure.colorbar(
+        scale, cax=figure.add_axes((0.3, 0.55 / inches[1], 0.4, 0.14 / inches[1])), orientation="horizontal"
+    )
+    bar.set_label("force on a taxel (N); arrows push on the skin; blue taxels feel nothing", labelpad=2)
     _save(figure, path)
+
+
+def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64]:
+    """Cut white borders off a picture [H, W, 3]."""
+    darkest = image.min(axis=2)
+    spans = []
+    for used in (darkest.min(axis=1) < 0.999, darkest.min(axis=0) < 0.999):
+        found = np.flatnonzero(used)
+        low, high = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, used.size)
+        spans.append(slice(max(low - margin, 0), high + margin))
+    return image[spans[0], spans[1]]
 
 
 def _part(palette: Any) -> Any:
@@ -183,18 +198,28 @@ def draw_temperature(
     figure, axes = pyplot.subplots(
         1, 1 + len(maps), figsize=(12, 3.4), layout="constrained", width_ratios=[1.5] + [1] * len(maps)
     )
+    colors = dict(zip(lines, ("#c1440e", "#2b6cb0", "#4a7c3a"), strict=False))
     for name, line in lines.items():
-        axes[0].plot(times, line, label=name)
-    axes[0].set(xlabel="time (s)", ylabel="warmest cell (°C)", title=link.replace("right_hand_", ""))
-    axes[0].legend(frameon=False)
+        axes[0].plot(times, line, color=colors.get(name), linewidth=1.8)
+        place = {"xytext": (5, -3), "textcoords": "offset points", "color": colors.get(name), "fontsize": 9}
+        axes[0].annotate(name, (times[-1], line[-1]), **place)
+    axes[0].spines[["top", "right"]].set_visible(False)
+    axes[0].set(xlabel="time (s)", ylabel="warmest cell (°C)", title=f"tip {link.replace('right_hand_', '')}")
+    axes[0].set_xlim(right=1.25 * times[-1])
     top = max(float(field.max()) for field in maps.values())
     bottom = min(float(field.min()) for field in maps.values())
+    # The eye has to tell a tenth of a degree under wood from ten degrees under metal.
+    scale = pyplot.matplotlib.colors.PowerNorm(0.35, bottom, top)
     shown = None
     for panel, (name, field) in zip(axes[1:], maps.items(), strict=True):
-        shown = panel.imshow(field.max(axis=0).T, origin="lower", cmap="inferno", vmin=bottom, vmax=top)
-        panel.set(title=f"{name} ball, 45 °C", xlabel="cell along y")
-    axes[1].set_ylabel("cell along z")
-    figure.colorbar(shown, ax=axes[1:], label="°C", shrink=0.85)
+        seen = field.max(axis=0).T
+        shown = panel.imshow(seen, origin="lower", cmap="inferno", norm=scale)
+        panel.set_title(f"{name} ball, 45 °C: +{seen.max() - bottom:.1f} K", fontsize=10)
+        panel.set(xlabel="cell across", xticks=[], yticks=[])
+    axes[1].set_ylabel("cell along the finger")
+    bar = figure.colorbar(shown, ax=axes[1:], label="°C", shrink=0.85)
+    bar.set_ticks([bottom, *(bottom + share * (top - bottom) for share in (0.02, 0.1, 0.3, 0.6)), top])
+    bar.ax.yaxis.set_major_formatter("{x:.1f}")
     _save(figure, path)
 
 
