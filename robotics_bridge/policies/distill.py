@@ -41,7 +41,7 @@ _LEAST_VARIANCE = 1e-4
 class Teacher(Protocol):
     """Who knows what to do."""
 
-    def act(self, obs: Any) -> torch.Tensor:
+    def act(self, obs: Any, /) -> torch.Tensor:
         """Return actions [B, A] for observation groups."""
         ...
 

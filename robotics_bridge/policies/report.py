@@ -92,14 +92,14 @@ def _result(members: Sequence[tuple[DistillConfig, list[dict[str, Any]]]]) -> St
     shares = [float(np.mean([np.mean(item["success"]) for item in found])) for _, found in members]
     every = [item for _, found in members for item in found]
     metrics = np.concatenate([np.asarray(item.get("metric") or [math.nan], dtype=float) for item in every])
-    if len(members) > 1:
-        interval = t_interval(shares, f"t over {len(members)} training seeds")
-        note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
-    else:
-        parts = [float(np.mean(item["success"])) for item in every]
-        interval = t_interval(parts, f"t over {len(parts)} evaluation seeds")
-        note = "one training seed: the interval covers chance in evaluation alone"
     episodes = sum(len(item["success"]) for item in every)
+    interval = t_interval(shares, f"t over {len(members)} training seeds")
+    note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
+    if len(members) == 1:
+        note = "one training seed: the interval covers chance in evaluation alone"
+    if interval is None or len(set(shares)) == 1:
+        # Equal shares, such as no success at all, tell nothing of their spread.
+        interval = wilson_interval(float(np.mean(shares)), episodes)
     seeds = tuple(config.seed for config, _ in members)
     finite = metrics[np.isfinite(metrics)]
     metric = float(finite.mean()) if len(finite) else math.nan
@@ -124,6 +124,14 @@ def t_interval(values: Sequence[float], method: str, level: float = 0.95) -> Int
     half = float(stdtrit(len(values) - 1, (1 + level) / 2) * np.std(values, ddof=1) / math.sqrt(len(values)))
     mean = float(np.mean(values))
     return Interval(mean - half, mean + half, level, method)
+
+
+def wilson_interval(share: float, count: int) -> Interval:
+    """Return the 95 % interval of a share of independent episodes (Wilson 1927)."""
+    z = 1.959964
+    middle, width = share + z**2 / (2 * count), z * math.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+    low, high = ((middle + sign * width) / (1 + z**2 / count) for sign in (-1, 1))
+    return Interval(max(low, 0.0), min(high, 1.0), 0.95, f"Wilson over {count} episodes")
 
 
 COLUMNS = ("task", "hand", "touch", "placement", "resolution", "noise", "encoder", "seeds", "success", "over none")

@@ -52,6 +52,9 @@ def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
     (only,) = read_results([tmp_path])
     assert only.value == pytest.approx(0.6)
     assert "chance in evaluation alone" in only.note
+    assert only.interval is not None
+    expected = stats.binomtest(36, 60).proportion_ci(method="wilson")
+    assert (only.interval.low, only.interval.high) == pytest.approx((expected.low, expected.high), abs=1e-6)
     assert records([only])[0].score.status == "unreliable"
 
 

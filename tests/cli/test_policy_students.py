@@ -1,0 +1,108 @@
+"""``brainbench policy distill|sweep|report|export|deploy``."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from tensordict import TensorDict
+from typer.testing import CliRunner
+
+from brainbench.cli import app
+from brainbench.errors import UsageError
+from brainbench.files import write_json
+from robotics_bridge import hands
+from robotics_bridge.policies.distill_config import DistillConfig
+from robotics_bridge.policies.export import export_policy
+from robotics_bridge.policies.student import TactilePolicy
+
+
+def _run(*arguments: object, code: int = 0) -> str:
+    result = CliRunner().invoke(app, ["policy", *map(str, arguments)])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+def test_sweep_counts_table_4_10() -> None:
+    counted = json.loads(_run("sweep", "--count", "--json"))
+    assert (counted["students"], counted["published"]) == (244, 214)
+    assert "244 students in table-4.10, all (214 without agg_bool)" in _run("sweep", "--count")
+    parts = [json.loads(_run("sweep", "--list", "--json", "--shard", f"{i}/3", "--subset", "types")) for i in range(3)]
+    assert sum(map(len, parts)) == len({name for part in parts for name in part}) == 44
+    with pytest.raises(UsageError, match="such as 0/4; received '4/4'"):
+        _run("sweep", "--shard", "4/4")
+
+
+def test_report_prints_a_table_and_writes_records(tmp_path) -> None:
+    for seed in range(3):
+        config = DistillConfig(task="screwdriver", observe="bool", seed=seed)
+        write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+        found = [{"seed": 0, "success": [1.0, 0.0, 1.0 * (seed > 0), 1.0], "metric": [1.0] * 4}]
+        write_json(tmp_path / config.name / "evaluation.json", found)
+    text = _run("report", tmp_path, "--records", tmp_path / "records", "--picture", tmp_path / "report.png")
+    assert "0.667" in text
+    assert len(list((tmp_path / "records").glob("*.json"))) == 1
+    assert (tmp_path / "report.png").stat().st_size > 5000
+
+
+def _exported(folder):
+    """A policy of the XHand1 as brainbench policy export writes it."""
+    hand = hands.load("xhand1")
+    joints = hand.joints
+    obs = TensorDict(
+        {"proprio": torch.zeros(1, 36), "goal": torch.zeros(1, 1), "tactile": torch.zeros(1, 5, 5, 3)}, [1]
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tactile = {"name": "mlp", "observe": "agg_force", "placement": "tips"}
+        policy = TactilePolicy(obs, {"s": ["proprio", "goal", "tactile"]}, "s", 12, hidden_dims=(16,), tactile=tactile)
+    limits = hand.model.jnt_range
+    mapping = {"names": joints, "default": [0.3] * 12, "scale": [0.1] * 12, "low": limits[:, 0], "high": limits[:, 1]}
+    links = list(hand.layout("med", "tips"))
+    deployment = {
+        "rate": 40, "hand": "xhand1", "observe": "agg_force", "joints": joints, "action_map": mapping, "frozen": {},
+        "links": links, "task": "hold",
+    }  # fmt: skip
+    return export_policy(policy, folder / "policy", deployment=deployment).path
+
+
+@pytest.mark.slow
+def test_deploy_runs_on_the_simulated_hand_and_stops_it_when_readings_are_absurd(tmp_path) -> None:
+    path = _exported(tmp_path)
+    found = json.loads(_run("deploy", path, "--seconds", 2, "--timeout", 1, "--record", tmp_path / "ep", "--json"))
+    assert found["status"] == "finished", found["reason"]
+    assert found["ticks"] > 40
+    info = json.loads((tmp_path / "ep" / "meta" / "info.json").read_text())
+    assert info["total_frames"] == found["ticks"]
+    stopped = json.loads(_run("deploy", path, "--seconds", 2, "--fault", "absurd=0.05", "--json", code=1))
+    assert "beyond its limits" in stopped["reason"]
+
+
+def test_deploy_refuses_files_without_a_contract_and_unknown_faults(tmp_path) -> None:
+    with pytest.raises(FileNotFoundError, match="brainbench policy export writes a policy"):
+        _run("deploy", tmp_path / "policy.onnx")
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(b"")
+    contract = {"inputs": [["proprio", [36]]], "format": "onnx", "deployment": {"rate": 40}}
+    write_json(tmp_path / "policy.onnx.json", contract)
+    with pytest.raises(UsageError, match="does not say 'action_map'"):
+        _run("deploy", path)
+
+
+@pytest.mark.slow
+def test_a_student_is_distilled_evaluated_exported_and_reported(tmp_path) -> None:
+    teacher = tmp_path / "teacher"
+    _run("train", "in_palm_rotate", "--out", teacher, "--envs", 2, "--iterations", 1, "--steps", 4)
+    common = ("--teacher", teacher, "--envs", 2, "--iterations", 1, "--episodes", 2)
+    run = tmp_path / "students" / "one"
+    found = json.loads(
+        _run(
+            "distill", "in_palm_rotate", *common, "--observe", "agg_bool", "--placement", "tips", "--out", run, "--json"
+        )
+    )
+    assert (found["status"], found["episodes"]) == ("finished", 6)
+    assert json.loads(_run("export", run, "--json"))["difference"] < 1e-4
+    assert "agg_bool" in _run("report", tmp_path / "students")
