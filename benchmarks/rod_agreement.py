@@ -53,7 +53,10 @@ def draw(objects: dict[str, Any], count: int, whiskers: int, speed: float | None
 
 def wrenches(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> np.ndarray:
     """[whisker of a sweep, reading, 6] (N, N m), NaN where a whisker was unstable."""
-    found = [simulate([scene], fidelity=fidelity, backend=backend)["wrench"].values[0] for scene in scenes]
+    found = [
+        simulate([scene], fidelity=fidelity, backend=backend, cache=backend != "rod")["wrench"].values[0]
+        for scene in scenes
+    ]
     return np.concatenate([np.moveaxis(wrench, 1, 0) for wrench in found]).astype(float)
 
 

@@ -1,9 +1,10 @@
 """Limits of the ``rod`` solver: what it looks at, how long it tries, and when it gives up. mm, ms, rad."""
 
-CONTACTS = 8
-"""Contacts of one whisker that are solved together; the tightest are kept when there are more."""
-SEEN = 12
-"""Places of possible contact that are watched within a step; the nearest are kept when there are more."""
+CONTACTS = 8, 14
+"""Contacts of one whisker that are solved together, of up to 12 links and of more; the tightest are kept when there are
+more. A finely divided whisker that lies on a round face touches it with link after link."""
+SPARE = 4
+"""Places of possible contact that are watched within a step beyond those; the nearest are kept when there are more."""
 ROUNDS = 4
 """Times that contacts are added to a step because the others press the whisker onto them."""
 CLOSED = 1e-3
@@ -21,7 +22,7 @@ DOUBTFUL = 0.05
 """What the last iterations still changed in the contact forces (root mean square, of the forces themselves) from which
 a result counts as unstable. Whiskers below it are within a few per cent of the converged solution (docs/stimuli.md)."""
 CROWDED = 0.02
-"""Share of the steps with more contacts than :data:`CONTACTS` from which a result counts as unstable."""
+"""Share of the steps with more contacts than there is room for from which a result counts as unstable."""
 LIGHT = 5e-3
 """Share of a whisker's mass that a quasi-static step keeps. It bounds the way of one step where there is no balance,
 as when a whisker slips off; what one step of 1 ms leaves of a slow mode is this share over (omega h)², below .5 %."""
@@ -39,6 +40,12 @@ WIDEST = 0.8
 """Widest search for contacts (mm)."""
 CREVICE = 0.02
 """Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
+
+
+def contacts_for(capacity: int) -> int:
+    """Return the contacts that a kernel for chains of at most ``capacity`` links solves together."""
+    return CONTACTS[capacity > 12]
+
 
 WARP = 32
 """Threads of a GPU that run in step."""

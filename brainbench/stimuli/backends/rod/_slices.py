@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from brainbench.stimuli.backends.rod._device import warp
-from brainbench.stimuli.backends.rod._limits import CONTACTS, WARP
+from brainbench.stimuli.backends.rod._limits import WARP, contacts_for
 
 BUDGET = 8
 """Steps of a whisker in one slice."""
@@ -39,7 +39,7 @@ class Slices:
         on.size = wp.array(np.array([lanes, 0, 0], dtype=np.int32), device=device)
         on.tally = wp.zeros(3, dtype=wp.int32, device=device)
         on.joints, on.ways = empty(capacity, lanes, kind=vec4), empty(capacity, lanes, kind=vec2)
-        on.held = empty(CONTACTS, lanes, kind=vec4)
+        on.held = empty(contacts_for(capacity), lanes, kind=vec4)
         on.times = empty(7, lanes)
         on.counts = wp.zeros((7, lanes), dtype=wp.int32, device=device)
         on.look_lane, on.look_link = (wp.zeros(self.looks, dtype=wp.int32, device=device) for _ in range(2))

@@ -15,7 +15,6 @@ from typing import Any
 from brainbench.stimuli.backends.rod._limits import (
     BENT,
     CLOSED,
-    CONTACTS,
     CREVICE,
     FAR,
     FINEST,
@@ -27,12 +26,13 @@ from brainbench.stimuli.backends.rod._limits import (
     NOTHING,
     REST,
     ROUNDS,
-    SEEN,
+    SPARE,
     STOP,
     SWEEPS,
     TRAVEL,
     WARP,
     WIDEST,
+    contacts_for,
 )
 from brainbench.stimuli.backends.rod._shapes import MESH, distances
 from brainbench.stimuli.backends.rod._tracks import tracks
@@ -66,7 +66,9 @@ def solver(
     segment_triangle, point_triangle = shape.segment_triangle, shape.point_triangle
     Tracks, Pose, pose_at = track.Tracks, track.Pose, track.pose_at
     single = real is wp.float32
-    rows = 3 * CONTACTS
+    most_held = contacts_for(capacity)
+    most_seen = most_held + SPARE
+    rows = 3 * most_held
 
     @wp.struct
     class Chains:
@@ -573,37 +575,37 @@ def solver(
         lift = wp.zeros(wp.static(capacity), dtype=vec2)
         mend = wp.zeros(wp.static(capacity), dtype=vec2)
         # Where contact is possible within one step.
-        k_link = wp.zeros(wp.static(SEEN), dtype=wp.int32)
-        k_arc = wp.zeros(wp.static(SEEN), dtype=real)
-        k_ahead = wp.zeros(wp.static(SEEN), dtype=real)
-        k_gap = wp.zeros(wp.static(SEEN), dtype=real)
-        k_mu = wp.zeros(wp.static(SEEN), dtype=real)
-        k_at = wp.zeros(wp.static(SEEN), dtype=vec3)
-        k_move = wp.zeros(wp.static(SEEN), dtype=vec3)
-        k_normal = wp.zeros(wp.static(SEEN), dtype=vec3)
-        k_free = wp.zeros(wp.static(SEEN), dtype=vec3)
-        k_taken = wp.zeros(wp.static(SEEN), dtype=wp.int32)
+        k_link = wp.zeros(wp.static(most_seen), dtype=wp.int32)
+        k_arc = wp.zeros(wp.static(most_seen), dtype=real)
+        k_ahead = wp.zeros(wp.static(most_seen), dtype=real)
+        k_gap = wp.zeros(wp.static(most_seen), dtype=real)
+        k_mu = wp.zeros(wp.static(most_seen), dtype=real)
+        k_at = wp.zeros(wp.static(most_seen), dtype=vec3)
+        k_move = wp.zeros(wp.static(most_seen), dtype=vec3)
+        k_normal = wp.zeros(wp.static(most_seen), dtype=vec3)
+        k_free = wp.zeros(wp.static(most_seen), dtype=vec3)
+        k_taken = wp.zeros(wp.static(most_seen), dtype=wp.int32)
         # Contacts whose forces are solved for.
-        c_link = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
-        c_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
-        c_gap = wp.zeros(wp.static(CONTACTS), dtype=real)
-        c_mu = wp.zeros(wp.static(CONTACTS), dtype=real)
-        c_at = wp.zeros(wp.static(CONTACTS), dtype=vec3)
+        c_link = wp.zeros(wp.static(most_held), dtype=wp.int32)
+        c_arc = wp.zeros(wp.static(most_held), dtype=real)
+        c_gap = wp.zeros(wp.static(most_held), dtype=real)
+        c_mu = wp.zeros(wp.static(most_held), dtype=real)
+        c_at = wp.zeros(wp.static(most_held), dtype=vec3)
         axis = wp.zeros(wp.static(rows), dtype=vec3)
         fw = wp.zeros(wp.static(rows), dtype=vec3)
         fv = wp.zeros(wp.static(rows), dtype=vec3)
         ju = wp.zeros(wp.static(rows), dtype=vec2)
         free = wp.zeros(wp.static(rows), dtype=real)
         force = wp.zeros(wp.static(rows), dtype=real)
-        held_arc = wp.zeros(wp.static(CONTACTS), dtype=real)
-        held_force = wp.zeros(wp.static(CONTACTS), dtype=vec3)
+        held_arc = wp.zeros(wp.static(most_held), dtype=real)
+        held_force = wp.zeros(wp.static(most_held), dtype=vec3)
         held_count = int(0)
-        stance = wp.zeros(wp.static(CONTACTS), dtype=wp.int32)
-        ratio = wp.zeros(wp.static(2 * CONTACTS), dtype=real)
-        asked = wp.zeros(wp.static(CONTACTS), dtype=real)
-        load_n = wp.zeros(wp.static(CONTACTS), dtype=real)
-        square = wp.zeros(wp.static(CONTACTS * CONTACTS), dtype=real)
-        work = wp.zeros(wp.static(CONTACTS * CONTACTS), dtype=real)
+        stance = wp.zeros(wp.static(most_held), dtype=wp.int32)
+        ratio = wp.zeros(wp.static(2 * most_held), dtype=real)
+        asked = wp.zeros(wp.static(most_held), dtype=real)
+        load_n = wp.zeros(wp.static(most_held), dtype=real)
+        square = wp.zeros(wp.static(most_held * most_held), dtype=real)
+        work = wp.zeros(wp.static(most_held * most_held), dtype=real)
         comply = wp.zeros(wp.static(rows * rows), dtype=real)
 
         near = int(0)
@@ -613,7 +615,7 @@ def solver(
         guess_tries = int(10) + wp.min(0, lane)
         rounds_most = int(wp.static(ROUNDS)) + wp.min(0, lane)
         sweeps_most = int(wp.static(SWEEPS)) + wp.min(0, lane)
-        contacts_most = int(wp.static(CONTACTS)) + wp.min(0, lane)
+        contacts_most = int(wp.static(most_held)) + wp.min(0, lane)
         sides = int(2) + wp.min(0, lane)
         object_speed = zero
         for s in range(shapes_from, shapes_to):
@@ -891,11 +893,11 @@ def solver(
                                         if slot < seen:
                                             if k_ahead[slot] <= ahead:
                                                 slot = int(-1)
-                                        elif seen < wp.static(SEEN):
+                                        elif seen < wp.static(most_seen):
                                             seen = seen + 1
                                         else:
                                             slot = int(0)
-                                            for j in range(1, wp.static(SEEN)):
+                                            for j in range(1, wp.static(most_seen)):
                                                 if k_ahead[j] > k_ahead[slot]:
                                                     slot = j
                                             if k_ahead[slot] <= ahead:
@@ -1076,7 +1078,7 @@ def solver(
                 for round_ in range(rounds_most):
                     if more == 1:
                         for _ in range(contacts_most):
-                            if contacts < wp.static(CONTACTS):
+                            if contacts < wp.static(most_held):
                                 slot = int(-1)
                                 lowest = zero
                                 for j in range(seen):
@@ -1273,38 +1275,38 @@ def solver(
                                                 near_n += near_1 * ratio[2 * e] + near_2 * ratio[2 * e + 1]
                                             else:
                                                 rest -= near_1 * force[3 * e + 1] + near_2 * force[3 * e + 2]
-                                            square[c * wp.static(CONTACTS) + e] = near_n
+                                            square[c * wp.static(most_held) + e] = near_n
                                         asked[c] = rest
                                     agreed = int(0)
                                     for _ in range(guess_tries):
                                         if agreed == 0:
                                             for c in range(contacts):
                                                 for e in range(contacts):
-                                                    keep = square[c * wp.static(CONTACTS) + e]
+                                                    keep = square[c * wp.static(most_held) + e]
                                                     if stance[c] == 0 or stance[e] == 0:
                                                         keep = zero
                                                         if c == e:
                                                             keep = one
-                                                    work[c * wp.static(CONTACTS) + e] = keep
+                                                    work[c * wp.static(most_held) + e] = keep
                                                 load_n[c] = zero
                                                 if stance[c] == 1:
                                                     load_n[c] = asked[c]
                                             for p in range(contacts):
                                                 for c in range(p + 1, contacts):
                                                     part = (
-                                                        work[c * wp.static(CONTACTS) + p]
-                                                        / work[p * wp.static(CONTACTS) + p]
+                                                        work[c * wp.static(most_held) + p]
+                                                        / work[p * wp.static(most_held) + p]
                                                     )
                                                     for e in range(p + 1, contacts):
-                                                        work[c * wp.static(CONTACTS) + e] -= (
-                                                            part * work[p * wp.static(CONTACTS) + e]
+                                                        work[c * wp.static(most_held) + e] -= (
+                                                            part * work[p * wp.static(most_held) + e]
                                                         )
                                                     load_n[c] -= part * load_n[p]
                                             for back in range(contacts):
                                                 c = contacts - 1 - back
                                                 for e in range(c + 1, contacts):
-                                                    load_n[c] -= work[c * wp.static(CONTACTS) + e] * load_n[e]
-                                                load_n[c] = load_n[c] / work[c * wp.static(CONTACTS) + c]
+                                                    load_n[c] -= work[c * wp.static(most_held) + e] * load_n[e]
+                                                load_n[c] = load_n[c] / work[c * wp.static(most_held) + c]
                                             worst_c = int(-1)
                                             lowest = zero
                                             for c in range(contacts):
@@ -1319,7 +1321,7 @@ def solver(
                                                     if stance[c] == 0:
                                                         opening = -asked[c]
                                                         for e in range(contacts):
-                                                            opening += square[c * wp.static(CONTACTS) + e] * load_n[e]
+                                                            opening += square[c * wp.static(most_held) + e] * load_n[e]
                                                         if opening < lowest:
                                                             lowest = opening
                                                             worst_c = c
@@ -1386,7 +1388,7 @@ def solver(
                                     k_ahead[j] = k_gap[j] + h * wp.dot(k_normal[j], moved)
                                     if k_ahead[j] < real(-wp.static(CLOSED)):
                                         more = int(1)
-                        if more == 1 and (contacts == wp.static(CONTACTS) or round_ == wp.static(ROUNDS - 1)):
+                        if more == 1 and (contacts == wp.static(most_held) or round_ == wp.static(ROUNDS - 1)):
                             more = int(0)
                             crowded = crowded + 1
                         if more == 0:
