@@ -124,6 +124,7 @@ class Trainer:
             model = load_model(job.model, seed=job.seed, **self.options)
             self.drawn = draw_silent_biases(model)
             self.learner: Any = make_learner(job.objective, model).to(device)
+        torch.manual_seed(job.seed)  # of dropout
         if device.type == "cuda":
             self.learner = self.learner.to(memory_format=torch.channels_last)
         self.model = self.learner.model
