@@ -34,6 +34,17 @@ def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: fl
     Raises:
         UsageError: the palm's side is unknown, or radius or mass are not positive.
     """
+    return _raised(holding_spec(hand, radius=radius, mass=mass, timestep=timestep, reach=reach).compile())
+
+
+def holding_spec(
+    hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: float = 0.002, reach: float = 0.6
+) -> Any:
+    """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
+
+    Raises:
+        UsageError: the palm's side is unknown, or radius or mass are not positive.
+    """
     mujoco = engine()
     if not (radius > 0 and mass > 0):
         raise UsageError(f"A ball has a positive radius (m) and mass (kg); received {radius!r} and {mass!r}.")
@@ -60,7 +71,7 @@ def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: fl
         name=OBJECT, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=mass, condim=4,
         friction=(1.0, 0.01, 1e-4),
     )  # fmt: skip
-    return _raised(spec.compile())
+    return spec
 
 
 def _raised(model: Any) -> Any:

@@ -31,7 +31,7 @@ class HandCalibration:
 
     force: float = 0.5
     """N that count as :data:`~brainbench.models.normaliser.FORCE_SCALE`."""
-    moment: float = 2e-3
+    moment: float = 5e-3
     """N·m that count as :data:`~brainbench.models.normaliser.MOMENT_SCALE`."""
 
     def __post_init__(self) -> None:

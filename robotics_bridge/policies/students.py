@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from brainbench.errors import UsageError
-from brainbench.files import write_json
+import torch
+
+from brainbench.errors import DataError, UsageError
+from brainbench.files import read_json, write_json
 from brainbench.types import Progress
-from robotics_bridge.policies.distill import DistillResult, StudentPolicy, distill, load_student
+from robotics_bridge.policies.calibration import HandCalibration
+from robotics_bridge.policies.distill import CONFIG, DistillResult, StudentPolicy, distill, load_student
 from robotics_bridge.policies.distill_config import DistillConfig
+from robotics_bridge.policies.encoders import ARMS
 from robotics_bridge.policies.report import EVALUATION
+from robotics_bridge.policies.taxel_grid import TaxelGrid
+
+_log = logging.getLogger(__name__)
 
 SEEDS = (1000, 1001, 1002)
 """Seeds of the environments in which students are evaluated; none of them is one of training."""
+_CALIBRATION_STEPS, _CALIBRATION_ENVS = 80, 64
+"""Two seconds of control, in so many environments."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +75,42 @@ def train_student(
         seed=config.seed,
     )  # fmt: skip
     teacher = load_teacher(config.teacher, env)
+    config = calibrated(config, env, teacher, out)
     result = distill(config, out, env=env, teacher=teacher, stop_after=stop_after, progress=progress)
     if result.status != "finished" or not episodes:
         return Student(out, result, ())
     return Student(out, result, evaluate_student(out, env, episodes=episodes, seeds=seeds, progress=progress))
+
+
+def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:
+    """Return the configuration with a hand calibration for a network, measured while the teacher acts.
+
+    Nothing changes for encoders that are learned with the policy, or where a calibration is given. A run that was
+    begun keeps the one it began with.
+    """
+    tactile = config.tactile
+    if tactile is None or tactile.arm in ARMS or "calibration" in config.encoder_settings:
+        return config
+    if (out / CONFIG).is_file():
+        found = read_json(out / CONFIG).get("distill", {}).get("encoder_settings", {}).get("calibration")
+    else:
+        found = asdict(_measure(config, env, teacher))
+    settings = dict(config.encoder_settings) if found is None else {**config.encoder_settings, "calibration": found}
+    return replace(config, encoder_settings=settings)
+
+
+def _measure(config: DistillConfig, env: Any, teacher: Any) -> HandCalibration:
+    grid = TaxelGrid(config.hand, placement=config.placement, resolution=config.resolution, observe=config.observe)
+    grid = grid.to(env.device)
+    observations, felt = env.reset(), []
+    for _ in range(_CALIBRATION_STEPS):
+        felt.append(grid(observations["tactile"][:_CALIBRATION_ENVS]).cpu())
+        observations, *_ = env.step(teacher.act(observations))
+    try:
+        return HandCalibration.fit(torch.stack(felt))
+    except DataError:
+        _log.warning("The teacher touched nothing in %d steps; the default calibration is used.", _CALIBRATION_STEPS)
+        return HandCalibration()
 
 
 def evaluate_student(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from brainbench.cli.stimuli import draw, objects, separability, show, simulate, sweep
+from brainbench.cli.stimuli import draw, hand, objects, separability, show, simulate, sweep
 
 app = typer.Typer(no_args_is_help=True, help="Simulate whiskers on objects; look at scenes and forces.")
 app.command("list")(show.list_)
@@ -15,3 +15,4 @@ app.command("separability")(separability.separability)
 app.command("render")(draw.render)
 app.command("plot")(draw.plot)
 app.command("objects")(objects.objects)
+app.command("hand")(hand.hand)

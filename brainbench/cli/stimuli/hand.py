@@ -1,0 +1,145 @@
+"""``brainbench stimuli hand``: touch of a robot hand that explores objects, as a stimulus set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+
+if TYPE_CHECKING:
+    from robotics_bridge.exploration.record import Explored
+
+RODGERS = "rodgers"
+_DISTANCES = {"close": 0.0, "medium": 4e-4, "far": 8e-4}
+
+
+def hand(
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Stimulus-set file to write (.h5).")] = None,
+    objects: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="rodgers (its convex and concave solid at three distances), primitives, a shape family (torus), a "
+            "collection (procedural-24:1) or a mesh file; may be repeated."
+        ),
+    ] = None,
+    procedure: Annotated[
+        list[str] | None,
+        typer.Option(help="lateral_motion, static_pressure, enclosure, contour_following; all by default."),
+    ] = None,
+    robot: Annotated[str, typer.Option("--hand", help="xhand1, sharpa, or a URDF or MJCF file.")] = "xhand1",
+    placement: Annotated[str, typer.Option(help="Taxels on: hand, fingers, tips or palm.")] = "hand",
+    resolution: Annotated[str, typer.Option(help="Of the taxels: low, med or high.")] = "med",
+    diagonal: Annotated[float, typer.Option(help="Size of shapes and meshes (mm).")] = 55.0,
+    unit: Annotated[str | None, typer.Option(help="Length unit of mesh files.")] = None,
+    noisy: Annotated[bool, typer.Option("--noisy", help="Taxels with the published imperfections.")] = False,
+    frames: Annotated[int, typer.Option(help="Frames of 9 ms; a multiple of 5.")] = 110,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Record exploratory procedures of a robot hand as a stimulus set that any model can be scored or probed on.
+
+    Sites of the hand stand in for whiskers (5 fingers × 7 sites); forces are scaled to a whisker's.
+    """
+    import numpy as np
+
+    from brainbench.errors import UsageError
+    from brainbench.stimuli import write_stimulus_set
+    from brainbench.stimuli.storage import hash_stimulus_set
+    from robotics_bridge.exploration.procedures import PROCEDURES
+    from robotics_bridge.exploration.record import record_exploration
+
+    if frames < 5 or frames % 5:
+        raise UsageError(f"--frames is a multiple of 5, the sub-steps of a time step; received {frames}.")
+    explored = [item for text in objects or ["primitives"] for item in objects_of(text, diagonal * 1e-3, unit)]
+    with progress_bar() as progress:
+        found = record_exploration(
+            explored, tuple(procedure or PROCEDURES), hand=robot, resolution=resolution, placement=placement,
+            noisy=noisy, frames=frames, seed=seed, progress=progress,
+        )  # fmt: skip
+    calibration = found.calibration()
+    dataset = found.dataset(calibration)
+    dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
+    if out is not None:
+        write_stimulus_set(dataset, out)
+    force = np.linalg.norm(found.wrench[..., :3], axis=-1)
+    rows, data = [], []
+    for label, felt in zip(found.labels, force, strict=True):
+        touched = int((felt.max(axis=0) > 1e-3).sum())
+        facts = {"stimulus": label, "sites_touched": touched, "peak_force_N": float(felt.sum(axis=1).max())}
+        data.append(facts)
+        rows.append([label, f"{touched} of {felt.shape[1]}", f"{facts['peak_force_N']:.3g}"])
+    silent = [item["stimulus"] for item in data if not item["sites_touched"]]
+    title = (
+        f"{found.hand}, {placement}, {resolution}; one unit = {calibration.force:.3g} N, {calibration.moment:.3g} N·m"
+    )
+    text = table(title, ["stimulus", "sites touched", "peak force N"], rows, right=(1, 2))
+    if silent:
+        text += f"\n\n{len(silent)} never touch a taxel: {', '.join(silent)}."
+    result: dict[str, Any] = {
+        "stimuli": data,
+        "calibration": calibration,
+        "content_hash": dataset.attrs["content_hash"],
+    }
+    emit({**result, "path": out}, text + ("" if out is None else f"\n\nstimuli  {out}"), as_json=as_json)
+
+
+def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Explored]:
+    """Return the objects that a word names, of a given size (m).
+
+    ``rodgers`` gives the labels of the recipe of that name, so that hand and whisker stimuli can be compared.
+    """
+    import math
+
+    from brainbench.stimuli.collections import resolve_objects
+    from brainbench.stimuli.objects import rodgers_solid
+    from brainbench.stimuli.recipes import get_recipe
+    from robotics_bridge.exploration.record import Explored
+    from robotics_bridge.physics import Geometry
+
+    if text == "primitives":
+        sizes = {
+            "sphere": (0.025,), "box": (0.02, 0.03, 0.015), "capsule": (0.012, 0.025), "cylinder": (0.02, 0.03),
+            "ellipsoid": (0.02, 0.035, 0.015),
+        }  # fmt: skip
+        lying = {"capsule": (0.7071068, 0.7071068, 0.0, 0.0)}
+        return [
+            Explored(
+                kind, Geometry(name=kind, link=kind, kind=kind, size=size), quaternion=lying.get(kind, (1, 0, 0, 0))
+            )
+            for kind, size in sizes.items()
+        ]
+    if text == RODGERS:
+        mesh, found = _surface(rodgers_solid(diagonal)), []
+        for scene in get_recipe(RODGERS).scenes:
+            side, _, distance = scene.label.partition("-")
+            # The concave face looks towards -y, askew by 25 degrees; the side that is named faces the palm.
+            half, skew = math.radians(-90.0 if side == "convex" else 90.0) / 2, math.radians(25.0) / 2
+            c, s, cz, sz = math.cos(half), math.sin(half), math.cos(skew), math.sin(skew)
+            turn = (c * cz, s * cz, -s * sz, c * sz)
+            found.append(Explored(scene.label, mesh=mesh, quaternion=turn, retreat=_DISTANCES[distance]))
+        return found
+    named = resolve_objects([text], unit=unit, surfaces=True)
+    return [Explored(name, mesh=_sized(_surface(item.load()), diagonal)) for name, item in named.items()]
+
+
+def _surface(solid: Any) -> Any:
+    """Return the mesh of a solid."""
+    from brainbench.geometry import Mesh
+
+    if solid.surface is not None:
+        return Mesh(solid.surface.vertices, solid.surface.faces)
+    return solid.mesh
+
+
+def _sized(mesh: Any, diagonal: float) -> Any:
+    """Return a mesh centred and scaled to the diagonal of its box."""
+    import numpy as np
+
+    from brainbench.geometry import Mesh
+
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    scale = diagonal / float(np.linalg.norm(high - low))
+    return Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces)

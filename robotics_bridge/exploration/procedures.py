@@ -1,0 +1,90 @@
+"""Exploratory procedures of the hand (Lederman & Klatzky 1987, Cognitive Psychology 19:342) as movements.
+
+The palm is up and fixed; the object moves over it, or the fingers close around it. z = 0 is where the object just
+touches the palm, x points along the fingers as near as the hand's frame allows. Metres, seconds, radians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from brainbench.errors import unknown_name
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the object is, and how far the fingers are closed."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    """Above the palm; negative presses."""
+    yaw: float = 0.0
+    """Turn about the vertical."""
+    closing: float = 0.3
+    """Share of their range to which the fingers are flexed."""
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """A movement over one second."""
+
+    name: str
+    text: str
+    """What it is for, in words."""
+    pose: Callable[[float], Pose]
+    """Time from 0 to 1 s → pose."""
+
+
+_ABOVE, _PRESSED, _LIGHT = 0.008, -0.002, -0.001
+
+
+def _ramp(time: float, start: float, end: float) -> float:
+    """Return a smooth step from 0 to 1."""
+    share = min(max((time - start) / (end - start), 0.0), 1.0)
+    return share * share * (3 - 2 * share)
+
+
+def _lateral(time: float) -> Pose:
+    z = _ABOVE + (_PRESSED - _ABOVE) * _ramp(time, 0.0, 0.25)
+    return Pose(y=0.012 * math.sin(4 * math.pi * max(time - 0.25, 0.0)), z=z)
+
+
+def _static(time: float) -> Pose:
+    return Pose(z=_ABOVE + (1.5 * _PRESSED - _ABOVE) * _ramp(time, 0.0, 0.5))
+
+
+def _enclosure(time: float) -> Pose:
+    z = _ABOVE + (_LIGHT - _ABOVE) * _ramp(time, 0.0, 0.2)
+    return Pose(z=z, closing=0.15 + 0.55 * _ramp(time, 0.2, 0.85))
+
+
+def _contour(time: float) -> Pose:
+    z = _ABOVE + (_LIGHT - _ABOVE) * _ramp(time, 0.0, 0.2)
+    turn = 2 * math.pi * _ramp(time, 0.2, 1.0)
+    return Pose(x=0.008 * math.sin(turn), y=0.008 * (1 - math.cos(turn)), z=z, yaw=turn, closing=0.45)
+
+
+PROCEDURES: Mapping[str, Procedure] = {
+    item.name: item
+    for item in (
+        Procedure("lateral_motion", "texture: pressed and rubbed to and fro across the fingers", _lateral),
+        Procedure("static_pressure", "hardness: pressed and held", _static),
+        Procedure("enclosure", "global shape: the fingers close around it", _enclosure),
+        Procedure("contour_following", "exact shape: its outline turns along the fingers", _contour),
+    )
+}
+"""Procedures by name."""
+
+
+def find_procedure(name: str) -> Procedure:
+    """Return a procedure by name.
+
+    Raises:
+        UsageError: there is none of this name.
+    """
+    if name not in PROCEDURES:
+        raise unknown_name("exploratory procedure", name, PROCEDURES)
+    return PROCEDURES[name]

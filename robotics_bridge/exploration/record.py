@@ -1,0 +1,294 @@
+"""What the taxels of a hand feel while objects are explored: [K, T, 35, 6] and, as input of encoders, [K, T, 30, 5, 7].
+
+Objects follow their movement exactly, as if held by a strong robot, with true velocities; the hand's own servos give
+way. Letters: K condition (object and procedure), T frame of 9 ms, S sub-step of a time step.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench import __version__
+from brainbench.errors import UsageError
+from brainbench.files import content_hash, to_json
+from brainbench.models.ead import SUB_STEP_SECONDS, SUB_STEPS
+from brainbench.types import CHANNELS, GRID_SHAPE, check_stimulus_set
+from robotics_bridge import hands
+from robotics_bridge._device import mujoco_module
+from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
+from robotics_bridge.hands.observations import observe, sensors_for
+from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec
+from robotics_bridge.physics import Geometry, MujocoEngine
+from robotics_bridge.physics.variants import compile_variants
+from robotics_bridge.policies._rays import FINGERS
+from robotics_bridge.policies.calibration import HandCalibration
+from robotics_bridge.policies.taxel_grid import SITES, TaxelGrid
+from robotics_bridge.sensors import SensorSuite
+
+if TYPE_CHECKING:
+    import torch
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from brainbench.geometry import Mesh
+    from brainbench.types import Progress
+
+_STEPS = 2
+"""Physics steps per frame."""
+TWIST = 1.6e-5
+"""Torsional friction of a taxel (N·m·s): k_t R²/2 of a disc of the published k_t = 2 N·s/m and radius 4 mm. The
+published 2 N·m·s is that of a disc of 1.4 m; it would drown every other moment when an object turns."""
+_DENSE = 2e5
+"""Density of explored objects (kg/m³): contacts must not move what is held."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explored:
+    """An object to explore.
+
+    Raises:
+        UsageError: it has neither or both of geometry and mesh.
+    """
+
+    label: str
+    geometry: Geometry | None = None
+    """A primitive (its link and pose do not matter)."""
+    mesh: Mesh | None = None
+    """A surface. It collides as its convex hull; what taxels feel is the surface itself."""
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """How it is held (w, x, y, z)."""
+    retreat: float = 0.0
+    """Held so much further away than the procedure says (m)."""
+
+    def __post_init__(self) -> None:
+        if (self.geometry is None) == (self.mesh is None):
+            raise UsageError(f"The object {self.label!r} needs a geometry or a mesh, and not both.")
+
+    def shape(self) -> Geometry:
+        """Return the geometry that the physics uses."""
+        if self.mesh is not None:
+            return Geometry(name=OBJECT, link=OBJECT, kind="mesh", mesh=self.mesh)
+        if self.geometry is None:
+            raise UsageError(f"The object {self.label!r} has no shape.")
+        return self.geometry
+
+
+@dataclass(frozen=True, eq=False)
+class HandRecording:
+    """What a hand felt."""
+
+    hand: str
+    resolution: str
+    placement: str
+    labels: tuple[str, ...]
+    """One per condition: object, or object/procedure where there are several procedures."""
+    objects: tuple[str, ...]
+    """Of each condition."""
+    procedures: tuple[str, ...]
+    """Of each condition."""
+    times: NDArray[np.float64]
+    """[T] (s)."""
+    wrench: NDArray[np.float32]
+    """[K, T, 35, 6] of every site about its centre (N, N·m; palm's axes; action of the object on the skin)."""
+    config: Mapping[str, Any]
+    """What was asked for."""
+
+    def grid(self) -> torch.Tensor:
+        """Return the wrenches as [K, T/S, S·6, 5, 7], in the hand's own units."""
+        import torch
+
+        count, frames = self.wrench.shape[:2]
+        if frames % SUB_STEPS:
+            raise UsageError(f"{frames} frames do not divide into time steps of {SUB_STEPS} sub-steps.")
+        return torch.from_numpy(self.wrench).transpose(2, 3).reshape(count, frames // SUB_STEPS, -1, *GRID_SHAPE)
+
+    def calibration(self) -> HandCalibration:
+        """Return the calibration that gives touched sites of this recording the size of a whisker's base."""
+        return HandCalibration.fit(self.grid())
+
+    def dataset(self, calibration: HandCalibration | None = None) -> xr.Dataset:
+        """Return a stimulus set whose whiskers are the 35 sites, in a network's units.
+
+        Args:
+            calibration: From newtons on the hand to a whisker's; :meth:`calibration` if None.
+        """
+        import xarray as xr
+
+        used = calibration or self.calibration()
+        gains = np.array(used.gains(1), dtype=np.float32)
+        rows, cols = np.divmod(np.arange(SITES), GRID_SHAPE[1])
+        names = [f"{FINGERS[row]}-{col}" for row, col in zip(rows, cols, strict=True)]
+        wrench = self.wrench * gains
+        dataset = xr.Dataset(
+            {
+                "wrench": (("stimulus", "time", "whisker", "channel"), wrench, {"units": "N (F), N m (M)"}),
+                "contact": (("stimulus", "time", "whisker"), np.linalg.norm(self.wrench[..., :3], axis=-1) > 1e-4),
+            },
+            coords={
+                "stimulus": np.array(self.labels, dtype=object),
+                "time": ("time", self.times, {"units": "s"}),
+                "whisker": np.array(names, dtype=object),
+                "row": ("whisker", rows),
+                "col": ("whisker", cols),
+                "side": ("whisker", np.array(["right"] * SITES, dtype=object)),
+                "object": ("stimulus", np.array(self.objects, dtype=object)),
+                "procedure": ("stimulus", np.array(self.procedures, dtype=object)),
+                "channel": np.array(CHANNELS, dtype=object),
+            },
+            attrs={
+                "array": f"hand:{self.hand}",
+                "scene": to_json(self.config, indent=None),
+                "fidelity": json.dumps({"resolution": self.resolution, "placement": self.placement}),
+                "seed": int(self.config["seed"]),
+                "backend": "mujoco",
+                "version": __version__,
+                "frame": "palm axes at the reference posture; action of the object on the skin, about a site's centre",
+                "hand_calibration": to_json(used, indent=None),
+            },
+        )
+        dataset.attrs["config_hash"] = content_hash(self.config, used)
+        dataset.attrs["content_hash"] = content_hash(list(self.labels), self.times, wrench)
+        return check_stimulus_set(dataset)
+
+
+def record_exploration(
+    objects: Sequence[Explored],
+    procedures: Sequence[str] = tuple(PROCEDURES),
+    *,
+    hand: str = "xhand1",
+    resolution: str = "med",
+    placement: str = "hand",
+    noisy: bool = False,
+    twist: float = TWIST,
+    frames: int = 110,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> HandRecording:
+    """Explore every object by every procedure and return what the hand felt.
+
+    Args:
+        objects: What to explore; labels differ.
+        procedures: Names of :data:`~robotics_bridge.exploration.procedures.PROCEDURES`.
+        hand: Name or file of the hand.
+        resolution: Of its taxels.
+        placement: Of its taxels.
+        noisy: With the published imperfections of force taxels.
+        twist: Torsional friction of a taxel (N·m·s); the other parameters are the published ones.
+        frames: T, of 9 ms; a procedure is stretched over them.
+        seed: Of the noise.
+        progress: Called with (frames done, frames, what).
+
+    Raises:
+        UsageError: a name is unknown or occurs twice, or nothing is to be explored.
+    """
+    chosen = [find_procedure(name) for name in procedures]
+    labels = [item.label for item in objects]
+    if not labels or not chosen or len(set(labels)) < len(labels) or frames < 1:
+        raise UsageError("Exploration needs objects with different labels, procedures and frames.")
+    conditions = [(item, procedure) for item in objects for procedure in chosen]
+    world = _World(hand, [item for item, _ in conditions], SUB_STEP_SECONDS * frames)
+    grid = TaxelGrid(world.hand, resolution=resolution, placement=placement)
+    sensors = sensors_for("force_torque", grid.layout, noisy=noisy, track=(OBJECT,), twist=twist)
+    suite = SensorSuite(world.engine.scene, sensors, num_envs=len(conditions), seed=seed)
+    felt = []
+    for frame in range(frames):
+        for sub_step in range(_STEPS):
+            world.move(conditions, (frame * _STEPS + sub_step) / (frames * _STEPS))
+            suite.update(world.engine.state, world.engine.timestep)
+        readings = {link: suite.read(link).clone() for link in grid.layout}
+        taxels = observe("force_torque", readings, grid.layout).view(len(conditions), 1, grid.items, 6)
+        felt.append(grid(taxels).flatten(2).transpose(1, 2).numpy())
+        if progress is not None:
+            progress(frame + 1, frames, "exploring")
+    several = len(chosen) > 1
+    config = {
+        "hand": hand, "resolution": resolution, "placement": placement, "noisy": noisy, "twist": twist,
+        "frames": frames, "seed": seed,
+        "procedures": [procedure.name for procedure in chosen],
+        "objects": [
+            {
+                "label": item.label, "quaternion": item.quaternion, "retreat": item.retreat,
+                "mesh": None if item.mesh is None else content_hash(item.mesh.vertices, item.mesh.faces),
+                "geometry": None if item.geometry is None else [item.geometry.kind, *item.geometry.size],
+            }
+            for item in objects
+        ],
+    }  # fmt: skip
+    return HandRecording(
+        world.hand.name, resolution, placement,
+        tuple(f"{item.label}/{procedure.name}" if several else item.label for item, procedure in conditions),
+        tuple(item.label for item, _ in conditions), tuple(procedure.name for _, procedure in conditions),
+        np.linspace(SUB_STEP_SECONDS, SUB_STEP_SECONDS * frames, frames), np.stack(felt, axis=1), config,
+    )  # fmt: skip
+
+
+class _World:
+    """One environment per condition: the hand palm up, the object where its procedure puts it."""
+
+    def __init__(self, hand: str, objects: Sequence[Explored], span: float) -> None:
+        self.hand, self.span = hands.load(hand), span
+        spec = holding_spec(self.hand, timestep=SUB_STEP_SECONDS / _STEPS)
+        kinds = list(dict.fromkeys(objects))
+        models = compile_variants(spec, OBJECT, [item.shape() for item in kinds], density=_DENSE)
+        self.engine = MujocoEngine(
+            models, len(objects), assignment=tuple(kinds.index(item) for item in objects), contacts=128
+        )
+        model = self.engine.model
+        joint = model.body(OBJECT).jntadr[0]
+        self._at, self._speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        self._place = model.body(OBJECT).pos.copy()
+        self._drives = [model.actuator(name).id for name in self.hand.joints] if self.hand.model.nu else slice(None)
+        self._closed = closing(self.hand, 1.0)
+        self._bottoms = {id(item): self._bottom(item) for item in kinds}
+
+    def _bottom(self, item: Explored) -> float:
+        """Return how far the lowest point of a held object lies below its body's origin (m)."""
+        mujoco = mujoco_module()
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, np.array(item.quaternion))
+        turn = turn.reshape(3, 3)
+        if item.mesh is not None:
+            return float(-(item.mesh.vertices @ turn.T)[:, 2].min())
+        shape, down = item.shape(), turn.T @ np.array([0.0, 0.0, -1.0])
+        size = [*shape.size, 0.0, 0.0][:3]
+        if shape.kind == "sphere":
+            return size[0]
+        if shape.kind == "capsule":
+            return size[0] + size[1] * abs(float(down[2]))
+        if shape.kind == "ellipsoid":
+            return float(np.linalg.norm(np.array(size) * down))
+        if shape.kind == "cylinder":
+            return size[1] * abs(float(down[2])) + size[0] * math.hypot(*down[:2])
+        return float(np.abs(np.array(size) * down).sum())
+
+    def move(self, conditions: Sequence[tuple[Explored, Procedure]], time: float) -> None:
+        """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""
+        step = 1e-3
+        for data, (item, procedure) in zip(self.engine.data, conditions, strict=True):
+            pose, after = procedure.pose(time), procedure.pose(time + step)
+            data.qpos[self._at : self._at + 7] = self._held(pose, item)
+            rates = [
+                (getattr(after, name) - getattr(pose, name)) / (step * self.span) for name in ("x", "y", "z", "yaw")
+            ]
+            data.qvel[self._speed : self._speed + 3] = rates[:3]
+            # MuJoCo wants the angular velocity in the body's own axes.
+            turn = np.zeros(9)
+            mujoco_module().mju_quat2Mat(turn, data.qpos[self._at + 3 : self._at + 7])
+            data.qvel[self._speed + 3 : self._speed + 6] = turn.reshape(3, 3).T @ np.array([0.0, 0.0, rates[3]])
+            data.ctrl[self._drives] = pose.closing * self._closed
+        self.engine.step()
+
+    def _held(self, pose: Pose, item: Explored) -> NDArray[np.float64]:
+        height = pose.z + item.retreat + self._bottoms[id(item)]
+        half = pose.yaw / 2
+        quaternion = np.zeros(4)
+        mujoco_module().mju_mulQuat(
+            quaternion, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array(item.quaternion)
+        )
+        return np.concatenate([[self._place[0] + pose.x, self._place[1] + pose.y, height], quaternion])

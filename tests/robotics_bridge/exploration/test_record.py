@@ -1,0 +1,82 @@
+"""Hands that explore objects."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench import load_model
+from brainbench.errors import UsageError
+from brainbench.stimuli import load_stimuli
+from brainbench.stimuli.storage import hash_stimulus_set
+from robotics_bridge.exploration.procedures import PROCEDURES, find_procedure
+from robotics_bridge.exploration.record import Explored, record_exploration
+from robotics_bridge.physics import Geometry
+from robotics_bridge.policies.taxel_grid import TaxelGrid
+
+
+def _box(label: str = "box", **changes) -> Explored:
+    return Explored(label, Geometry(name="o", link="o", kind="box", size=(0.02, 0.03, 0.015)), **changes)
+
+
+@pytest.fixture(scope="module")
+def rubbed():
+    return record_exploration([_box(), _box("far", retreat=0.0015)], ["lateral_motion"], resolution="low", frames=40)
+
+
+def test_nothing_is_felt_before_the_touch_and_the_object_pushes_into_the_palm(rubbed) -> None:
+    total = rubbed.wrench[:, :, :, :3].sum(axis=2)
+    assert not total[:, 0].any()
+    assert (total[:, -1, 0] < -0.5).all()  # the palm of this hand faces x
+
+
+def test_rubbing_drags_the_skin_along(rubbed) -> None:
+    times = np.arange(40) / 40
+    there = times > 0.45
+    sideways = np.array([PROCEDURES["lateral_motion"].pose(t).y for t in times])
+    velocity = np.gradient(sideways, times)
+    force = rubbed.wrench[0, :, :, :3].sum(axis=1)
+    # Across the fingers is the palm's y, up to its sign in the world.
+    assert abs(np.corrcoef(force[there, 1], velocity[there])[0, 1]) > 0.8
+
+
+def test_what_is_held_further_away_is_felt_more_softly(rubbed) -> None:
+    strength = np.linalg.norm(rubbed.wrench[..., :3].sum(axis=2), axis=-1).max(axis=1)
+    assert strength[1] < strength[0]
+
+
+def test_the_recording_is_a_stimulus_set_that_models_read(rubbed) -> None:
+    dataset = rubbed.dataset()
+    dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
+    stimuli = load_stimuli(dataset)
+    assert stimuli.labels == ("box", "far")
+    assert stimuli.input.shape == (2, 8, 30, 5, 7)
+    gains = torch.tensor(rubbed.calibration().gains(5)).view(30, 1, 1)
+    np.testing.assert_allclose(stimuli.input, (rubbed.grid() * gains).numpy(), rtol=1e-5, atol=1e-12)
+    model = load_model("zhuang-small")
+    values = model.normaliser(torch.from_numpy(stimuli.input))  # type: ignore[operator]
+    touched = values.abs().amax((0, 1, 2)) > 0
+    assert 0.05 < float(values[..., touched].pow(2).mean().sqrt()) < 1.5
+    assert torch.isfinite(model(torch.from_numpy(stimuli.input))).all()
+
+
+@pytest.mark.parametrize("hand", ["xhand1", "sharpa"])
+@pytest.mark.parametrize("name", list(PROCEDURES))
+def test_every_procedure_touches_on_both_hands(hand, name) -> None:
+    ball = Explored("ball", Geometry(name="o", link="o", kind="sphere", size=(0.03,)))
+    found = record_exploration([ball], [name], hand=hand, frames=60)
+    assert np.isfinite(found.wrench).all()
+    assert np.linalg.norm(found.wrench[0, -1, :, :3], axis=-1).max() > 0.02
+    assert found.labels == ("ball",)
+    occupied = TaxelGrid(hand).occupied.flatten().numpy()
+    assert not found.wrench[0, :, ~occupied].any()
+
+
+def test_requests_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(UsageError, match="did you mean 'enclosure'"):
+        find_procedure("enclosur")
+    with pytest.raises(UsageError, match="different labels"):
+        record_exploration([_box(), _box()], ["enclosure"])
+    with pytest.raises(UsageError, match="a geometry or a mesh, and not both"):
+        Explored("nothing")
