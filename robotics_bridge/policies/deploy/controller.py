@@ -84,6 +84,8 @@ class Report:
     seconds: float
     latency: dict[str, Any]
     """Of reading, deciding and sending, in ms."""
+    processor: dict[str, Any]
+    """The same in processor time of the loop's thread, which does not count waiting for a busy machine."""
     rate: float
     """Ticks per second."""
     overruns: int
@@ -142,7 +144,7 @@ class Controller:
         self._action = np.zeros(len(actuation.names), np.float32)
         self._targets: NDArray[np.float64] | None = None
         self._offset, self._monitor = ClockOffset(), RateMonitor(rate, limits.rate_window)
-        self.latency = LatencyHistogram()
+        self.latency, self.processor = LatencyHistogram(), LatencyHistogram()
         self.limited = self.overruns = self.ticks = 0
 
     def run(self, seconds: float) -> Report:
@@ -168,7 +170,7 @@ class Controller:
         elapsed = self.clock() - begun
         return Report(
             "stopped" if reason else "finished", reason or "", self.ticks, elapsed, self.latency.summary(),
-            self.ticks / elapsed if elapsed > 0 else math.nan, self.overruns, self.limited,
+            self.processor.summary(), self.ticks / elapsed if elapsed > 0 else math.nan, self.overruns, self.limited,
             dict(vars(self.driver.counters)),
         )  # fmt: skip
 
@@ -182,6 +184,7 @@ class Controller:
         return None
 
     def _tick(self, now: float) -> str | None:
+        busy = time.thread_time()
         reading = self.driver.read()
         if reading is None:
             return "the hand gave no report"
@@ -201,6 +204,7 @@ class Controller:
         targets = self._limit(self.actuation.targets(action), reading)
         self.driver.send(targets)
         self.latency.add(self.clock() - now)
+        self.processor.add(time.thread_time() - busy)
         self.ticks += 1
         if self.record is not None:
             self.record(reading, obs, action, targets)
