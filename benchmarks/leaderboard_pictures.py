@@ -1,8 +1,9 @@
-"""Screenshots of the leaderboard for the documentation, and its accessibility by axe-core.
+"""Screenshots of the leaderboard and of a report for the documentation, and their accessibility by axe-core.
 
     brainbench leaderboard build leaderboards/results --out /tmp/site
     npm pack axe-core && tar xf axe-core-*.tgz package/axe.min.js
-    python benchmarks/leaderboard_pictures.py /tmp/site --axe package/axe.min.js --out docs/images
+    brainbench score zhuang-intersection-ln --out /tmp/score
+    python benchmarks/leaderboard_pictures.py /tmp/site --report /tmp/score/*.html --axe package/axe.min.js
 
 Needs ``playwright``, ``pillow`` and Chromium (``--chromium PATH``). axe-core (MPL 2.0) is not shipped.
 """
@@ -23,9 +24,11 @@ VIEWS = {
     "model-phone": ("MODEL", 390, 844, "light"),
     "figures": ("figures.html", 860, 1400, "light"),
     "figures-dark": ("figures.html", 860, 1400, "dark"),
+    "report": ("REPORT", 1000, 1040, "light"),
+    "report-phone": ("REPORT", 390, 844, "light"),
 }
 """View → page, width, height and colours."""
-KEPT = ("table", "dark", "phone", "model", "figures")
+KEPT = ("table", "dark", "phone", "model", "figures", "report")
 """Views whose picture is written; the others are only checked."""
 
 
@@ -35,23 +38,29 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("site", type=Path)
     options.add_argument("--model", default="zhuang-intersection-ln-small")
+    options.add_argument("--report", type=Path)
     options.add_argument("--axe", type=Path)
     options.add_argument("--out", type=Path, default=Path("docs/images"))
     options.add_argument("--chromium", default=shutil.which("chromium"))
     asked = options.parse_args()
     model = sorted((asked.site / "models").glob(f"{asked.model}--*.html"))[0]
+    pages = {"MODEL": model, "REPORT": asked.report}
     with sync_playwright() as api:
         browser = api.chromium.launch(executable_path=asked.chromium, args=["--no-sandbox", "--disable-gpu"])
         for name, (address, width, height, colours) in VIEWS.items():
+            if pages.get(address, model) is None:
+                continue
             # axe must be put into the page, which its policy forbids; pictures need no such exception.
             context = browser.new_context(
                 viewport={"width": width, "height": height}, color_scheme=colours, bypass_csp=True
             )
             page = context.new_page()
-            page.goto((model if address == "MODEL" else asked.site / address).as_uri())
+            page.goto(pages.get(address, asked.site / address).resolve().as_uri())
             page.wait_for_timeout(200)
             if name in KEPT:
-                _write(page.screenshot(), asked.out / f"leaderboard-{name}.png")
+                _write(
+                    page.screenshot(), asked.out / (f"{name}.png" if address == "REPORT" else f"leaderboard-{name}.png")
+                )
             if asked.axe is not None:
                 page.evaluate(asked.axe.read_text(encoding="utf-8"))
                 found = page.evaluate("axe.run(document)")

@@ -11,6 +11,7 @@ from typing import Any
 from brainbench.types import Interval, ModelCard, ResultRecord, Score
 from leaderboards import _origin
 from leaderboards._figures import known
+from leaderboards.ranking import PAIRED_ANIMALS, paired_difference
 
 STATUS = {
     "ok": "The recordings are reliable enough to trust this number.",
@@ -90,7 +91,7 @@ def p_sentence(score: Score) -> str:
 
 
 def comparisons(record: ResultRecord) -> list[str]:
-    """Say how the score stands to each baseline, by whether their intervals overlap."""
+    """Say how the score stands to each baseline: by the paired difference over animals, with few of them by overlap."""
     score = record.score
     others = list(record.baselines.items())
     if record.animal_to_animal is not None:
@@ -102,12 +103,21 @@ def comparisons(record: ResultRecord) -> list[str]:
         if other.status != "ok" or other.interval is None or not known(other.interval):
             reason = "has no interval" if other.status == "ok" else f"is {other.status}"
             sentences.append(f"Cannot be compared with {name}, which {reason}.")
+        elif (paired := paired_difference(score, other)) is not None:
+            mean, interval, animals = paired
+            verdict = "Above" if interval.low > 0 else "Below" if interval.high < 0 else "Not told apart from"
+            sentences.append(
+                f"{verdict} {name} ({number(other.value)}): difference {number(mean)} {span(interval)}, paired over "
+                f"{animals} animals."
+            )
         elif score.interval.low > other.interval.high:
             sentences.append(f"Above {name} ({number(other.value)}): the intervals do not overlap.")
         elif score.interval.high < other.interval.low:
             sentences.append(f"Below {name} ({number(other.value)}): the intervals do not overlap.")
         else:
             sentences.append(f"Not told apart from {name} ({number(other.value)}): the intervals overlap.")
+    if any("overlap" in sentence for sentence in sentences):
+        sentences.append(f"With fewer than {PAIRED_ANIMALS} animals in common no paired test is trusted.")
     return sentences
 
 
@@ -188,10 +198,23 @@ def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
     for key, value in sorted(provenance.items()):
         # Groups of facts get a row for each; short lists, such as the packages' versions, stay together.
         if isinstance(value, Mapping) and key not in ("packages", "pairs"):
-            rows += [(f"{key}: {name}", item) for name, item in value.items()]
+            # Each layer's p stands in the table of layers; other statistics are measured, so few digits say all.
+            found = {name: item for name, item in value.items() if (key, name) != ("statistics", "layer_tests")}
+            rows += [
+                (f"{key}: {name}", _rounded(item) if key == "statistics" else item) for name, item in found.items()
+            ]
         elif key != "command":
             rows.append((key, value))
     return [(key.replace("_", " "), _inline(item)) for key, item in rows if item not in (None, "", {}, [])]
+
+
+def _rounded(value: Any) -> Any:
+    """Return a value with its floats at three significant digits."""
+    if isinstance(value, Mapping):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.3g}") if isinstance(value, float) else value
 
 
 def _inline(value: Any) -> str:

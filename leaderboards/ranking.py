@@ -142,6 +142,24 @@ def animals_of(score: Score) -> dict[str, float]:
     return {item.subject: item.value for item in score.subjects if math.isfinite(item.value)}
 
 
+def paired_difference(one: Score, other: Score, level: float = 0.95) -> tuple[float, Interval, int] | None:
+    """Return the mean difference of two scores over the animals both could use, its t interval and their number.
+
+    None with fewer than :data:`PAIRED_ANIMALS` of them.
+    """
+    from scipy.special import stdtrit
+
+    first, second = ({item.subject: item.value for item in x.subjects if item.status == "ok"} for x in (one, other))
+    difference = np.array([first[name] - second[name] for name in sorted(first.keys() & second.keys())])
+    difference = difference[np.isfinite(difference)]
+    count = len(difference)
+    if count < PAIRED_ANIMALS:
+        return None
+    mean = float(difference.mean())
+    reach = float(stdtrit(count - 1, (1 + level) / 2) * difference.std(ddof=1) / math.sqrt(count))
+    return mean, Interval(mean - reach, mean + reach, level, f"paired t over {count} animals"), count
+
+
 def pairs_rule(animals: Sequence[Mapping[str, float]]) -> str:
     """Return by which rule models with these animals are told apart, in words."""
     most = max((len(set(one)) for one in animals), default=0)

@@ -58,10 +58,9 @@ def make_server(folder: str | os.PathLike[str], *, host: str = "127.0.0.1", port
     try:
         kind = _Server6 if ":" in host else ThreadingHTTPServer
         return kind((host, port), partial(_Handler, root=root, host=host))
-    except OSError as error:
-        raise UsageError(
-            f"The address {host}:{port} cannot be had ({error.strerror or error}); choose another with --port."
-        ) from error
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"The address {host}:{port} cannot be had ({reason}); choose another with --port.") from error
 
 
 class _Server6(ThreadingHTTPServer):

@@ -62,3 +62,20 @@ def animal_patterns(
         noise.append(square / (number - 1))
     joined = np.concatenate(means, axis=1)
     return AnimalPatterns(subject, joined, np.concatenate(noise, axis=1), joined.shape[1], trials, None, notes)
+
+
+class OfMeanResponses:
+    """Base of metrics that need no more of an animal than its mean responses."""
+
+    def animal(
+        self,
+        subject: str,
+        blocks: Sequence[TrialBlock],
+        n_stimuli: int,
+        *,
+        stimuli: Sequence[str] | None = None,
+        seed: int = 0,
+        draws: int = 0,
+    ) -> AnimalPatterns:
+        """Return the animal's mean responses; nothing here is random."""
+        return animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)

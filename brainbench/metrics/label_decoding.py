@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.metrics._animal_patterns import AnimalPatterns, animal_patterns
+from brainbench.metrics._animal_patterns import AnimalPatterns, OfMeanResponses
 from brainbench.metrics._arrays import fetch
 from brainbench.metrics._labels import response_matrix
 from brainbench.metrics._pairs import Floats, Ints
@@ -31,7 +31,6 @@ from brainbench.metrics._pattern_parts import (
 from brainbench.metrics.decoding import ORDERS, Decoder
 from brainbench.metrics.intervals import t_interval
 from brainbench.metrics.protocol import register_metric
-from brainbench.metrics.reliability import TrialBlock
 from brainbench.metrics.score import layer_table
 from brainbench.types import LayerScore, Score
 
@@ -53,24 +52,11 @@ def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
     return found
 
 
-class LabelDecoding:
+class LabelDecoding(OfMeanResponses):
     """Accuracy of decoding the labels' properties, leaving one stimulus out."""
 
     name = "decoding"
     title = "accuracy of logistic regression for properties of stimuli left out, mean over properties"
-
-    def animal(
-        self,
-        subject: str,
-        blocks: Sequence[TrialBlock],
-        n_stimuli: int,
-        *,
-        stimuli: Sequence[str] | None = None,
-        seed: int = 0,
-        draws: int = 0,
-    ) -> AnimalPatterns:
-        """Return the animal's mean responses; nothing here is random."""
-        return animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)
 
     def score(
         self,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.errors import UsageError
-from brainbench.metrics._animal_patterns import AnimalPatterns, animal_patterns
+from brainbench.metrics._animal_patterns import AnimalPatterns, OfMeanResponses
 from brainbench.metrics._labels import response_matrix
 from brainbench.metrics._pairs import Floats, Ints
 from brainbench.metrics._pattern_parts import (
@@ -34,12 +34,11 @@ from brainbench.metrics._pattern_parts import (
 from brainbench.metrics.inference import SMALLEST_STIMULI
 from brainbench.metrics.intervals import t_interval
 from brainbench.metrics.layers import most_chosen
-from brainbench.metrics.reliability import TrialBlock
 from brainbench.metrics.score import layer_table
 from brainbench.types import LayerScore, Score
 
 
-class PatternMetric:
+class PatternMetric(OfMeanResponses):
     """Base of metrics that compare patterns. Subclasses set ``name``, ``title`` and write ``similarity``.
 
     A subclass whose comparison is corrected for noise sets ``corrected`` and overrides :meth:`compare`,
@@ -62,19 +61,6 @@ class PatternMetric:
     def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
         """Return values [N, A] with the model's stimuli in each order [N, K]."""
         return np.array([[self.compare(model[order], animal) for animal in animals] for order in orders])
-
-    def animal(
-        self,
-        subject: str,
-        blocks: Sequence[TrialBlock],
-        n_stimuli: int,
-        *,
-        stimuli: Sequence[str] | None = None,
-        seed: int = 0,
-        draws: int = 0,
-    ) -> AnimalPatterns:
-        """Return the animal's mean responses; nothing here is random."""
-        return animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)
 
     def score(
         self,

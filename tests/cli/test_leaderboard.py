@@ -183,6 +183,8 @@ def test_seeds_and_batches_are_read_or_refused(tmp_path):
     assert parse_seeds("0-2,7") == (0, 1, 2, 7)
     with pytest.raises(UsageError, match="such as 0-4"):
         parse_seeds("a")
+    with pytest.raises(UsageError, match="received '0,3-1'"):
+        parse_seeds("0,3-1")
     batch = tmp_path / "b.toml"
     batch.write_text('[[entries]]\nmodels = ["s4-small"]\nseeds = [0, 1]\n')
     assert [(job.model, job.weights_seed) for job in read_batch(batch)] == [("s4-small", 0), ("s4-small", 1)]

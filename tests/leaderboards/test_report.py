@@ -84,6 +84,7 @@ def test_report_shows_animals_methods_provenance_and_command(make_record, tmp_pa
     assert "was compared with demo (2 animals, 6 stimuli) by representational similarity analysis" in page.text
     assert "Above raw input (0.223): the intervals do not overlap." in page.text
     assert "Not told apart from random features (0.487): the intervals overlap." in page.text
+    assert "With fewer than 5 animals in common no paired test is trusted." in page.text
 
 
 def test_synthetic_recordings_are_announced_and_real_ones_are_not(make_record, tmp_path):

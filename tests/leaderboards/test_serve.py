@@ -88,6 +88,8 @@ def test_no_site_and_a_taken_port_are_said(server, tmp_path):
         make_server(tmp_path)
     with pytest.raises(UsageError, match="choose another with --port"):
         make_server(tmp_path / "site", port=server.server_address[1])
+    with pytest.raises(UsageError, match="port must be 0-65535"):
+        make_server(tmp_path / "site", port=99_999)
 
 
 def test_loopback_has_a_sixth_version_too(server, tmp_path):

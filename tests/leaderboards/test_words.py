@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from brainbench.types import Interval
+import numpy as np
+
+from brainbench.types import Interval, SubjectScore
 from leaderboards import _words, build_leaderboard
 from tests.leaderboards._page import Page
 
@@ -62,3 +64,40 @@ def test_layers_show_their_corrected_p_where_the_record_states_it(make_record, t
     text = Page(write_report(record, tmp_path / "r.html")).text
     assert "p, corrected" in text
     assert "0.031" in text
+
+
+def test_statistics_of_the_provenance_are_rounded_and_what_a_table_shows_is_not_repeated():
+    statistics = {
+        "monte_carlo_error": {"value": 0.000271728075387, "p": 0},
+        "layer_tests": [{"layer": "conv3", "p": 0.01}],
+        "bootstrap": {"draws": 1000, "interval": {"low": -0.46965415, "high": 0.8}, "spread": [1 / 3]},
+    }
+    rows = dict(_words.provenance_rows({"statistics": statistics, "settings": {"bin": 0.0123456}}))
+    assert rows["statistics: monte carlo error"] == "value: 0.000272, p: 0"
+    assert rows["statistics: bootstrap"] == "draws: 1000, interval: low: -0.47, high: 0.8, spread: 0.333"
+    assert rows["settings: bin"] == "0.0123456"
+    assert "statistics: layer tests" not in rows
+
+
+def _on(score, values):
+    return replace(score, subjects=tuple(SubjectScore(f"m{i}", v, v, 0.9, "ok", 9, 9) for i, v in enumerate(values)))
+
+
+def test_five_animals_tell_apart_what_overlapping_intervals_do_not(make_record):
+    from scipy.stats import ttest_rel
+
+    record = make_record()
+    brain, mine = [0.3, 0.4, 0.5, 0.6, 0.7], [0.36, 0.47, 0.55, 0.68, 0.75]
+    raw, random = record.baselines["raw input"], record.baselines["random features"]
+    record = replace(
+        record,
+        score=_on(record.score, mine),
+        baselines={"raw input": _on(raw, brain), "random features": _on(random, mine[:4])},
+    )
+    interval = ttest_rel(mine, brain).confidence_interval(0.95)
+    above, overlap, *_ = _words.comparisons(record)
+    assert above == (
+        f"Above raw input (0.223): difference {np.mean(np.subtract(mine, brain)):.3f} "
+        f"[{interval.low:.3f}, {interval.high:.3f}], paired over 5 animals."
+    )
+    assert overlap.startswith("Not told apart from random features (0.487): the intervals overlap")

@@ -173,7 +173,10 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     try:
         for part in text.split(","):
             first, dash, last = part.strip().partition("-")
-            seeds += range(int(first), int(last) + 1) if dash else [int(first)]
+            found = range(int(first), int(last) + 1) if dash else [int(first)]
+            if not found:
+                raise ValueError("a range that ends before it begins")
+            seeds += found
     except ValueError as error:
         raise UsageError(f"Seeds are numbers and ranges such as 0-4 or 0,3; received {text!r}.") from error
     return tuple(dict.fromkeys(seeds))
