@@ -150,6 +150,8 @@ class Trainer:
         self.found = torch.zeros((), **options)
         self.epoch, self.best, self.best_epoch = 0, math.inf, None
         self.kept: dict[str, torch.Tensor] = {}
+        self.refit = steps is not None
+        """Whether a supervised network's decoder is fitted anew at the end: a short training hardly moved it."""
         self.seconds = 0.0
 
     def done(self, passes: int | None) -> float | None:
@@ -334,7 +336,7 @@ def publish(trainer: Trainer, out: Path) -> dict[str, Any]:
             evaluation=evaluation,
             drawn_biases=trainer.drawn,
         )
-        info["data"] = data.summary()
+        info |= {"data": data.summary(), "refit_decoder": trainer.refit and job.objective == "supervised"}
         card = model_card(config, info)
         save_checkpoint(
             out / BEST, model, architecture=job.model, options=options, info=info, card=card, dtype="float16"
@@ -342,7 +344,7 @@ def publish(trainer: Trainer, out: Path) -> dict[str, Any]:
 
     write(None)
     load_weights(model, out / BEST / WEIGHTS, what=job.model)
-    if job.objective != "supervised":
+    if job.objective != "supervised" or trainer.refit:
         fit_probe(
             model,
             data.train.batches(),

@@ -69,6 +69,7 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
     if found is not None:
         low, high = found["interval"]["low"], found["interval"]["high"]
         read = "linear probe on the frozen network" if config.objective != "supervised" else "its own decoder"
+        read += ", fitted anew to the trained features" if info.get("refit_decoder") else ""
         lines += [
             f"| top-1 | {found['top1']:.3f} [{low:.3f}, {high:.3f}] on {found['count']} sweeps ({read}) |",
             f"| top-5 | {found['top5']:.3f} |",
