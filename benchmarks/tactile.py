@@ -123,6 +123,7 @@ def part_sensors(options: argparse.Namespace) -> Iterable[Row]:
             ratio = seconds / (ROOFLINE[noise is not None] * faster * options.envs / 16384 * count / 100)
         per = (held["sensors"] + held["shared"]) / numbers
         row = {"case": label, "envs": options.envs, "ms": seconds * 1e3, "roofline_ratio": ratio, "bytes": per}
+        row["scratch"] = held["scratch"] / numbers
         yield row | {"ns": seconds / options.envs / numbers * 1e9, "first_s": first}
         del suite
 
@@ -174,7 +175,7 @@ def part_published(options: argparse.Namespace) -> Iterable[Row]:
         seconds, first, suite = timed(scene_of(), config, state, options.device)
         held = suite.state_bytes
         row = {"case": label, "envs": count, "ms": seconds * 1e3, "rate": count / seconds, "first_s": first}
-        yield row | {"kib": (held["sensors"] + held["shared"]) / 1024}
+        yield row | {"kib": (held["sensors"] + held["shared"] + held["scratch"]) / 1024}
         del suite, state
 
 
@@ -251,7 +252,7 @@ def lay_out(rows: list[Row], options: argparse.Namespace) -> None:
     for device in dict.fromkeys(row["device"] for row in rows):
         kept = [row for row in rows if row["device"] == device]
         for part, (heading, body) in tables(kept).items():
-            flag = "cpu" if "processor" in device else "cuda"
+            flag = "cpu" if "cores" in device else "cuda"
             write_section(heading, f"python benchmarks/tactile.py --device {flag} --part {part}", body)
     if options.figure:
         plot_scaling([row for row in rows if row["part"] == "scaling"], options.figure)
@@ -287,7 +288,7 @@ def main() -> None:
     options.env_list = options.env_list or ([64, 256] if small else [1024, 4096, 8192, 16_384])
     options.brought = read_input(options.input) if options.input else None
     where = pick_device(options.device)
-    options.name = where.name if where.is_cuda else "2 shared processors"
+    options.name = where.name if where.is_cuda else "2 shared cores"
     chosen = [name for name in PARTS if name != "peer"] if options.part == "all" else [options.part]
     for part in chosen:
         print(f"# {part} on {options.name}", flush=True)

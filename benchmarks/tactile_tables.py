@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -37,10 +38,13 @@ def _sensors(rows: Rows) -> tuple[str, str]:
         ratio = row.get("roofline_ratio")
         cells.append([
             row["case"], f"{row['ms']:.3f}", f"{row['ns']:.3g}", "–" if ratio is None else f"{ratio:.2f}",
-            f"{row['bytes']:.0f}", f"{row['first_s']:.2f}",
+            f"{row['bytes']:.0f}", f"{row.get('scratch', 0):.0f}", f"{row['first_s']:.2f}",
         ])  # fmt: skip
-    columns = ["sensor", "ms / update", "ns / number", "time / roofline", "bytes / taxel", "first update (s)"]
-    note = "A taxel of temperature is a cell, of audio a sample. The first update loads or compiles the kernels."
+    columns = ["sensor", "ms / update", "ns / number", "time / roofline", "bytes / taxel", "scratch", "first (s)"]
+    note = (
+        "A taxel of temperature is a cell, of audio a sample. Scratch (bytes / taxel) is written anew by every update; "
+    )
+    note += "the first update loads or compiles the kernels."
     return f"Tactile sensors alone, {rows[0]['envs']:,} environments", f"{note}\n\n{table(columns, cells)}"
 
 
@@ -104,9 +108,8 @@ def plot_scaling(rows: Rows, path: Path) -> None:
                 if not kept:
                     continue
                 x = sorted(kept)
-                y = [1e6 * kept[value]["ms"] / kept[value]["envs"] for value in x]
-                if title == "environments":
-                    y = [1e3 * kept[value]["ms"] for value in x]
+                per = 1e3 if title == "environments" else 1e-3
+                y = [kept[value]["ms"] / (per if title == "environments" else per * kept[value]["envs"]) for value in x]
                 name = axis.split("(")[-1].rstrip(")") if "(" in axis else ""
                 label = " ".join(part for part in (name, device if len(devices) > 1 else "") if part)
                 axes.loglog(x, y, marker + "-", color=colour, markersize=4, linewidth=1, label=label or None)
@@ -115,7 +118,9 @@ def plot_scaling(rows: Rows, path: Path) -> None:
                     ends = [x[0], x[-1]]
                     axes.loglog(ends, [scale * end for end in ends], ":", color="#888888", linewidth=1)
         axes.set_title(title, fontsize=9)
-        axes.set_ylabel("µs / update" if title == "environments" else "ns / update and environment", fontsize=8)
+        axes.set_ylabel("s / update" if title == "environments" else "µs / update and environment", fontsize=8)
+        low, high = axes.get_ylim()
+        axes.set_ylim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high)))
         axes.tick_params(labelsize=7)
         axes.spines[["top", "right"]].set_visible(False)
         if axes.get_legend_handles_labels()[0]:

@@ -149,6 +149,11 @@ class Runtime(abc.ABC):
         """Memory per environment [bytes] of delays that the user asked for."""
         return 0
 
+    @property
+    def scratch_bytes(self) -> int:
+        """Memory per environment [bytes] that every update writes anew."""
+        return 0
+
 
 class ReadoutRuntime(Runtime):
     """Readings of a group with their noise: fused into the sensor's kernel where that can be, in stages otherwise.

@@ -15,6 +15,9 @@ from robotics_bridge.sensors._pair_kernels import pair_structs
 from robotics_bridge.sensors._probe_kernels import deepest_function
 from robotics_bridge.sensors._query_kernels import FAR, distance_function, query_structs
 
+NEGLIGIBLE = 17.0
+"""Exponent of a Gaussian from which it is left out: 4e-8 of its middle."""
+
 
 @cache
 def elastomer_structs() -> SimpleNamespace:
@@ -162,9 +165,9 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
     """Return the kernel that follows surface points inside the elastomer (before 4.20).
 
     A point sets its anchor where it sinks below −enter and loses it above +leave, or when its geometry no longer
-    touches. Points with an anchor are listed, block by block in a fixed order, if they moved since: place (3) and
-    s_s h times the way since the anchor (3). Anchors are [P, 3, B] (x NaN: none). Blocks of points that hold no anchor
-    and lie off the pad are passed over; ``held`` counts the anchors of each and ``moved`` what it lists.
+    touches. Anchors are [P, 3, B] (x NaN: none). Blocks of points that lie off the pad are passed over: ``held`` counts
+    the anchors of each. Of points that moved since, ``drive`` [P, B] lists s_s h without gaps, ``order`` their numbers
+    in the block, and ``moved`` how many they are plus 64 times one more than the block's place in the pair list.
 
     Args:
         kinds: of the pad's geometries.
@@ -203,7 +206,8 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
         held: wp.array2d(dtype=wp.int32),
         moved: wp.array2d(dtype=wp.int32),
         dragged: wp.array2d(dtype=wp.int32),
-        listed: wp.array2d(dtype=wp.spatial_vectorf),
+        drive: wp.array2d(dtype=wp.float32),
+        order: wp.array2d(dtype=wp.uint8),
     ):
         i, j = wp.tid()
         env = i
@@ -249,8 +253,9 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
         holds = int(0)
         for n in range(wp.static(BLOCK)):
             p = cloud.point[first * wp.static(BLOCK) + n]
+            index = store * wp.static(BLOCK) + n
+            strength = float(0.0)
             if not wp.isnan(p[0]):
-                index = store * wp.static(BLOCK) + n
                 kept = wp.static(float("nan"))
                 if had > 0:
                     kept = anchor[index, 0, env]
@@ -265,18 +270,17 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
                     kept = wp.static(float("nan"))
                 anchor[index, 0, env] = kept
                 if not wp.isnan(kept):
-                    drive = gel.shear * wp.max(-phi, 0.0)
                     way = z - wp.vec3f(kept, anchor[index, 1, env], anchor[index, 2, env])
-                    if drive * wp.length_sq(way) > 0.0:
-                        way = drive * way
-                        listed[store * wp.static(BLOCK) + found, env] = wp.spatial_vectorf(
-                            z[0], z[1], z[2], way[0], way[1], way[2]
-                        )
-                        found += 1
+                    if wp.length_sq(way) > 0.0:
+                        strength = gel.shear * wp.max(-phi, 0.0)
                     holds += 1
+            if strength > 0.0:
+                drive[store * wp.static(BLOCK) + found, env] = strength
+                order[store * wp.static(BLOCK) + found, env] = wp.uint8(n)
+                found += 1
         held[store, env] = holds
         if found > 0:
-            moved[store, env] = found
+            moved[store, env] = 64 * (at + 1) + found
             dragged[env, part] = io.age[env] * 1024 + io.episode[env]
 
     return anchors
@@ -299,6 +303,7 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
     io = io_functions(mode, hysteresis, walk, 3)
     emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
     types, gel_type = io_structs(), elastomer_structs().Gel
+    pairs_type, cloud_type = pair_structs().Pairs, cloud_structs().Cloud
     probes_type, io_type = types.ProbeSet, types.Io
     noise = noise_functions()
     params_type = noise.NoiseParams
@@ -318,6 +323,16 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
             u -= deep * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * deep * deep) * away)
         return u
 
+    @wp.func
+    def block_of(cloud: cloud_type, tracked: wp.array(dtype=wp.int32), row: int, geometry: int, block: int) -> int:
+        """Number in the cloud of a block that was counted through all tracked geometries."""
+        before = int(0)
+        for member in range(tracked.shape[0]):
+            if tracked[member] == geometry:
+                return cloud.first[row, geometry] + block - before
+            before += cloud.blocks[row, tracked[member]]
+        return 0
+
     @wp.kernel(module="unique")
     def markers(
         probes: probes_type,
@@ -330,9 +345,14 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
         height: wp.array3d(dtype=wp.float32),
         spread: wp.array3d(dtype=wp.float32),
         blocks: int,
+        tracked: wp.array(dtype=wp.int32),
+        pairs: pairs_type,
+        cloud: cloud_type,
         moved: wp.array2d(dtype=wp.int32),
         dragged: wp.array2d(dtype=wp.int32),
-        listed: wp.array2d(dtype=wp.spatial_vectorf),
+        anchor: wp.array3d(dtype=wp.float32),
+        drive: wp.array2d(dtype=wp.float32),
+        order: wp.array2d(dtype=wp.uint8),
     ):
         env, n = wp.tid()
         if probes.radius[n] <= 0.0:
@@ -404,18 +424,44 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
                     signal = u
         slide = wp.vec3f(0.0)
         if dragged[env, part] == io.age[env] * 1024 + io.episode[env]:
+            row = env % cloud.first.shape[0]
             for block in range(part * blocks, part * blocks + blocks):
-                for k in range(moved[block, env]):
-                    point = listed[block * wp.static(BLOCK) + k, env]
-                    slip = across_plane(wp.vec3f(point[3], point[4], point[5]), normal)
-                    away = across_plane(x - wp.vec3f(point[0], point[1], point[2]), normal)
-                    if wp.static(layered):
-                        if gel.layered == 1:
-                            slide += traction(gel, away, slip)
-                        else:
-                            slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
-                    else:
-                        slide += wp.exp(-gel.smear * wp.length_sq(away)) * slip
+                packed = moved[block, env]
+                if packed > 0:
+                    at = packed // 64 - 1
+                    rotation = wp.transpose(pairs.rotation[env, at])
+                    offset = pairs.offset[env, at]
+                    first = block_of(cloud, tracked, row, pairs.geometry[env, at], block - part * blocks)
+                    # Σ w (z − anchor) with z = rotation (p − offset): the pose of the block is applied once.
+                    here = wp.transpose(rotation) @ x + offset
+                    up = wp.transpose(rotation) @ normal
+                    mass = float(0.0)
+                    carried = wp.vec3f(0.0)
+                    left = wp.vec3f(0.0)
+                    for k in range(packed % 64):
+                        own = int(order[block * wp.static(BLOCK) + k, env])
+                        index = block * wp.static(BLOCK) + own
+                        p = cloud.point[first * wp.static(BLOCK) + own]
+                        strength = drive[block * wp.static(BLOCK) + k, env]
+                        kept = wp.vec3f(anchor[index, 0, env], anchor[index, 1, env], anchor[index, 2, env])
+                        if wp.static(layered):
+                            if gel.layered == 1:
+                                z = rotation @ (p - offset)
+                                slip = across_plane(strength * (z - kept), normal)
+                                slide += traction(gel, across_plane(x - z, normal), slip)
+                                strength = 0.0
+                        away = p - here
+                        rise = wp.dot(away, up)
+                        far = gel.smear * (wp.dot(away, away) - rise * rise)
+                        if far < wp.static(NEGLIGIBLE):
+                            w = strength * wp.exp(-far)
+                            mass += w
+                            carried += w * (p - offset)
+                            left += w * kept
+                    if mass > 0.0:
+                        slide += rotation @ carried - left
+            if gel.layered == 0:
+                slide = across_plane(slide, normal)
         if wp.static(planes == 1):
             signal = truth
         truth += slide

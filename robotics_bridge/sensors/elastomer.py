@@ -12,7 +12,7 @@ import numpy as np
 from brainbench.errors import UsageError, unknown_name
 from robotics_bridge._device import warp
 from robotics_bridge.sensors._base import Asks, ProbeRuntime, QuerySensor
-from robotics_bridge.sensors._cloud_kernels import BLOCK
+from robotics_bridge.sensors._cloud_kernels import BLOCK, cloud_structs
 from robotics_bridge.sensors._clouds import sample_cloud
 from robotics_bridge.sensors.noise import TAXEL_KNOBS
 
@@ -160,10 +160,9 @@ class ElastomerRuntime(ProbeRuntime):
         count, tracked = len(self._sensors), first.tracked(scene)
         self._followed = first.points > 0 and bool(tracked)
         self._tracked = wp.array(np.array(tracked or [0], np.int32), dtype=wp.int32, device=device)
-        self._cloud = (
-            sample_cloud(scene, tracked, first.points, context.solids.rows, device) if self._followed else None
-        )
-        self._total = self._cloud.total if self._cloud else 0
+        cloud = sample_cloud(scene, tracked, first.points, context.solids.rows, device) if self._followed else None
+        self._points = cloud.struct if cloud else cloud_structs().Cloud()
+        self._total = cloud.total if cloud else 0
         own = [sensor.own(scene) if self._followed else () for sensor in self._sensors]
         self._own_kinds = context.solids.kinds_of(sorted({g for members in own for g in members}))
         members = np.array([g for one in own for g in one] or [0], np.int32)
@@ -179,8 +178,11 @@ class ElastomerRuntime(ProbeRuntime):
         self._blocks = -(-self._total // BLOCK)
         total = max(count * self._blocks * BLOCK, 1)
         # Threads of a GPU are environments and want them side by side; a processor walks through the points of one.
-        self._anchor = floats(total, 3, envs) if device.is_cuda else floats(envs, total, 3).transpose((1, 2, 0))
-        self._listed = wp.zeros((envs, total), dtype=wp.spatial_vectorf, device=device).transpose((1, 0))
+        self._side_by_side = device.is_cuda
+        self._anchor = floats(total, 3, envs) if self._side_by_side else floats(envs, total, 3).transpose((1, 2, 0))
+        self._drive = floats(total, envs) if self._side_by_side else floats(envs, total).transpose((1, 0))
+        order = wp.zeros((total, envs) if self._side_by_side else (envs, total), dtype=wp.uint8, device=device)
+        self._order = order if self._side_by_side else order.transpose((1, 0))
         stores = (max(count * self._blocks, 1), envs)
         self._held, self._moved = (wp.zeros(stores, dtype=wp.int32, device=device) for _ in range(2))
         exponents = np.array([sensor.exponent for sensor in self._sensors], np.float32)
@@ -191,10 +193,15 @@ class ElastomerRuntime(ProbeRuntime):
 
     @property
     def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes]: readings, anchors, and what kernels hand to one another."""
-        followed = (9 * self._total + 2 * self._blocks + 2) * len(self._sensors)
+        """Lasting memory per environment [bytes]: readings and anchors."""
+        return super().state_bytes + 4 * (3 * self._total + self._blocks + 2) * len(self._sensors)
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Memory per environment [bytes] that every update writes anew: heights, their sums and drives of points."""
         spread = 3 * self._planes if self._way != "direct" else 0
-        return super().state_bytes + 4 * (followed + self.count * (2 * self._planes + spread))
+        followed = (5 * self._total + 4 * self._blocks) * len(self._sensors)
+        return followed + 4 * self.count * (2 * self._planes + spread)
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
@@ -210,16 +217,17 @@ class ElastomerRuntime(ProbeRuntime):
             self.launch(kernels.spread_kernel(self._planes), *inputs, self._spread)
         elif self._way == "fft":
             self._transform()
-        if self._cloud:
-            inputs = [self._gels, self._own, self._tracked, solids, pairs, self._cloud.struct, self.io]
-            inputs += [self._blocks, self._anchor, self._held, self._moved, self._dragged, self._listed]
-            kernel = kernels.anchor_kernel(self._own_kinds, self._raycast, c.device.is_cuda)
+        if self._followed:
+            inputs = [self._gels, self._own, self._tracked, solids, pairs, self._points, self.io]
+            inputs += [self._blocks, self._anchor, self._held, self._moved, self._dragged, self._drive, self._order]
+            kernel = kernels.anchor_kernel(self._own_kinds, self._raycast, self._side_by_side)
             dim = (self._held.shape[0], c.num_envs)
-            wp.launch(kernel, dim=dim if c.device.is_cuda else dim[::-1], inputs=inputs, device=c.device)
+            wp.launch(kernel, dim=dim if self._side_by_side else dim[::-1], inputs=inputs, device=c.device)
         way = ("direct", "separable", "fft").index(self._way)
         kernel = kernels.marker_kernel(way, self._layered, self._planes, self.mode, *self.stores)
         inputs = [self.probes, self.io, self.knobs, self._gels, self._weights, self._reach, self._stamp, self._height]
-        self.launch(kernel, *inputs, self._spread, self._blocks, self._moved, self._dragged, self._listed)
+        inputs += [self._spread, self._blocks, self._tracked, pairs, self._points]
+        self.launch(kernel, *inputs, self._moved, self._dragged, self._anchor, self._drive, self._order)
         self.finish(dt)
 
     def _describe(self, own: list[tuple[int, ...]]) -> Any:

@@ -214,10 +214,12 @@ class SensorSuite:
 
     @property
     def state_bytes(self) -> dict[str, int]:
-        """Memory per environment [bytes]: ``sensors``, ``shared`` lists of contacts, and ``rings`` users asked for."""
+        """Memory per environment [bytes]: ``sensors``, ``shared`` lists of contacts, ``rings`` that users asked for,
+        and ``scratch`` that every update writes anew."""
         rings = sum(runtime.ring_bytes for runtime in self.runtimes) + sum(h.bytes for h in self._histories.values())
         sensors = sum(runtime.state_bytes for runtime in self.runtimes)
-        return {"sensors": sensors, "shared": 8 + self.pairs.state_bytes, "rings": rings}
+        scratch = sum(runtime.scratch_bytes for runtime in self.runtimes)
+        return {"sensors": sensors, "shared": 8 + self.pairs.state_bytes, "rings": rings, "scratch": scratch}
 
     def _launch(self, state: HandState, dt: float) -> None:
         wp = warp()

@@ -67,7 +67,7 @@ def test_shear_is_the_published_sum_over_anchored_points() -> None:
     suite = _suite({"all": _taxel(), "press": _taxel(points=0)})
     _press(suite, (0, 0, -0.001), (0.0006, 0, -0.001))
     runtime = suite.runtimes[0]
-    points = runtime._cloud.struct.point.numpy()  # type: ignore[attr-defined]
+    points = runtime._points.point.numpy()  # type: ignore[attr-defined]
     points = points[~np.isnan(points[:, 0])].astype(float)
     before, now = points + np.array([0, 0, 0.01]), points + np.array([0.0006, 0, 0.01])
     anchored = before[:, 2] < 0.005 - 1e-5
@@ -143,6 +143,18 @@ def test_a_clamped_frame_stops_the_widening_where_a_free_edge_moves_most() -> No
     assert extra["free"][4, :, 0].argmax() == 10
     assert abs(extra["clamped"][4, 10, 0]) < 1e-3 * extra["clamped"][4, :, 0].max()
     assert np.abs(extra["free"][4, 5]).max() < 1e-9
+
+
+def test_shear_does_not_depend_on_the_order_of_threads_that_a_gpu_has() -> None:
+    suites = [_suite({"a": _taxel(), "b": _taxel(enter=2e-5)}, envs=3) for _ in range(2)]
+    suites[1].runtimes[0]._side_by_side = True  # type: ignore[attr-defined]
+    for suite in suites:
+        _press(suite, (0, 0, -0.001), (0.0003, 0, -0.001))
+        suite.reset([1])
+        _press(suite, (0.0006, 0.0002, -0.0009), (0.0006, 0.0002, 0.001), (0.0001, 0, -0.0005), (0.0002, 0, -0.0005))
+    for name in ("a", "b"):
+        assert float(suites[0].read(name)[..., 0].abs().max()) > 1e-6
+        np.testing.assert_array_equal(suites[0].read(name), suites[1].read(name))
 
 
 def test_a_layer_with_recoil_pushes_less_by_twice_its_share_however_it_is_summed() -> None:

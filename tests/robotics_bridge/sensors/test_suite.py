@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,9 +14,11 @@ from robotics_bridge.physics import Geometry, Scene
 from robotics_bridge.sensors import (
     ContactDepthProbe,
     ContactProbe,
+    ElastomerTaxel,
     KinematicTaxel,
     Noise,
     Probes,
+    ProximityTaxel,
     SensorSuite,
     SurfaceDistanceProbe,
     _cloud_kernels,
@@ -221,12 +225,26 @@ def test_seeds_and_offsets_decide_the_noise_and_nothing_else() -> None:
     assert torch.equal(whole.read_ground_truth("a"), other.read_ground_truth("a"))
 
 
-def test_a_noisy_taxel_keeps_at_most_130_bytes() -> None:
-    grid = Probes.grid(10, 10, size=(0.02, 0.02), radius=0.003)
-    noise = Noise.preset("published-force")
-    suite = _suite({"taxel": KinematicTaxel(link="hand", probes=grid, noise=noise)})
-    held = suite.state_bytes
+NOISY = {
+    "distance": (SurfaceDistanceProbe, "depth", {}),
+    "contact": (ContactProbe, "bool", {}),
+    "depth": (ContactDepthProbe, "depth", {}),
+    "kinematic": (KinematicTaxel, "force", {}),
+    "proximity": (ProximityTaxel, "proximity", {"points": 500}),
+    "elastomer": (ElastomerTaxel, "elastomer", {"points": 500}),
+}
+
+
+@pytest.mark.parametrize("name", list(NOISY))
+def test_a_noisy_taxel_keeps_at_most_130_bytes(name: str) -> None:
+    kind, preset, options = NOISY[name]
+    noise = Noise.preset(f"published-{preset}")
+    noise = replace(noise, **{knob: 0.0 for knob in ("hysteresis", "radius") if knob not in kind.knobs})
+    noise = noise if "gain" in kind.knobs else replace(noise, gain=(1.0, 1.0), dead_probability=0.0)
+    sensor = kind(link="hand", probes=Probes.grid(10, 10, size=(0.02, 0.02), radius=0.003), noise=noise, **options)
+    held = _suite({"taxel": sensor}).state_bytes
     assert (held["sensors"] + held["shared"]) / 100 <= 130
+    assert held["rings"] == 0
 
 
 @pytest.mark.parametrize(
