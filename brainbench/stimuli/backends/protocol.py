@@ -124,6 +124,9 @@ class Trace:
     """Processor time of this whisker [s]."""
     link_positions: NDArray[np.float64] | None = None
     """[n, links + 1, 3] joints and tip (m, world) when the shape was asked for."""
+    contact_wrench: NDArray[np.float64] | None = None
+    """[n, 6] force (N) and moment about the base point (N·m, world axes) of all contacts on the whisker, when the shape
+    was asked for and the engine tells (``rod`` does)."""
 
 
 class Backend(Protocol):

@@ -9,6 +9,7 @@ from brainbench.errors import UsageError
 from brainbench.stimuli import validation
 from brainbench.stimuli.backends.protocol import Job, StillFollicle
 from brainbench.stimuli.backends.rod import RodBackend
+from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.collections import resolve_objects
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.obstacle import Box, Capsule, Obstacle, TriangleMesh
@@ -237,3 +238,30 @@ def test_other_engines_refuse_to_leave_inertia_out(name):
     job = Job(C2, StillFollicle(), (), np.array([0.01]))
     with pytest.raises(UsageError, match="has no solver 'quasistatic', only 'dynamic'; use the backend 'rod'"):
         get_backend(name).run([job], Fidelity(solver="quasistatic"))
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.48])
+def test_the_base_feels_contacts_less_the_rate_of_momentum_in_every_frame(friction):
+    """Newton and Euler for the whole whisker, from its recorded shape alone, through a blow at 60 mm/s."""
+    peg = _moving((Capsule((0.009, 5e-4, -0.02), (0.009, 5e-4, 0.02), 3e-4),), (0.0, 0.06, 0.03), friction=friction)
+    step = 1e-5
+    whisker = replace(C2, curvature=12.0)
+    fidelity = Fidelity(links=10, time_step=step, precision="double")
+    job = Job(whisker, StillFollicle(), (peg,), step * np.arange(1, 1001))
+    trace = _run(job, fidelity, record_shape=True)[0]
+    chain = build_chain(whisker, 10)
+    nodes, lengths = trace.link_positions, chain.lengths[:, None]
+    along = np.diff(nodes, axis=1) / lengths
+    centres = nodes[:, :-1] + along * chain.centres[:, None]
+
+    def rate(values):
+        return (values[2:] - 2 * values[1:-1] + values[:-2]) / step**2
+
+    masses = chain.masses[:, None]
+    pushed, turned = masses * rate(centres), chain.inertias[:, 1:2] * np.cross(along[1:-1], rate(along))
+    momentum = np.concatenate([pushed.sum(axis=1), (np.cross(centres[1:-1], pushed) + turned).sum(axis=1)], axis=1)
+    expected = trace.contact_wrench[1:-1] - momentum
+    assert np.linalg.norm(momentum[:, :3], axis=1).max() > 0.1 * np.linalg.norm(trace.wrench[:, :3], axis=1).max()
+    for part in (slice(0, 3), slice(3, 6)):
+        peak = np.linalg.norm(trace.wrench[:, part], axis=1).max()
+        assert np.linalg.norm((expected - trace.wrench[1:-1])[:, part], axis=1).max() < 1e-3 * peak

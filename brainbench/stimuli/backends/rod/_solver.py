@@ -12,17 +12,16 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+from brainbench.stimuli.backends.rod._algebra import algebra
 from brainbench.stimuli.backends.rod._limits import (
     BENT,
     CLOSED,
     CREVICE,
-    FAR,
     FINEST,
     FOLD,
     LARGEST_BEND,
     LOST,
     MESHES,
-    NEAR,
     NOTHING,
     REST,
     ROUNDS,
@@ -34,7 +33,9 @@ from brainbench.stimuli.backends.rod._limits import (
     WIDEST,
     contacts_for,
 )
+from brainbench.stimuli.backends.rod._looks import looks
 from brainbench.stimuli.backends.rod._shapes import MESH, distances
+from brainbench.stimuli.backends.rod._structs import structs
 from brainbench.stimuli.backends.rod._tracks import tracks
 
 
@@ -60,428 +61,17 @@ def solver(
     vec4: Any = wp.types.vector(4, real)
     vec6: Any = wp.types.vector(6, real)
     mat33: Any = wp.types.matrix((3, 3), real)
-    shape = distances(real)
-    track = tracks(real)
-    segment_primitive, primitive = shape.segment_primitive, shape.primitive
-    segment_triangle, point_triangle = shape.segment_triangle, shape.point_triangle
-    Tracks, Pose, pose_at = track.Tracks, track.Pose, track.pose_at
-    single = real is wp.float32
+    primitive = distances(real).primitive
+    kinds, maths, near_by, track = structs(real), algebra(real), looks(real, against), tracks(real)
+    Chains, Bodies, Lanes, Options = kinds.Chains, kinds.Bodies, kinds.Lanes, kinds.Options
+    Results, Paused = kinds.Results, kinds.Paused
+    sym, sym_pair, sine, cosine = maths.sym, maths.sym_pair, maths.sine, maths.cosine
+    first_axis, rotate, unrotate = maths.first_axis, maths.rotate, maths.unrotate
+    Touch, far_mesh, look_at = near_by.Touch, near_by.far_mesh, near_by.look_at
+    Tracks, pose_at = track.Tracks, track.pose_at
     most_held = contacts_for(capacity)
     most_seen = most_held + SPARE
     rows = 3 * most_held
-
-    @wp.struct
-    class Chains:
-        links: wp.array(dtype=wp.int32)
-        """[whisker]"""
-        beta: wp.array(dtype=real)
-        """[whisker] damping over stiffness, numerical damping included."""
-        friction: wp.array(dtype=real)
-        """[whisker]"""
-        length: wp.array(dtype=real)
-        """[whisker] arc length."""
-        build: wp.array2d(dtype=vec4)
-        """[link, whisker] length, cosine and sine of the rest bend, mass."""
-        inertia: wp.array2d(dtype=vec4)
-        """[link, whisker] centre of mass, axial and transverse inertia, hinge stiffness."""
-        taper: wp.array2d(dtype=vec4)
-        """[link, whisker] radius at both ends, arc at the joint, arc of the link."""
-
-    @wp.struct
-    class Bodies:
-        first: wp.array(dtype=wp.int32)
-        """[scene + 1] first shape of each scene."""
-        kind: wp.array(dtype=wp.int32)
-        """[shape]"""
-        size: wp.array(dtype=vec3)
-        """[shape]"""
-        place: wp.array(dtype=vec3)
-        """[shape] origin of the shape in its body."""
-        turn: wp.array(dtype=vec4)
-        """[shape] quaternion, shape to body."""
-        scale: wp.array(dtype=real)
-        """[shape] length of one unit of the shape (mm)."""
-        radius: wp.array(dtype=real)
-        """[shape] farthest point of the shape from the body's origin (mm)."""
-        speed: wp.array(dtype=real)
-        """[shape] fastest that any of its points ever moves."""
-        friction: wp.array(dtype=real)
-        """[shape] negative for the whisker's own."""
-        track: wp.array(dtype=wp.int32)
-        """[shape] motion of its body."""
-        mesh: wp.array(dtype=wp.uint64)
-        """[shape] Warp mesh."""
-        face: wp.array(dtype=wp.int32)
-        """[shape] first of its triangles below."""
-        corner: wp.array2d(dtype=vec3)
-        """[triangle, 3]"""
-        outward: wp.array2d(dtype=vec3)
-        """[triangle, 7] angle-weighted normals: face, three corners, edges opposite to them."""
-
-    @wp.struct
-    class Lanes:
-        whisker: wp.array(dtype=wp.int32)
-        """[lane]"""
-        scene: wp.array(dtype=wp.int32)
-        """[lane]"""
-        base: wp.array(dtype=wp.int32)
-        """[lane] motion of the base."""
-        step: wp.array(dtype=real)
-        """[lane] longest time step."""
-        row: wp.array(dtype=wp.int32)
-        """[lane] first index of its results."""
-        column: wp.array(dtype=wp.int32)
-        """[lane] third index of its results."""
-        load_first: wp.array(dtype=wp.int32)
-        """[lane + 1] first load of each lane."""
-        load_link: wp.array(dtype=wp.int32)
-        """[load]"""
-        load_share: wp.array(dtype=real)
-        """[load] where on its link."""
-        load_force: wp.array(dtype=vec3)
-        """[load]"""
-        load_stop: wp.array(dtype=real)
-        """[load]"""
-
-    @wp.struct
-    class Options:
-        start: real
-        gravity: vec3
-        axes: mat33
-        """Rotation of the results."""
-        quasistatic: wp.int32
-        """Whether rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
-        shape: wp.int32
-
-    @wp.struct
-    class Results:
-        wrench: wp.array4d(dtype=real)
-        """[row, reading, column, 6] action of the whisker on its base (N, N m)."""
-        contact: wp.array3d(dtype=real)
-        """[row, reading, column] arc of the contact (m), negative without."""
-        points: wp.array3d(dtype=vec3)
-        """[reading, node, lane] when shapes are recorded."""
-        depth: wp.array(dtype=real)
-        """[lane] deepest overlap."""
-        status: wp.array(dtype=wp.int32)
-        """[lane]"""
-        failed: wp.array(dtype=real)
-        """[lane] when it failed."""
-        steps: wp.array(dtype=wp.int32)
-        """[lane] steps computed."""
-        touching: wp.array(dtype=wp.int32)
-        """[lane] steps with contact."""
-        crowded: wp.array(dtype=wp.int32)
-        """[lane] steps in which a contact found no place."""
-        unsolved: wp.array(dtype=wp.int32)
-        """[lane] steps whose contact forces did not converge."""
-        miss: wp.array(dtype=real)
-        """[lane] sum over the steps of the square of what the last iteration changed in the forces (mN²)."""
-        load: wp.array(dtype=real)
-        """[lane] sum over the steps of the square of the contact forces (mN²)."""
-
-    @wp.func
-    def sym(a: vec6, x: vec3) -> vec3:
-        """Product of a symmetric matrix (xx yy zz xy xz yz) and a vector."""
-        return vec3(
-            a[0] * x[0] + a[3] * x[1] + a[4] * x[2],
-            a[3] * x[0] + a[1] * x[1] + a[5] * x[2],
-            a[4] * x[0] + a[5] * x[1] + a[2] * x[2],
-        )
-
-    @wp.func
-    def sym_pair(a: vec3, b: vec3, c: vec3, d: vec3) -> vec6:
-        """Symmetric matrix a bᵀ + c dᵀ, given that it is symmetric."""
-        return vec6(
-            a[0] * b[0] + c[0] * d[0],
-            a[1] * b[1] + c[1] * d[1],
-            a[2] * b[2] + c[2] * d[2],
-            a[0] * b[1] + c[0] * d[1],
-            a[0] * b[2] + c[0] * d[2],
-            a[1] * b[2] + c[1] * d[2],
-        )
-
-    @wp.func
-    def sine(x: real) -> real:
-        if wp.static(single):
-            y = x * x
-            return x * (
-                real(1.0)
-                + y
-                * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
-            )
-        return wp.sin(x)
-
-    @wp.func
-    def cosine(x: real) -> real:
-        if wp.static(single):
-            y = x * x
-            return real(1.0) + y * (
-                real(-0.5)
-                + y
-                * (real(1.0 / 24.0) + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0))))
-            )
-        return wp.cos(x)
-
-    @wp.func
-    def first_axis(z: vec3, along: vec3, angle: real) -> vec3:
-        """Axis of a joint's first hinge from that of its second, the link behind it and the second angle."""
-        x = wp.normalize(along)
-        return wp.cross(z, x) * cosine(angle) + x * sine(angle)
-
-    @wp.func
-    def rotate(q: vec4, x: vec3) -> vec3:
-        u = vec3(q[1], q[2], q[3])
-        t = real(2.0) * wp.cross(u, x)
-        return x + q[0] * t + wp.cross(u, t)
-
-    @wp.func
-    def unrotate(q: vec4, x: vec3) -> vec3:
-        u = vec3(-q[1], -q[2], -q[3])
-        t = real(2.0) * wp.cross(u, x)
-        return x + q[0] * t + wp.cross(u, t)
-
-    @wp.func
-    def outward_of(bodies: Bodies, face: int, v: real, w: real) -> vec3:
-        """Pseudo-normal of the corner, edge or face on which the point with these barycentric coordinates lies."""
-        u = real(1.0) - v - w
-        low = real(1e-4)
-        on_p = u > low
-        on_q = v > low
-        on_r = w > low
-        slot = int(0)
-        if on_p and not on_q and not on_r:
-            slot = 1
-        elif on_q and not on_p and not on_r:
-            slot = 2
-        elif on_r and not on_p and not on_q:
-            slot = 3
-        elif not on_p:
-            slot = 4
-        elif not on_q:
-            slot = 5
-        elif not on_r:
-            slot = 6
-        return bodies.outward[face, slot]
-
-    @wp.func
-    def single3(x: vec3) -> wp.vec3f:
-        return wp.vec3f(wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]))
-
-    @wp.struct
-    class Touch:
-        """How near a link comes to a shape: between its ends, and at its far end."""
-
-        between: wp.int32
-        """Whether something between the ends is near."""
-        share: real
-        gap: real
-        normal: vec3
-        end: wp.int32
-        """Whether the far end is near."""
-        end_gap: real
-        end_normal: vec3
-        clear: real
-        """Lower bound of the distance of the link's axis from the surface."""
-        close: wp.int32
-        """Whether triangles were near."""
-
-    @wp.func
-    def corner_point(bodies: Bodies, face: int, v: real, w: real) -> vec3:
-        p = bodies.corner[face, 0]
-        return p + (bodies.corner[face, 1] - p) * v + (bodies.corner[face, 2] - p) * w
-
-    @wp.func
-    def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
-        """Direction out of a mesh and signed distance, given the way from the closest point and the pseudo-normal."""
-        if distance < real(1e-3) * radius:
-            return vec4(outward[0], outward[1], outward[2], distance)
-        side = real(1.0) / distance
-        signed = distance
-        if wp.dot(away, outward) < real(0.0):
-            side = -side
-            signed = -distance
-        return vec4(away[0] * side, away[1] * side, away[2] * side, signed)
-
-    @wp.func
-    def near_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, margin: real) -> Touch:
-        """Look at the triangles around a link whose axis a–b lies within ``margin`` + radius of a mesh."""
-        touch = Touch()
-        touch.between = 0
-        touch.end = 0
-        mesh = bodies.mesh[s]
-        reach = wp.max(ra, rb) + margin
-        low = wp.vec3f(
-            wp.float32(wp.min(a[0], b[0]) - reach),
-            wp.float32(wp.min(a[1], b[1]) - reach),
-            wp.float32(wp.min(a[2], b[2]) - reach),
-        )
-        high = wp.vec3f(
-            wp.float32(wp.max(a[0], b[0]) + reach),
-            wp.float32(wp.max(a[1], b[1]) + reach),
-            wp.float32(wp.max(a[2], b[2]) + reach),
-        )
-        query = wp.mesh_query_aabb(mesh, low, high)
-        candidate = wp.int32(0)
-        nearest = real(1e20)
-        face = wp.int32(-1)
-        share = real(0.0)
-        v = real(0.0)
-        w = real(0.0)
-        end_nearest = real(1e20)
-        end_face = wp.int32(-1)
-        end_v = real(0.0)
-        end_w = real(0.0)
-        start_nearest = real(1e20)
-        first = bodies.face[s]
-        while wp.mesh_query_aabb_next(query, candidate):
-            row = first + candidate
-            p = bodies.corner[row, 0]
-            q = bodies.corner[row, 1]
-            r = bodies.corner[row, 2]
-            at = segment_triangle(a, b, p, q, r)
-            if at[0] < nearest:
-                nearest = at[0]
-                share = at[1]
-                v = at[2]
-                w = at[3]
-                face = row
-            spot = point_triangle(b, p, q, r)
-            square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
-            if square < end_nearest:
-                end_nearest = square
-                end_v = spot[0]
-                end_w = spot[1]
-                end_face = row
-            spot = point_triangle(a, p, q, r)
-            start_nearest = wp.min(start_nearest, wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1]))
-        touch.clear = wp.min(reach, wp.sqrt(wp.min(nearest, wp.min(end_nearest, start_nearest))))
-        if face >= 0:
-            out_here = outward_of(bodies, face, v, w)
-            # On a flat or hollow edge the ends of the link are nearer, or as near.
-            flat = wp.dot(out_here, bodies.outward[face, 0]) > real(0.99999)
-            if share > real(1e-3) and share < real(1.0 - 1e-3) and not (flat and nearest > real(0.0)):
-                radius = ra + (rb - ra) * share
-                away = a + (b - a) * share - corner_point(bodies, face, v, w)
-                out = direction(away, wp.sqrt(nearest), out_here, radius)
-                touch.between = 1
-                touch.share = share
-                touch.gap = out[3] - radius
-                touch.normal = vec3(out[0], out[1], out[2])
-            away = b - corner_point(bodies, end_face, end_v, end_w)
-            out = direction(away, wp.sqrt(end_nearest), outward_of(bodies, end_face, end_v, end_w), rb)
-            touch.end = 1
-            touch.end_gap = out[3] - rb
-            touch.end_normal = vec3(out[0], out[1], out[2])
-        return touch
-
-    @wp.func
-    def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, look: real) -> Touch:
-        """Distance bound of a link from a mesh, and a contact when its middle lies inside."""
-        touch = Touch()
-        touch.between = 0
-        touch.end = 0
-        middle = real(0.5) * (a + b)
-        half = real(0.5) * wp.length(b - a)
-        far = look + half
-        hit = wp.mesh_query_point_sign_normal(bodies.mesh[s], single3(middle), wp.float32(far))
-        touch.clear = far - half
-        if hit.result:
-            on = wp.mesh_eval_position(bodies.mesh[s], hit.face, hit.u, hit.v)
-            away = middle - vec3(real(on[0]), real(on[1]), real(on[2]))
-            distance = wp.length(away)
-            touch.clear = distance - half
-            if hit.sign < 0.0 and distance > real(0.0):
-                touch.between = 1
-                touch.share = real(0.5)
-                touch.normal = -away / distance
-                touch.gap = -distance - real(0.5) * (ra + rb)
-                touch.clear = real(0.0)
-        return touch
-
-    if against < MESHES:
-
-        @wp.func
-        def near_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, margin: real) -> Touch:
-            return Touch()
-
-        @wp.func
-        def far_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, look: real) -> Touch:
-            return Touch()
-
-    @wp.func
-    def look_at(
-        bodies: Bodies, s: int, body: Pose, a_world: vec3, b_world: vec3, taper: vec4, margin: real, close: int
-    ) -> Touch:
-        """How near a link comes to a shape, in lengths of the scene but directions of the shape."""
-        turn_s = bodies.turn[s]
-        scale = bodies.scale[s]
-        local = unrotate(body.turn, a_world - body.place) - bodies.place[s]
-        a = unrotate(turn_s, local) / scale
-        local = unrotate(body.turn, b_world - body.place) - bodies.place[s]
-        b = unrotate(turn_s, local) / scale
-        ra = taper[0] / scale
-        rb = taper[1] / scale
-        touch = Touch()
-        touch.close = close
-        if bodies.kind[s] == wp.static(MESH):
-            # A link that was near is looked at among its triangles at once.
-            touch.clear = real(0.0)
-            if close == 0:
-                touch = far_mesh(bodies, s, a, b, ra, rb, real(wp.static(FAR)) / scale)
-            if touch.between == 0 and touch.clear * scale <= margin + taper[0]:
-                touch = near_mesh(bodies, s, a, b, ra, rb, (margin + real(wp.static(NEAR))) / scale)
-                touch.close = touch.end
-        else:
-            found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
-            touch.clear = found[1] + wp.min(ra, rb)
-            touch.share = found[0]
-            touch.gap = found[1]
-            touch.normal = vec3(found[2], found[3], found[4])
-            touch.between = 0
-            if found[0] > real(1e-3) and found[0] < real(1.0 - 1e-3):
-                touch.between = 1
-            tip = primitive(bodies.kind[s], bodies.size[s] / scale, b)
-            touch.end = 1
-            touch.end_gap = tip[3] - rb
-            touch.end_normal = vec3(tip[0], tip[1], tip[2])
-        touch.clear = touch.clear * scale
-        touch.gap = touch.gap * scale
-        touch.end_gap = touch.end_gap * scale
-        return touch
-
-    @wp.struct
-    class Paused:
-        """Whiskers between two slices, and the looks that they wait for."""
-
-        budget: wp.int32
-        """Steps of one slice."""
-        queue: wp.array(dtype=wp.int32)
-        """[lane] whiskers to go on with: those that got an answer from the front, the others from the back."""
-        after: wp.array(dtype=wp.int32)
-        """[lane] the same for the next slice."""
-        size: wp.array(dtype=wp.int32)
-        """[3] whiskers at the front, at the back, looks."""
-        tally: wp.array(dtype=wp.int32)
-        """[3] the same for the next slice."""
-        joints: wp.array2d(dtype=vec4)
-        """[link, lane] angles and rates."""
-        ways: wp.array2d(dtype=vec2)
-        """[link, lane] lower bound of the distance, and whether triangles were near."""
-        held: wp.array2d(dtype=vec4)
-        """[contact, lane] arc and force of the last step."""
-        times: wp.array2d(dtype=real)
-        """[7, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look."""
-        counts: wp.array2d(dtype=wp.int32)
-        """[7, lane] reading, reading to write, held contacts, near, resting, waiting, first look."""
-        look_lane: wp.array(dtype=wp.int32)
-        """[look]"""
-        look_link: wp.array(dtype=wp.int32)
-        """[look]"""
-        look_ends: wp.array2d(dtype=vec3)
-        """[look, 2]"""
-        found: wp.array2d(dtype=vec4)
-        """[look, 3] direction and gap between the ends; at the far end; share, bound, and what there was."""
 
     @wp.kernel(enable_backward=False, module="unique")
     def turn_over(on: Paused, looks: int):
@@ -1432,6 +1022,13 @@ def solver(
                     if opt.shape == 1:
                         for i in range(links + 1):
                             out.points[pending, i, lane] = origin + node[i]
+                        pressed = none
+                        twisted = none
+                        for c in range(contacts):
+                            pressed = pressed + held_force[c]
+                            twisted = twisted + wp.cross(c_at[c], held_force[c])
+                        out.pressed[pending, 0, lane] = pressed * real(1e-3)
+                        out.pressed[pending, 1, lane] = twisted * real(1e-6)
                     pending = int(-1)
                 steps = steps + 1
                 busy = touched

@@ -6,7 +6,7 @@ import math
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -181,19 +181,7 @@ def _simulate(
     started += time.thread_time() - paused
     readings = first.times * MILLI
     count, frames = len(lanes), len(readings)
-    out = kernels.Results()
-    dtype = real
-
-    def empty(*shape: int, fill: float | None = None, kind: Any = dtype) -> Any:
-        return wp.full(shape, fill, dtype=kind, device=device) if fill else wp.zeros(shape, dtype=kind, device=device)
-
-    out.wrench = empty(count, frames, 1, 6)
-    out.contact = empty(count, frames, 1, fill=-1.0)
-    out.points = empty(*((frames, capacity + 1, count) if record_shape else (1, 1, 1)), kind=kernels.vec3)
-    for name in _NUMBERS:
-        setattr(out, name, empty(count))
-    for name in _COUNTS:
-        setattr(out, name, empty(count, kind=wp.int32))
+    out = _results(kernels, real, device, (count, frames, capacity), record_shape)
     options = kernels.Options()
     options.start = first.start * MILLI
     options.quasistatic = int(fidelity.solver == "quasistatic")
@@ -215,11 +203,32 @@ def _simulate(
     )
     spent = time.thread_time() - started
     results = {name: getattr(out, name).numpy() for name in (*_NUMBERS, *_COUNTS, "wrench", "contact")}
-    points = out.points.numpy() if record_shape else None
+    points, pressed = (out.points.numpy(), out.pressed.numpy()) if record_shape else (None, None)
     for lane, (index, job, chain, missed) in enumerate(lanes):
         shape = None if points is None else points[:, : chain.links + 1, lane].astype(float) / MILLI
-        found.append((index, _trace(results, lane, job, shape, missed, spent / count)))
+        trace = _trace(results, lane, job, shape, missed, spent / count)
+        if pressed is not None:
+            sound = np.isfinite(trace.wrench).all(axis=1, keepdims=True)
+            felt = pressed[:, :, lane].reshape(frames, 6).astype(float)
+            trace = replace(trace, contact_wrench=np.where(sound, felt, np.nan))
+        found.append((index, trace))
     return found
+
+
+def _results(kernels: Any, real: Any, device: Any, sizes: tuple[int, int, int], record_shape: bool) -> Any:
+    """Room for the results of (lanes, readings, links)."""
+    wp = warp()
+    count, frames, capacity = sizes
+    out = kernels.Results()
+    out.wrench = wp.zeros((count, frames, 1, 6), dtype=real, device=device)
+    out.contact = wp.full((count, frames, 1), -1.0, dtype=real, device=device)
+    points, pressed = ((frames, capacity + 1, count), (frames, 2, count)) if record_shape else ((1, 1, 1),) * 2
+    out.points = wp.zeros(points, dtype=kernels.vec3, device=device)
+    out.pressed = wp.zeros(pressed, dtype=kernels.vec3, device=device)
+    for names, kind in ((_NUMBERS, real), (_COUNTS, wp.int32)):
+        for name in names:
+            setattr(out, name, wp.zeros(count, dtype=kind, device=device))
+    return out
 
 
 def batch_structs(batch: _Batch, kernels: Any, device: Any) -> list[Any]:
@@ -270,6 +279,7 @@ def _silent(job: Job, fidelity: Fidelity, record_shape: bool, started: float) ->
         contact_arc=np.full(count, np.nan),
         seconds=time.thread_time() - started,
         link_positions=shape,
+        contact_wrench=np.zeros((count, 6)) if record_shape else None,
     )
 
 
