@@ -150,10 +150,16 @@ def _text(data: dict[str, Any]) -> str:
         ["surface", f"{data['diagnosis']}, {data['triangles']:,} triangles"],
         ["size", f"{size} mm, diagonal {data['diagonal_mm']:.4g} mm"],
         ["volume", volume],
-        ["touched", f"{data['convex_parts']} convex part{'' if data['convex_parts'] == 1 else 's'}"],
+        ["touched", _touched(data["convex_parts"])],
         *([["note" if i == 0 else "", note] for i, note in enumerate(data["notes"])]),
         ["hash", data["content_hash"]],
     ]
     if "export" in data:
         rows.append(["written", f"{data['export']} (mm)"])
     return table("", ["", ""], rows)
+
+
+def _touched(parts: int) -> str:
+    if not parts:
+        return "the triangles of its surface (engine rod; for others choose --collision decomposition)"
+    return f"{parts} convex part{'' if parts == 1 else 's'}"

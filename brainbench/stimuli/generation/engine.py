@@ -180,6 +180,10 @@ class _Threads:
     def name(self) -> str:
         return self.engine.name
 
+    @property
+    def surfaces(self) -> bool:
+        return getattr(self.engine, "surfaces", False)
+
     def run(
         self,
         jobs: Sequence[Job],
