@@ -51,12 +51,10 @@ def draw(objects: dict[str, Any], count: int, whiskers: int, speed: float | None
     return drawn
 
 
-def wrenches(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> np.ndarray:
-    """[whisker of a sweep, reading, 6] (N, N m), NaN where a whisker was unstable."""
-    found = [
-        simulate([scene], fidelity=fidelity, backend=backend, cache=backend != "rod")["wrench"].values[0]
-        for scene in scenes
-    ]
+def wrenches(scenes: Sequence[Scene], fidelity: Fidelity, backend: str, *, cache: bool | None = None) -> np.ndarray:
+    """[whisker of a sweep, reading, 6] (N, N m), NaN where a whisker was unstable; ``rod`` is computed anew."""
+    keep = backend != "rod" if cache is None else cache
+    found = [simulate([scene], fidelity=fidelity, backend=backend, cache=keep)["wrench"].values[0] for scene in scenes]
     return np.concatenate([np.moveaxis(wrench, 1, 0) for wrench in found]).astype(float)
 
 
