@@ -1,6 +1,6 @@
 """Whisker-steps per second of the ``rod`` backend: free, and sweeping over meshes. Run on a GPU, or with --device cpu.
 
-PYTHONPATH=. python benchmarks/whisker_throughput.py [--device cuda] [--only free,sweep,low,high]
+PYTHONPATH=. python benchmarks/whisker_throughput.py [--device cuda] [--only free,peer,sweep]
 """
 
 from __future__ import annotations
@@ -104,6 +104,53 @@ def free(
     )
 
 
+def peer(device_name: str, worlds: int, links: int, steps: int) -> None:
+    """MuJoCo Warp on the same free whisker, one a world: its own steps, recorded as a CUDA graph where there is one."""
+    import mujoco
+    import mujoco_warp
+
+    from brainbench.stimuli.backends._mujoco_model import build_model
+    from brainbench.stimuli.backends._reach import reachable
+    from brainbench.stimuli.backends.protocol import Job, StillFollicle
+    from brainbench.stimuli.chain import build_chain
+    from brainbench.stimuli.sweep_grid import default_array
+
+    wp = warp()
+    whisker = next(mount.whisker for mount in default_array("mouse") if mount.name == "C2")
+    job = Job(whisker, StillFollicle(), (), np.array([1e-2]), gravity=(0.0, 0.0, -9.81))
+    times = np.arange(101) * 1e-4
+    reach = reachable(whisker, np.zeros((len(times), 3)), (), times, surfaces=False)
+    model = build_model(job, build_chain(whisker, links), reach, 1e-4, times).model
+    # These flags serve contacts; MuJoCo Warp does not know them.
+    model.opt.disableflags, model.opt.enableflags = 0, 0
+    device = wp.get_device(device_name)
+    with wp.ScopedDevice(device):
+        m = mujoco_warp.put_model(model)
+        d = mujoco_warp.put_data(model, mujoco.MjData(model), nworld=worlds, nconmax=1, njmax=1)
+        run: Callable[[], None]
+        if device.is_cuda:
+            mujoco_warp.step(m, d)
+            with wp.ScopedCapture() as capture:
+                for _ in range(steps):
+                    mujoco_warp.step(m, d)
+
+            def run() -> None:
+                wp.capture_launch(capture.graph)
+        else:
+
+            def run() -> None:
+                for _ in range(steps):
+                    mujoco_warp.step(m, d)
+
+        seconds = timed(wp, device, run)
+        bad = int((~np.isfinite(d.qpos.numpy()).all(axis=1)).sum())
+    print(
+        f"peer  MuJoCo Warp N={links} worlds={worlds}: {worlds * steps / seconds:.3e} whisker-steps/s "
+        f"({seconds:.3f} s, {bad} failed)",
+        flush=True,
+    )
+
+
 def sweep(
     device_name: str, recipe: str, words: list[str], fidelity: Fidelity, sweeps: int, sliced: bool | None = None
 ) -> None:
@@ -140,7 +187,7 @@ def sweep(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--only", default="free,sweep")
+    parser.add_argument("--only", default="free,peer,sweep")
     parser.add_argument("--lanes", type=int, default=262_144)
     parser.add_argument("--blocks", default=f"{BLOCK}:0", help="block size : most blocks (0 = all), several by commas")
     parser.add_argument("--bounds", default="0", help="CUDA launch bounds such as 64x6, several by commas; 0 = none")
@@ -160,6 +207,9 @@ def main() -> None:
                 for words in args.bounds.split(","):
                     bounds = None if words == "0" else tuple(map(int, words.split("x")))
                     free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, most, bounds)
+    if "peer" in chosen:
+        for links in (10, 20):
+            peer(args.device, 16 if small else 32_768, links, 20)
     if "sweep" in chosen:
         for step in map(float, args.steps.split(",")):
             fidelity = Fidelity(links=args.links, time_step=step)
