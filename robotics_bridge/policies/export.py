@@ -14,6 +14,7 @@ import torch
 
 from brainbench.errors import DataError, missing_dependency, unknown_name
 from brainbench.files import atomic_path, provenance, write_json
+from brainbench.models.extract import evaluating
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -188,23 +189,21 @@ def compare(policy: TactilePolicy, run: Runner, *, steps: int = STEPS, seed: int
 
     It is relative to the largest action; infinite where the file gives no numbers or fails.
     """
-    from robotics_bridge.policies.exported import StepPolicy
-
-    own = StepPolicy(policy)
     generator = torch.Generator().manual_seed(seed)
-    h = torch.zeros(1, own.state_size)
+    h = policy.zeros(1)
     worst, largest = 0.0, 1e-12
     for step in range(steps):
         forget = step in (0, steps // 3, steps // 3 + 1, 2 * steps // 3)
         # Unit noise on flat groups; touch as large as the hand's.
         obs = {
             name: torch.randn(1, *shape, generator=generator) * (0.2 if len(shape) > 1 else 1.0)
-            for name, shape in own.shapes.items()
+            for name, shape in policy.shapes.items()
         }
         if forget:
             h = torch.zeros_like(h)
-        with torch.no_grad():
-            expected, h = own(*obs.values(), h)
+        with torch.no_grad(), evaluating(policy):
+            latent, h = policy.advance({name: value.to(h.device) for name, value in obs.items()}, h)
+            expected = policy.action_of(latent).cpu()
         found = run({name: value[0].numpy() for name, value in obs.items()}, forget)
         if found.shape != tuple(expected.shape[1:]):
             return math.inf

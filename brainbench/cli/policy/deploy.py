@@ -118,7 +118,8 @@ class _Tape:
         del obs, action
         # The maker's pressure is about outward normals with axes z, y, x; a force on the skin points inward.
         force = -reading.pressure[self.rows][:, ::-1]
-        points = np.concatenate([force, np.cross(self.points.position, force)], axis=1)
+        torque = np.cross(self.points.position, force).astype(float)
+        points = np.concatenate([force, torque], axis=1)
         wrench = total_wrench(points, self.points.links, self.points.link, self.rays)
         self.episode.add(reading.position, reading.velocity, targets, points, wrench)
 

@@ -33,6 +33,7 @@ def _losses(folder) -> list[dict[str, float]]:
     return [line for line in lines if line["kind"] == "loss"]
 
 
+@pytest.mark.slow
 def test_a_student_that_feels_learns_what_one_without_touch_cannot(tmp_path) -> None:
     settings = {"iterations": 40, "learning_rate": 5e-3, "epochs": 4, "save_interval": 40, "steps_per_env": 16}
     felt = _run(tmp_path / "felt", **settings)

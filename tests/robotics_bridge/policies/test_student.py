@@ -113,10 +113,13 @@ def test_kept_features_of_a_frozen_network_give_the_same_latent() -> None:
         torch.testing.assert_close(latent, kept)
 
 
-SLOWER = [pytest.param(name, marks=pytest.mark.slow) for name in ("tactile_convrnn", "tactile_canvas_cnn", "s4-small")]
+SLOWER = [
+    pytest.param(name, marks=pytest.mark.slow)
+    for name in (NETWORK, "tactile_convrnn", "tactile_canvas_cnn", "s4-small")
+]
 
 
-@pytest.mark.parametrize("name", ["mlp", NETWORK, *SLOWER])
+@pytest.mark.parametrize("name", ["mlp", *SLOWER])
 def test_onnx_file_follows_the_policy_for_sixty_steps_with_resets(name, tmp_path) -> None:
     policy = _make_policy(name, tactile={"time": "resampled"} if name == NETWORK else {})
     found = export_policy(policy, tmp_path / "policy", deployment={"rate": 40})
@@ -154,7 +157,7 @@ class _HeadOnly(torch.nn.Module):
         from robotics_bridge.policies.exported import StepPolicy
 
         full = StepPolicy(policy)
-        self.mlp, self.latent = full.policy.mlp, policy.core.features
+        self.mlp, self.latent = full.mlp, policy.core.features
         self.shapes = {name: shape for name, shape in full.shapes.items() if name != "tactile"}
         self.input_names, self.output_names = [*self.shapes, "h_in"], ["actions", "h_out"]
 
