@@ -366,6 +366,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "hand": config.hand,
             "observe": config.observe,
             "placement": config.placement,
+            "resolution": config.resolution,
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
             "joints": list(env.joint_names),

@@ -27,6 +27,9 @@ def deploy(
     goal: Annotated[list[float] | None, typer.Option(help="Numbers of the group 'goal', once for each.")] = None,
     timeout: Annotated[float, typer.Option(help="Oldest report to act upon (s).")] = 0.1,
     pressure: Annotated[float, typer.Option(help="Largest force of a finger tip, in the maker's unit.")] = 30.0,
+    shadow: Annotated[
+        bool, typer.Option("--shadow", help="Simulate touch beside the hand, for what it does not measure.")
+    ] = False,
     threads: Annotated[int, typer.Option(help="Of the network's computations.")] = 1,
     record: Annotated[Path | None, typer.Option(help="Folder to write the session to, as a LeRobot data set.")] = None,
     as_json: JsonOption = False,
@@ -54,9 +57,11 @@ def deploy(
             address, joints, fingers = _remote(driver, deployed)
         link = stack.enter_context(UdpDriver(address, joints, fingers))
         tape = _Tape(deployed) if record is not None else None
+        fallback = _shadow(deployed, joints) if shadow else None
         controller = deployed.controller(
-            link, limits={"timeout": timeout, "pressure": pressure}, sources=sources, threads=threads, record=tape
-        )
+            link, limits={"timeout": timeout, "pressure": pressure}, sources=sources, fallback=fallback,
+            threads=threads, record=tape,
+        )  # fmt: skip
         report = controller.run(seconds)
     facts: dict[str, Any] = {**vars(report)}
     if record is not None and tape is not None and tape.episode.state:
@@ -85,6 +90,14 @@ def _remote(text: str, deployed: DeployedPolicy) -> tuple[tuple[str, int], tuple
         raise UsageError(f"A driver is 'sim' or HOST:PORT; received {text!r}.")
     hand = hands.load(deployed.hand)
     return (host, int(port)), hand.joints, tuple(hand.fingers)
+
+
+def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
+    from robotics_bridge.policies.deploy.shadow import ShadowTouch
+
+    facts = deployed.deployment
+    names = (str(facts[key]) for key in ("observe", "placement", "resolution"))
+    return ShadowTouch(deployed.hand, *names, joints=joints, rate=deployed.rate, sub_steps=int(facts["sub_steps"]))
 
 
 class _Tape:

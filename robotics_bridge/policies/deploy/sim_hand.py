@@ -90,9 +90,20 @@ class SimulatedHand:
     Args:
         hand: Name of the hand.
         rate: Reports per second; also the rate of the physics.
+        observe: Observation type that its skin gives; reports need ``agg_force`` on the tips.
+        placement: Of its taxels.
+        resolution: Of its taxels.
     """
 
-    def __init__(self, hand: str = "xhand1", rate: float = 200.0) -> None:
+    def __init__(
+        self,
+        hand: str = "xhand1",
+        rate: float = 200.0,
+        *,
+        observe: str = "agg_force",
+        placement: str = "tips",
+        resolution: str = "med",
+    ) -> None:
         from robotics_bridge import hands
         from robotics_bridge.hands.observations import sensors_for
         from robotics_bridge.hands.scenes import OBJECT, holding
@@ -101,8 +112,8 @@ class SimulatedHand:
 
         self.hand, self.rate = hands.load(hand), rate
         self.engine = MujocoEngine(holding(self.hand, timestep=1 / rate), 1, threads=1)
-        self.layout = self.hand.layout("med", "tips")
-        sensors = sensors_for("agg_force", self.layout, track=(OBJECT,))
+        self.observe, self.layout = observe, self.hand.layout(resolution, placement)
+        sensors = sensors_for(observe, self.layout, track=(OBJECT,))
         self.suite = SensorSuite(self.engine.scene, sensors, num_envs=1)
         self.suite.update(self.engine.state, 1 / rate)
         self.calibration = PressureCalibration()
@@ -113,10 +124,10 @@ class SimulatedHand:
         self._speeds = [int(model.joint(name).dofadr[0]) for name in self.joints]
         self._drives = [model.actuator(name).id for name in self.joints]
         tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
-        self._rows = [self.fingers.index(tips[link]) for link in self.layout]
+        self._rows = [self.fingers.index(tips[link]) for link in self.layout if link in tips]
         # The first step and reading load what later ones use; real time begins after them.
         self.step()
-        self.report()
+        self.touch()
         self.engine.reset()
 
     def hold(self) -> None:
@@ -138,13 +149,17 @@ class SimulatedHand:
         self.engine.step()
         self.suite.update(self.engine.state, 1 / self.rate)
 
+    def touch(self) -> NDArray[np.float32]:
+        """Return what the skin gives [N, C]: items of the observation type, in the layout's order."""
+        from robotics_bridge.hands.observations import observation_type, observe
+
+        values = observe(self.observe, {link: self.suite.read(link) for link in self.layout}, self.layout)
+        return values.view(-1, observation_type(self.observe).channels).numpy()
+
     def report(self) -> NDArray[np.float64]:
         """Return positions, velocities and pressures [2J + 3F]."""
-        from robotics_bridge.hands.observations import observe
-
-        force = observe("agg_force", {link: self.suite.read(link) for link in self.layout}, self.layout)
         pressure = np.zeros((len(self.fingers), 3))
-        pressure[self._rows] = force.view(-1, 3).numpy()
+        pressure[self._rows] = self.touch()
         raw = self.calibration.pressure(self.fingers, pressure)
         return np.concatenate([self.position, self.engine.data[0].qvel[self._speeds], raw.ravel()])
 
