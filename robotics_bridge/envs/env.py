@@ -405,6 +405,9 @@ class Env:
         for substep in range(self.decimation):
             self.drives.launch(substep)
             self.world.step()
+            if substep == 0 and self.task.push is not None:
+                self.world.push[:, self._bodies, :3] = 0.0
+                self.world.apply_push()
             if self.touch is not None:
                 self.touch.update(self.world.state, self.physics_dt, substep)
             if self.watch is not None:
@@ -492,6 +495,8 @@ class Env:
         import torch
 
         parts = [r.weight * r.term(moment, **r.params) * self.step_dt for r in self.task.rewards.values()]
+        if not parts:
+            return torch.zeros(self.num_envs, device=self.device), self._sums
         table = torch.stack(parts, dim=1).masked_fill(diverged.unsqueeze(1), 0.0)
         return table.sum(dim=1), table
 

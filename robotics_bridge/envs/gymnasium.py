@@ -57,7 +57,7 @@ class GymVectorEnv(VectorEnv):
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self._groups = groups or tuple(env.observation_shapes)
         infinite = float("inf")
-        spaces = {
+        spaces: dict[str, gymnasium.Space[Any]] = {
             name: gymnasium.spaces.Box(-infinite, infinite, env.observation_shapes[name], np.float32)
             for name in self._groups
         }

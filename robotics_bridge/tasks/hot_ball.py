@@ -34,6 +34,8 @@ CELLS = tuple(
     for heat in (500.0, 5000.0)
 )
 """Conductivity, emissivity and heat generation of the sixteen cells of figure 4.8."""
+_SPANS = {"x": (-0.22, 0.22), "y": (-0.22, 0.22), "z": (-0.2, 0.05)}
+"""How far the hand can be carried from above the middle of the bin [m]."""
 _SITES = tuple((0.13 * (i - 1), 0.13 * (j - 1), -0.13 * (i - 1) * math.sin(TILT)) for i in range(3) for j in range(3))
 
 
@@ -75,7 +77,8 @@ def published() -> Task:
 
 def with_thermal(thermal: Thermal) -> Task:
     """Return the task for fingers and balls of other materials."""
-    down = ((-0.02, 0.0, 0.42), (0.0, 1.0, 0.0, 0.0))
+    # The palm faces uphill, so that the thumb stays within the bin.
+    down = ((0.0, 0.0, 0.42), (0.0, 0.0, 1.0, 0.0))
     return Task(
         name="hot_ball",
         text="find the hot ball among eight by touch and stay in contact",
@@ -83,9 +86,8 @@ def with_thermal(thermal: Thermal) -> Task:
         copies=BALLS,
         placement=Placement(height=0.01, x=(-0.015, 0.015), y=(-0.015, 0.015), sites=_SITES),
         hand_poses={"xhand1": down, "sharpa": down},
-        carriage={
-            "x": ((-0.2, 0.2), 2000.0, 120.0), "y": ((-0.2, 0.2), 2000.0, 120.0), "z": ((-0.2, 0.05), 2000.0, 120.0),
-        },
+        joints={"xhand1": {"right_hand_thumb_bend_joint": 1.5}},
+        carriage={axis: (span, 2000.0, 120.0, 100.0) for axis, span in _SPANS.items()},
         furniture=bin_walls,
         watch=thermometers(thermal),
         rewards={

@@ -103,8 +103,6 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     option, solver = spec.option, task.solver
     option.timestep, option.iterations, option.ls_iterations = solver.timestep, solver.iterations, solver.line_search
     option.tolerance, option.integrator = solver.tolerance, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # An environment that diverges shows it; MuJoCo would put it back silently.
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = task.hand_poses[hand.name] if hand.name in task.hand_poses else palm_up(hand)
     drives = _drives(hand)
@@ -114,7 +112,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
         if joint.name in drives:
             joint.armature = joint.armature or _ARMATURE
     slides = {}
-    for axis, ((low, high), stiffness, damping) in task.carriage.items():
+    for axis, ((low, high), stiffness, damping, effort) in task.carriage.items():
         direction = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[axis]
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, np.array(palm.quat, dtype=float))
@@ -123,7 +121,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
             name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=matrix.reshape(3, 3).T @ direction, range=(low, high),
             limited=True, armature=1.0,
         )  # fmt: skip
-        slides[name] = (stiffness, damping, 10 * stiffness)
+        slides[name] = (stiffness, damping, effort)
     if slides:
         # A robot arm bears the weight of the hand.
         for body in spec.bodies:

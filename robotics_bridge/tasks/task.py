@@ -80,7 +80,7 @@ class ObjectRandomisation:
 
 @dataclass(frozen=True, kw_only=True)
 class Push:
-    """A random force on the object, for one control step each time (thesis, table 4.9)."""
+    """A random force on the object, for one physics step each time (thesis, table 4.9)."""
 
     x: Range = (0.0, 0.0)
     y: Range = (0.0, 0.0)
@@ -173,8 +173,8 @@ class Task:
     """Beginnings of the names of fingers that the policy moves; empty: all. The others are held."""
     furniture: Callable[[Any], None] | None = None
     """Adds fixed things to the ``mujoco.MjSpec`` of the scene."""
-    carriage: Mapping[str, tuple[Range, float, float]] = field(default_factory=dict)
-    """Slides that carry the palm: world axis (x, y, z) → range [m], stiffness [N/m], damping [N·s/m]."""
+    carriage: Mapping[str, tuple[Range, float, float, float]] = field(default_factory=dict)
+    """Slides that carry the palm: world axis (x, y, z) → range [m], stiffness [N/m], damping [N·s/m], effort [N]."""
     starts: str | None = None
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()

@@ -143,6 +143,9 @@ class Thermometers:
             self._env.target.copy_(torch.where(mask, drawn, self._env.target))
         self._apply(mask)
         self.suite.reset(mask)
+        for link in self._links:
+            # Until their next update, readings are those of the episode before.
+            self.suite.read(link).masked_fill_(mask.view(-1, 1, 1, 1), self.thermal.ambient)
         self.latched &= ~mask
         self.touching &= ~mask
         self.latch_time.masked_fill_(mask, float("inf"))

@@ -59,12 +59,44 @@ def read_task_file(path: Path) -> None:
 
 
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
-    """Return the agent ``zero`` or ``random``, or the policy of a training run's folder."""
+    """Return the agent ``zero`` or ``random``, or the teacher or student of a run's folder."""
     from brainbench.errors import unknown_name
+    from brainbench.files import read_json
     from robotics_bridge.policies import evaluate, teacher
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
     if not Path(name).exists():
         raise unknown_name("agent", name, evaluate.AGENTS, hint="Or give the folder of a training run.")
+    config = Path(name) / "config.json"
+    if config.is_file() and read_json(config).get("brainbench_student"):
+        from robotics_bridge.policies.distill import StudentPolicy, load_student
+
+        student, _ = load_student(name, device=str(env.device))
+        return StudentPolicy(student)
     return teacher.load_teacher(name, env)
+
+
+def touch_of(names: list[str]) -> dict[str, Any]:
+    """Return the tactile options of the student among some agents; nothing if there is none.
+
+    Raises:
+        UsageError: students with different senses are asked for at once.
+    """
+    from brainbench.errors import UsageError
+    from brainbench.files import read_json
+
+    found: dict[str, dict[str, Any]] = {}
+    for name in names:
+        config = Path(name) / "config.json"
+        if config.is_file():
+            facts = read_json(config)
+            if facts.get("brainbench_student"):
+                kept = facts.get("distill", facts)
+                found[name] = {key: kept[key] for key in _TOUCH if key in kept}
+    if any(senses != next(iter(found.values())) for senses in found.values()):
+        raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")
+    return next(iter(found.values()), {})
+
+
+_TOUCH = ("observe", "placement", "resolution", "noisy")

@@ -17,13 +17,15 @@ from brainbench.cli.policy._options import (
     TaskFileOption,
     agent_of,
     make_env,
+    touch_of,
 )
 
 
 def evaluate(
     task: TaskArgument,
     agents: Annotated[
-        list[str] | None, typer.Argument(help="zero, random, or folders of training runs; zero and random always run.")
+        list[str] | None,
+        typer.Argument(help="zero, random, or folders of teachers or students; zero and random always run."),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Per agent and seed.")] = 100,
     seeds: Annotated[int, typer.Option(help="Evaluation seeds.")] = 3,
@@ -42,8 +44,9 @@ def evaluate(
 
     if seeds < 1:
         raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
-    env = make_env(task, task_file=task_file, num_envs=envs, hand=hand, config=config, device=device)
-    names = list(dict.fromkeys(["zero", "random", *(agents or [])]))
+    touch = touch_of(list(agents or []))
+    env = make_env(task, task_file=task_file, num_envs=envs, hand=hand, config=config, device=device, **touch)
+    names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
     found: list[dict[str, Any]] = []
     with progress_bar() as progress:
         for name in names:

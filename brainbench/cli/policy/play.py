@@ -21,12 +21,13 @@ from brainbench.cli.policy._options import (
     TaskFileOption,
     agent_of,
     make_env,
+    touch_of,
 )
 
 
 def play(
     task: TaskArgument,
-    agent: Annotated[str, typer.Option(help="zero, random, or the folder of a training run.")] = "random",
+    agent: Annotated[str, typer.Option(help="zero, random, or the folder of a teacher or student.")] = "random",
     video: Annotated[Path | None, typer.Option(help="Write a film here (.mp4 or .gif).")] = None,
     strip: Annotated[Path | None, typer.Option(help="Write six frames side by side here (.png).")] = None,
     seconds: Annotated[float, typer.Option(help="Simulated time.")] = 4.0,
@@ -53,10 +54,10 @@ def play(
             f"A film has a positive length and rate, and 64 pixels or more across; received {seconds} s, "
             f"{rate} frames/s and {width} pixels."
         )
+    touch = {"observe": observe, "placement": placement, "resolution": resolution, "noisy": noisy} | touch_of([agent])
     env = make_env(
-        task, task_file=task_file, num_envs=1, hand=hand, config=config, observe=observe, placement=placement,
-        resolution=resolution, noisy=noisy, device=device, seed=seed, threads=1,
-    )  # fmt: skip
+        task, task_file=task_file, num_envs=1, hand=hand, config=config, device=device, seed=seed, threads=1, **touch
+    )
     act = agent_of(agent, env, seed=seed)
     steps = max(round(seconds / env.step_dt), 1)
     pictures = [path for path in (video, strip) if path is not None]

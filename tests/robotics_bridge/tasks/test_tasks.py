@@ -1,0 +1,162 @@
+"""Tasks as data: registry, goals, objects, scenes, grasps, thermometers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench.errors import UsageError
+from robotics_bridge import hands, tasks
+from robotics_bridge.tasks import terms
+from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
+from robotics_bridge.tasks.objects import box, screwdriver, slots, with_sizes
+from robotics_bridge.tasks.rotations import about, angle_of, conjugate, multiply
+from robotics_bridge.tasks.scenes import build, palm_up
+
+MY_TASK = """
+from dataclasses import replace
+from robotics_bridge import tasks
+from robotics_bridge.tasks import terms
+
+@tasks.register("keep_still")
+def keep_still() -> tasks.Task:
+    rotate = tasks.load("in_palm_rotate")
+    rewards = {"stay": tasks.Reward(-10.0, terms.far_from, {"target": None, "margin": 0.0})}
+    return replace(rotate, name="keep_still", text="hold a block still", rewards=rewards, goal=None, goal_terms=(),
+                   endings={}, auxiliary=(), decoders=(),
+                   groups={"actor": ("priv_proprio", "priv_obj_state"), "student": ("proprio",)})
+"""
+
+
+def test_a_task_of_ones_own_is_one_file(tmp_path: Path) -> None:
+    from brainbench.cli.policy._options import read_task_file
+
+    file = tmp_path / "keep_still.py"
+    file.write_text(MY_TASK)
+    read_task_file(file)
+    try:
+        assert "keep_still" in tasks.list_tasks()
+        env = tasks.make("keep_still", num_envs=2, threads=1)
+        observations, reward, *_ = env.step(torch.zeros(2, env.num_actions))
+        assert set(observations) == {"proprio", "priv_proprio", "priv_obj_state"}
+        assert (reward <= 0).all()
+        with pytest.raises(UsageError, match="already"):
+            read_task_file(file)
+    finally:
+        tasks.forget("keep_still")
+    assert "keep_still" not in tasks.list_tasks()
+
+
+def test_unknown_names_are_met_with_the_nearest() -> None:
+    with pytest.raises(UsageError, match="did you mean 'screwdriver'"):
+        tasks.load("screwdrivr")
+    with pytest.raises(UsageError, match="did you mean 'published'"):
+        tasks.load("screwdriver", "publish")
+    with pytest.raises(UsageError, match="observation group"):
+        replace(tasks.load("screwdriver"), groups={"actor": ("priv_obj_stat",)})
+    with pytest.raises(UsageError, match="positive length"):
+        replace(tasks.load("screwdriver"), episode=0.0)
+    with pytest.raises(UsageError, match="range"):
+        replace(tasks.load("screwdriver"), object_changes=tasks.ObjectRandomisation(friction=(2.0, 1.0)))
+
+
+def test_stepping_goals_lie_one_step_further_about_the_axis() -> None:
+    goal = SteppingRotation(axis=(0.0, 0.0, 1.0), step=0.5)
+    start = about(torch.tensor([1.0, 0.0, 0.0]).expand(3, 3), torch.tensor([0.0, 0.3, -0.7]))
+    first = goal.first(start, torch.zeros(3, 2))
+    second = goal.following(start, first, torch.zeros(3, 2))
+    for one, two, angle in ((start, first, 0.5), (start, second, 1.0)):
+        turn = multiply(two, conjugate(one))
+        assert torch.allclose(angle_of(turn), torch.full((3,), angle), atol=1e-6)
+        assert torch.allclose(turn[:, 1:3], torch.zeros(3, 2), atol=1e-6)
+
+
+def test_timed_goals_stay_within_their_tilt() -> None:
+    goal = TimedRotation(tilt=(-0.4, 0.4))
+    start = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(500, 4)
+    angle = angle_of(goal.first(start, torch.rand(500, 2)))
+    assert float(angle.max()) <= 0.4 * 2**0.5 + 1e-6
+    assert float(angle.mean()) > 0.1
+
+
+def test_shapes_share_their_slots_and_scale_in_all_lengths() -> None:
+    shapes = (box(0.04, 0.05, 0.06), screwdriver(0.2, 0.1, 0.02, 0.004))
+    assert slots(shapes) == ("box", "capsule", "cylinder")
+    sizes = with_sizes(shapes, (0.5, 2.0), steps=4)
+    assert len(sizes) == 8
+    assert sizes[0].extent == pytest.approx((0.02, 0.025, 0.03))
+    assert sizes[-1].solids[0].position == pytest.approx((0.0, 0.3, 0.0))
+    assert with_sizes(shapes, (1.0, 1.0)) == shapes
+    with pytest.raises(UsageError, match="positive range"):
+        with_sizes(shapes, (0.0, 1.0))
+    with pytest.raises(UsageError, match="shorter than the tool"):
+        screwdriver(0.1, 0.2, 0.02, 0.004)
+
+
+def test_blocks_weigh_what_their_density_says() -> None:
+    task = tasks.load("in_palm_rotate")
+    model = build(task, hands.load("xhand1"))
+    for each, shape in zip(model.models, model.shapes, strict=True):
+        body = each.body("object").id
+        volume = np.prod(shape.extent) * (np.pi / 4 if shape.name.startswith("cylinder") else 1)
+        assert each.body_mass[body] == pytest.approx(task.density * volume, rel=1e-6)
+
+
+@pytest.mark.parametrize(("hand", "published"), [("xhand1", (0.07, 0.0, 0.475)), ("sharpa", (0.07, -0.015, 0.48))])
+def test_palms_of_other_hands_are_turned_up_where_the_published_ones_are(hand: str, published: Any) -> None:
+    position, quaternion = palm_up(hands.load(hand))
+    assert position == pytest.approx(published, abs=0.015)
+    turn = multiply(torch.tensor([quaternion]), torch.tensor([[0.70710678, 0.0, 0.70710678, 0.0]]))
+    assert float(angle_of(turn)) < 0.2
+
+
+def test_only_links_that_can_meet_collide() -> None:
+    model = build(tasks.load("in_hand_repose"), hands.load("xhand1")).models[0]
+    left_out = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in model.exclude_signature}
+    thumb, index = (model.body(f"right_hand_{name}").id for name in ("thumb_rota_link2", "index_rota_link2"))
+    assert tuple(sorted((thumb, index))) not in left_out
+    palm, base = model.body("right_hand_link").id, model.body("right_hand_mid_link1").id
+    assert tuple(sorted((palm, base))) in left_out
+
+
+def test_a_finger_that_the_hand_lacks_is_named() -> None:
+    task = replace(tasks.load("in_palm_rotate"), moves=("tentacle",))
+    with pytest.raises(UsageError, match="fingers of hand 'xhand1' are"):
+        build(task, hands.load("xhand1"))
+    with pytest.raises(UsageError, match="does not have"):
+        build(replace(tasks.load("in_palm_rotate"), joints={"xhand1": {"elbow": 1.0}}), hands.load("xhand1"))
+
+
+def test_sampled_grasps_hold_without_any_action() -> None:
+    task = replace(tasks.load("screwdriver"), push=None, object_changes=tasks.ObjectRandomisation())
+    env = tasks.make(task, num_envs=8, threads=1)
+    start = env.object_pose[:, 0, :3].clone()
+    # In published terms: three finger tips nearer than 2 cm, and the tool does not move by a centimetre.
+    assert ((env.surface_distance < 0.02).sum(dim=1) >= 3).all()
+    for _ in range(20):
+        env.step(torch.zeros(8, env.num_actions))
+    moved = (env.object_pose[:, 0, :3] - start).norm(dim=1)
+    assert float(moved.quantile(0.8)) < 0.01
+    assert float(terms.alignment(env._moment(), (0.0, 1.0, 0.0)).median()) > 0.98
+
+
+def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
+    from robotics_bridge.tasks.thermometers import Thermal, progress
+
+    thermal = Thermal()
+    reading = torch.tensor([10.0, 22.0, 33.5, 42.3, 60.0])
+    assert progress(reading, thermal).tolist() == pytest.approx([0.0, 0.0, 0.5, 0.8826, 1.0], abs=1e-4)
+    env = tasks.make("hot_ball", num_envs=2, threads=1)
+    watch: Any = env.watch
+    assert (watch.temperature() == 22.0).all()
+    assert env.observations["thermal"].abs().max() < 1e-5
+    env.step(torch.zeros(2, env.num_actions))
+    assert not watch.latched.any()
+    assert env.metric.tolist() == [0.0, 0.0]
+    with pytest.raises(UsageError, match="hotter than the room"):
+        Thermal(hot=10.0)
