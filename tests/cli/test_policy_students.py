@@ -77,7 +77,7 @@ def test_deploy_runs_on_the_simulated_hand_and_stops_it_when_readings_are_absurd
     assert found["ticks"] > 40
     info = json.loads((tmp_path / "ep" / "meta" / "info.json").read_text())
     assert info["total_frames"] == found["ticks"]
-    stopped = json.loads(_run("deploy", path, "--seconds", 2, "--fault", "absurd=0.05", "--json", code=1))
+    stopped = json.loads(_run("deploy", path, "--seconds", 2, "--fault", "absurd=0.5", "--json", code=1))
     assert "beyond its limits" in stopped["reason"]
 
 

@@ -16,7 +16,7 @@ from brainbench.errors import UsageError
 from robotics_bridge.policies.deploy.controller import Actuation, Controller
 from robotics_bridge.policies.deploy.messages import STATE, decode, encode
 from robotics_bridge.policies.deploy.safety import SafetyLimits
-from robotics_bridge.policies.deploy.sim_hand import HOLD_AFTER, Faults, SimulatedHand, serve, simulated_hand
+from robotics_bridge.policies.deploy.sim_hand import Faults, SimulatedHand, serve, simulated_hand
 from robotics_bridge.policies.deploy.udp import UdpDriver
 
 JOINTS, FINGERS = ("a", "b"), ("thumb",)
@@ -52,9 +52,19 @@ def _hand(faults: Faults | None = None, seconds: float = 3.0):
         link.bind(("127.0.0.1", 0))
         thread = threading.Thread(target=serve, args=(hand, link, faults or Faults(), seconds))
         thread.start()
-        with UdpDriver(link.getsockname(), JOINTS, FINGERS) as driver:
-            yield hand, driver
-        thread.join()
+        try:
+            with UdpDriver(link.getsockname(), JOINTS, FINGERS) as driver:
+                yield hand, driver
+        finally:
+            thread.join()
+
+
+def _until(condition, seconds: float = 1.2) -> None:
+    """Wait for what a busy machine may take its time for."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "did not happen in time"
+        time.sleep(0.01)
 
 
 def _control(driver, seconds=0.6, **limits):
@@ -83,8 +93,11 @@ def test_losses_delays_and_overtaking_are_survived(faults) -> None:
         np.testing.assert_allclose(hand.position, 0.4, atol=1e-3)
         counters = driver.counters
         assert counters.received > 20
-        assert (counters.lost > 5) is (faults.drop > 0 or faults.damage > 0)
-        assert (counters.damaged > 5) is (faults.damage > 0)
+        if faults.drop or faults.damage:
+            assert counters.lost > 5
+        elif not faults.jitter:  # with it, some are still under way
+            assert counters.lost == 0
+        assert (counters.damaged > 2) is (faults.damage > 0)
         if faults.jitter:
             assert counters.late > 3
     assert hand.held >= 2  # at the start and at the stop
@@ -93,8 +106,8 @@ def test_losses_delays_and_overtaking_are_survived(faults) -> None:
 @pytest.mark.parametrize(
     ("faults", "message"),
     [
-        (Faults(absurd=0.05), "beyond its limits"),
-        (Faults(nan=0.05), "no numbers"),
+        (Faults(absurd=0.5), "beyond its limits"),
+        (Faults(nan=0.5), "no numbers"),
         (Faults(silent_after=0.3), "ms old"),
         (Faults(frozen_after=0.3), "ms old"),
         (Faults(delay=0.4, delay_after=0.3), "ms old"),
@@ -118,7 +131,7 @@ def test_the_hand_holds_by_itself_when_the_controller_dies() -> None:
             time.sleep(0.005)
         before = hand.held
         driver.send(np.full(2, 0.9))
-        time.sleep(HOLD_AFTER + 0.2)
+        _until(lambda: hand.held > before)
         assert hand.held == before + 1
 
 
@@ -130,8 +143,7 @@ def test_a_new_session_moves_a_hand_that_was_stopped() -> None:
             while second.read() is None:
                 time.sleep(0.005)
             second.send(np.full(2, 0.5))
-            time.sleep(0.1)
-            np.testing.assert_allclose(hand.position, 0.5, atol=1e-2)
+            _until(lambda: bool(np.abs(hand.position - 0.5).max() < 1e-2))
 
 
 @given(st.binary(max_size=200))
