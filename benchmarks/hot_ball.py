@@ -24,7 +24,7 @@ from robotics_bridge.tasks.thermometers import Thermal, Thermometers
 PUBLISHED = {(150.0, 0.5, 500.0), (150.0, 0.5, 5000.0)}
 """Cells with a check mark in figure 4.8."""
 NAMES = {1.0: "glass", 10.0: "steel", 100.0: "aluminium alloy", 150.0: "aluminium"}
-IMAGE = Path(__file__).parents[1] / "docs" / "images" / "policy-hot-ball.png"
+IMAGE = Path(__file__).parents[1] / "docs" / "images" / "policy-heat.png"
 
 
 class TouchAndHold:

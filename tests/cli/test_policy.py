@@ -1,0 +1,80 @@
+"""``brainbench policy`` tasks, play, train and evaluate, as a user calls them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from brainbench.cli import app
+from brainbench.errors import DataError, UsageError
+
+SMALL = """
+from dataclasses import replace
+from robotics_bridge import tasks
+
+@tasks.register("quick")
+def quick() -> tasks.Task:
+    task = tasks.load("in_palm_rotate")
+    return replace(task, name="quick", episode=0.1,
+                   teacher=replace(task.teacher, hidden=(8,), epochs=1, minibatches=1, steps_per_env=4))
+"""
+
+
+@pytest.fixture
+def quick(tmp_path: Path) -> Path:
+    from robotics_bridge import tasks
+
+    file = tmp_path / "quick.py"
+    file.write_text(SMALL)
+    if "quick" in tasks.list_tasks():
+        tasks.forget("quick")
+    return file
+
+
+def _run(*arguments: str) -> str:
+    result = CliRunner().invoke(app, ["policy", *arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_tasks_are_listed() -> None:
+    found = json.loads(_run("tasks", "--json"))
+    assert {"in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball"} <= {row["task"] for row in found}
+
+
+def test_a_played_task_leaves_a_strip_of_frames(tmp_path: Path) -> None:
+    strip = tmp_path / "strip.png"
+    out = _run("play", "in_palm_rotate", "--seconds", "0.1", "--strip", str(strip), "--width", "96", "--json")
+    assert json.loads(out)["seconds"] == pytest.approx(0.1)
+    assert strip.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path) -> None:
+    run = tmp_path / "run"
+    out = _run(
+        "train", "quick", "--task-file", str(quick), "--envs", "2", "--iterations", "1", "--out", str(run), "--json"
+    )
+    assert json.loads(out)["control_steps"] == 8
+    from robotics_bridge import tasks
+
+    tasks.forget("quick")
+    arguments = ["quick", str(run), "--task-file", str(quick), "--envs", "2", "--episodes", "2", "--seeds", "1"]
+    found = json.loads(_run("evaluate", *arguments, "--json"))
+    assert [row["agent"] for row in found] == ["zero", "random", str(run)]
+    assert all(row["episodes"] == 2 for row in found)
+
+
+def test_wrong_requests_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="did you mean 'random'"):
+        _run("play", "in_palm_rotate", "--agent", "randm", "--seconds", "0.1")
+    with pytest.raises(UsageError, match="positive length"):
+        _run("play", "in_palm_rotate", "--seconds", "0")
+    with pytest.raises(DataError, match="no task file"):
+        _run("play", "in_palm_rotate", "--task-file", str(tmp_path / "none.py"))
+    broken = tmp_path / "broken.py"
+    broken.write_text("1 / 0")
+    with pytest.raises(DataError, match="ZeroDivisionError"):
+        _run("play", "in_palm_rotate", "--task-file", str(broken))
