@@ -32,6 +32,8 @@ OPTIONAL = {
     "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),
     "warp-lang": ("rod", "the rod backend and all tactile sensors of robot hands, on CPU and GPU"),
     "mujoco-warp": ("gpu", "simulation of robot hands on CUDA"),
+    "rsl-rl-lib": ("policies", "training of teachers and students (brainbench policy train | distill)"),
+    "gymnasium": ("policies", "the dexterous tasks as gymnasium environments"),
     "scikit-fem": ("tactile", "modes of struck bodies: contact sound from their shape and material"),
     "distributed": ("cluster", "data sets made by a Dask cluster (brainbench stimuli sweep --scheduler)"),
     "scikit-learn": ("learn", "support vector machines (brainbench stimuli separability)"),
