@@ -253,6 +253,8 @@ def lay_out(rows: list[Row], options: argparse.Namespace) -> None:
         kept = [row for row in rows if row["device"] == device]
         for part, (heading, body) in tables(kept).items():
             flag = "cpu" if "cores" in device else "cuda"
+            if (part, flag) == ("check", "cpu"):
+                continue
             write_section(heading, f"python benchmarks/tactile.py --device {flag} --part {part}", body)
     if options.figure:
         plot_scaling([row for row in rows if row["part"] == "scaling"], options.figure)
