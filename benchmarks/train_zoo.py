@@ -426,7 +426,9 @@ def fill(out: Path, work: Path, paths: list[Path]) -> None:
         room[place] -= size
         inside[place].append(path)
     for index, chosen in enumerate(inside):
-        if chosen:
+        if not chosen:  # an older file would bring back what has ended since
+            (out / f"zoo-{index}.tar").unlink(missing_ok=True)
+        else:
             with atomic_path(out / f"zoo-{index}.tar") as temporary, tarfile.open(temporary, "w") as file:
                 for path in chosen:
                     file.add(path, str(path.relative_to(work)))

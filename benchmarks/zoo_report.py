@@ -94,7 +94,7 @@ def draw(curves: list[dict[str, Any]], path: Path) -> None:
     colors: dict[str, str] = {}
     for name, lines in sorted(series.items()):
         model, objective = name.rsplit(".", 2)[:2]
-        axis = axes[objective == "simclr"]
+        axis = axes[int(objective == "simclr")]
         color = colors.setdefault(model, f"C{len(colors)}")
         lines.sort(key=lambda line: line["epoch"])
         value = (lambda line: 100 * (1 - line["validation"])) if axis is axes[0] else (lambda line: line["validation"])
@@ -137,7 +137,7 @@ def main() -> None:
         for result in results
         if result.get("training_seconds")
     ]
-    text += "Several jobs shared a GPU, so rates add up:\n\n" + table(
+    text += "Several jobs shared a device, so rates add up:\n\n" + table(
         ["job", "precision", "epochs", "s", "sweeps/s"], speeds
     )
     print(text)
