@@ -72,6 +72,24 @@ def solver(
     most_held = contacts_for(capacity)
     most_seen = most_held + SPARE
     rows = 3 * most_held
+    # Memory of a thread. Vectors and matrices, because arrays in a kernel carry addresses that the compiler loses.
+    Links2: Any = wp.types.matrix((capacity, 2), real)
+    Links3: Any = wp.types.matrix((capacity, 3), real)
+    Nodes3: Any = wp.types.matrix((capacity + 1, 3), real)
+    Links: Any = wp.types.vector(capacity, real)
+    LinksWhole: Any = wp.types.vector(capacity, wp.int32)
+    SeenWhole: Any = wp.types.vector(most_seen, wp.int32)
+    Seen: Any = wp.types.vector(most_seen, real)
+    Seen3: Any = wp.types.matrix((most_seen, 3), real)
+    HeldWhole: Any = wp.types.vector(most_held, wp.int32)
+    Held: Any = wp.types.vector(most_held, real)
+    Held3: Any = wp.types.matrix((most_held, 3), real)
+    Rows3: Any = wp.types.matrix((rows, 3), real)
+    Rows2: Any = wp.types.matrix((rows, 2), real)
+    Rows: Any = wp.types.vector(rows, real)
+    Pairs: Any = wp.types.vector(2 * most_held, real)
+    Square: Any = wp.types.vector(most_held * most_held, real)
+    Table: Any = wp.types.vector(rows * rows, real)
 
     @wp.kernel(enable_backward=False, module="unique")
     def turn_over(on: Paused, looks: int):
@@ -150,53 +168,53 @@ def solver(
             may_rest = 1
 
         # State of the joints, and what one step keeps of each link between its passes.
-        q = wp.zeros(wp.static(capacity), dtype=vec2)
-        qd = wp.zeros(wp.static(capacity), dtype=vec2)
-        e2 = wp.zeros(wp.static(capacity), dtype=vec3)
-        node = wp.zeros(wp.static(capacity + 1), dtype=vec3)
-        k1w = wp.zeros(wp.static(capacity), dtype=vec3)
-        k1v = wp.zeros(wp.static(capacity), dtype=vec3)
-        k2w = wp.zeros(wp.static(capacity), dtype=vec3)
-        k2v = wp.zeros(wp.static(capacity), dtype=vec3)
-        push = wp.zeros(wp.static(capacity), dtype=vec2)
-        inverse = wp.zeros(wp.static(capacity), dtype=vec3)
-        clear = wp.zeros(wp.static(capacity), dtype=real)
-        close = wp.zeros(wp.static(capacity), dtype=wp.int32)
-        lift = wp.zeros(wp.static(capacity), dtype=vec2)
-        mend = wp.zeros(wp.static(capacity), dtype=vec2)
+        q = Links2()
+        qd = Links2()
+        e2 = Links3()
+        node = Nodes3()
+        k1w = Links3()
+        k1v = Links3()
+        k2w = Links3()
+        k2v = Links3()
+        push = Links2()
+        inverse = Links3()
+        clear = Links()
+        close = LinksWhole()
+        lift = Links2()
+        mend = Links2()
         # Where contact is possible within one step.
-        k_link = wp.zeros(wp.static(most_seen), dtype=wp.int32)
-        k_arc = wp.zeros(wp.static(most_seen), dtype=real)
-        k_ahead = wp.zeros(wp.static(most_seen), dtype=real)
-        k_gap = wp.zeros(wp.static(most_seen), dtype=real)
-        k_mu = wp.zeros(wp.static(most_seen), dtype=real)
-        k_at = wp.zeros(wp.static(most_seen), dtype=vec3)
-        k_move = wp.zeros(wp.static(most_seen), dtype=vec3)
-        k_normal = wp.zeros(wp.static(most_seen), dtype=vec3)
-        k_free = wp.zeros(wp.static(most_seen), dtype=vec3)
-        k_taken = wp.zeros(wp.static(most_seen), dtype=wp.int32)
+        k_link = SeenWhole()
+        k_arc = Seen()
+        k_ahead = Seen()
+        k_gap = Seen()
+        k_mu = Seen()
+        k_at = Seen3()
+        k_move = Seen3()
+        k_normal = Seen3()
+        k_free = Seen3()
+        k_taken = SeenWhole()
         # Contacts whose forces are solved for.
-        c_link = wp.zeros(wp.static(most_held), dtype=wp.int32)
-        c_arc = wp.zeros(wp.static(most_held), dtype=real)
-        c_gap = wp.zeros(wp.static(most_held), dtype=real)
-        c_mu = wp.zeros(wp.static(most_held), dtype=real)
-        c_at = wp.zeros(wp.static(most_held), dtype=vec3)
-        axis = wp.zeros(wp.static(rows), dtype=vec3)
-        fw = wp.zeros(wp.static(rows), dtype=vec3)
-        fv = wp.zeros(wp.static(rows), dtype=vec3)
-        ju = wp.zeros(wp.static(rows), dtype=vec2)
-        free = wp.zeros(wp.static(rows), dtype=real)
-        force = wp.zeros(wp.static(rows), dtype=real)
-        held_arc = wp.zeros(wp.static(most_held), dtype=real)
-        held_force = wp.zeros(wp.static(most_held), dtype=vec3)
+        c_link = HeldWhole()
+        c_arc = Held()
+        c_gap = Held()
+        c_mu = Held()
+        c_at = Held3()
+        axis = Rows3()
+        fw = Rows3()
+        fv = Rows3()
+        ju = Rows2()
+        free = Rows()
+        force = Rows()
+        held_arc = Held()
+        held_force = Held3()
         held_count = int(0)
-        stance = wp.zeros(wp.static(most_held), dtype=wp.int32)
-        ratio = wp.zeros(wp.static(2 * most_held), dtype=real)
-        asked = wp.zeros(wp.static(most_held), dtype=real)
-        load_n = wp.zeros(wp.static(most_held), dtype=real)
-        square = wp.zeros(wp.static(most_held * most_held), dtype=real)
-        work = wp.zeros(wp.static(most_held * most_held), dtype=real)
-        comply = wp.zeros(wp.static(rows * rows), dtype=real)
+        stance = HeldWhole()
+        ratio = Pairs()
+        asked = Held()
+        load_n = Held()
+        square = Square()
+        work = Square()
+        comply = Table()
 
         near = int(0)
         quickest = zero
@@ -741,7 +759,9 @@ def solver(
                                     for e in range(r + 1):
                                         if c_link[e // 3] >= i:
                                             other = ju[e]
-                                            comply[r * wp.static(rows) + e] += w1 * other[0] + w2 * other[1]
+                                            comply[r * wp.static(rows) + e] = (
+                                                comply[r * wp.static(rows) + e] + w1 * other[0] + w2 * other[1]
+                                            )
                                     fw[r] = fw[r] - g1w * u1 - g2w * u2
                                     fv[r] = fv[r] - g1v * u1 - g2v * u2
                         for r in range(rows_used):
@@ -888,14 +908,17 @@ def solver(
                                                         / work[p * wp.static(most_held) + p]
                                                     )
                                                     for e in range(p + 1, contacts):
-                                                        work[c * wp.static(most_held) + e] -= (
-                                                            part * work[p * wp.static(most_held) + e]
+                                                        work[c * wp.static(most_held) + e] = (
+                                                            work[c * wp.static(most_held) + e]
+                                                            - part * work[p * wp.static(most_held) + e]
                                                         )
-                                                    load_n[c] -= part * load_n[p]
+                                                    load_n[c] = load_n[c] - part * load_n[p]
                                             for back in range(contacts):
                                                 c = contacts - 1 - back
                                                 for e in range(c + 1, contacts):
-                                                    load_n[c] -= work[c * wp.static(most_held) + e] * load_n[e]
+                                                    load_n[c] = (
+                                                        load_n[c] - work[c * wp.static(most_held) + e] * load_n[e]
+                                                    )
                                                 load_n[c] = load_n[c] / work[c * wp.static(most_held) + c]
                                             worst_c = int(-1)
                                             lowest = zero
