@@ -343,8 +343,9 @@ class Env:
         self.target = zeros(dtype=torch.long)
         """[B] number of the object that counts."""
         shapes = self.model.shapes
-        self._extent = floats([shape.extent for shape in shapes])[torch.as_tensor(self.world.shape_of)]
-        self._bottom = floats([shape.bottom for shape in shapes])[torch.as_tensor(self.world.shape_of)]
+        self._shape_rows = torch.as_tensor(self.world.shape_of, device=self.device)
+        self._extent = floats([shape.extent for shape in shapes])[self._shape_rows]
+        self._bottom = floats([shape.bottom for shape in shapes])[self._shape_rows]
         self._nominal = {name: value.clone() for name, value in self.world.fields.items()}
         geoms = np.isin(np.asarray(first.geom_bodyid), bodies)
         self._object_geoms = torch.as_tensor(np.flatnonzero(geoms), device=self.device)
@@ -613,12 +614,6 @@ class Env:
             fields[name][:, where] = torch.where(chosen, value, fields[name][:, where])
         self.friction.copy_(torch.where(mask, ratio[:, 0], self.friction))
         self.mass.copy_(torch.where(mask, mass[:, 0], self.mass))
-
-    @property
-    def _shape_rows(self) -> torch.Tensor:
-        import torch
-
-        return torch.as_tensor(self.world.shape_of, device=self.device)
 
     def _observe(self) -> dict[str, torch.Tensor]:
         return observe(self)
