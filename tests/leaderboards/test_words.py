@@ -47,6 +47,8 @@ def test_a_trained_models_page_shows_accuracy_and_training(make_record, tmp_path
         assert shown in text
     assert "untrained twin net" in text
     assert "clip" not in text
+    rows = _words.training_rows(replace(record.card, training={**record.card.training, "objective": "simclr"}))
+    assert [label for label, _ in rows].count("objective") == 1
 
 
 def test_numbers_have_true_minus_signs_and_no_negative_zero():
