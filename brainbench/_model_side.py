@@ -148,17 +148,19 @@ def _trained(card: ModelCard, config: Mapping[str, Any]) -> ModelCard:
     from brainbench.types import Interval
 
     found = config.get("evaluation") or {}
-    interval = found.get("interval")
+    twin = config.get("twin_evaluation") or {}
     return replace(
         card,
         objective=config.get("objective"),
         augmentation=config.get("augmentation"),
         top1=found.get("top1"),
         top5=found.get("top5"),
-        accuracy_interval=Interval(**interval) if interval else None,
+        accuracy_interval=Interval(**found["interval"]) if found.get("interval") else None,
         accuracy_data=found.get("data"),
         collapsed=found.get("collapsed"),
         twin=config.get("twin"),
+        twin_top1=twin.get("top1"),
+        twin_interval=Interval(**twin["interval"]) if twin.get("interval") else None,
         seed=config.get("seed"),
         training=_training(config),
     )

@@ -259,6 +259,9 @@ class ModelCard:
     graph: ModelGraph | None = None
     citation: str | None = None
     """Papers that the architecture comes from."""
+    twin_top1: float | None = field(default=None, metadata={"later": True})
+    """Top-1 accuracy of the untrained twin, its decoder trained on the same data."""
+    twin_interval: Interval | None = field(default=None, metadata={"later": True})
 
 
 @dataclass(frozen=True)
@@ -454,7 +457,8 @@ def _card(data: Mapping[str, Any]) -> ModelCard:
     if graph is not None:
         nodes = tuple(_build(GraphNode, item) for item in graph.get("nodes", ()))
         graph = ModelGraph(nodes, tuple(_build(GraphEdge, item) for item in graph.get("edges", ())))
-    return _build(ModelCard, data, accuracy_interval=_optional(Interval, data.get("accuracy_interval")), graph=graph)
+    spans = {name: _optional(Interval, data.get(name)) for name in ("accuracy_interval", "twin_interval")}
+    return _build(ModelCard, data, **spans, graph=graph)
 
 
 def _optional(kind: type, data: Mapping[str, Any] | None) -> Any:

@@ -33,6 +33,8 @@ _CARD_LABELS = {
     "accuracy_data": "accuracy measured on",
     "collapsed": "collapsed to one class",
     "twin": "untrained twin",
+    "twin_top1": "top-1 accuracy of the untrained twin",
+    "twin_interval": "its interval",
     "seed": "seed",
     "weights": "weights (hash)",
     "input": "input",

@@ -7,7 +7,7 @@ are those of the thesis, chapter 3.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from brainbench.types import Interval
 from leaderboards._figures import known
@@ -194,9 +194,9 @@ def accuracy(board: Board, entries: Sequence[Entry]) -> Figure:
         return Figure(
             key, title, "", None, "no record states a task accuracy (top1 on its model card); trained models do"
         )
-    twin = twins(entries)
+    untrained = twins(entries)
     many, rows = len(rows), [e for e in rows if e.trained][:SHOWN] or rows[:SHOWN]
-    reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0) for e in rows))
+    reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in rows))
     scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
     drawing = Drawing(WIDTH, 44 + 19 * len(rows), f"{title}: {len(rows)} models")
     draw_axis(drawing, scale, 30, drawing.height - 8, "accuracy on held-out objects")
@@ -206,16 +206,9 @@ def accuracy(board: Board, entries: Sequence[Entry]) -> Figure:
         kind = colour[entry.card.objective or "not stated"]
         card = entry.card
         drawing.text(242, y + 4, cut(entry.name, 36), "end")
-        other = twin.get(entry.architecture)
-        if other is not None and other.card.top1 is not None:
-            drawing.rect(
-                250,
-                y - 6,
-                scale.at(other.card.top1) - 250,
-                4,
-                f"{kind} faint",
-                tip=f"untrained twin {number(other.card.top1)}",
-            )
+        twin = _twin_accuracy(entry, untrained)
+        if twin is not None:
+            drawing.rect(250, y - 6, scale.at(twin) - 250, 4, f"{kind} faint", tip=f"untrained twin {number(twin)}")
         drawing.rect(
             250, y - 2, scale.at(card.top1 or 0) - 250, 8, kind, tip=f"{entry.name}: top-1 {number(card.top1)}"
         )
@@ -225,7 +218,7 @@ def accuracy(board: Board, entries: Sequence[Entry]) -> Figure:
         y += 19
     lack = (
         ""
-        if any(e.card.top1 is not None for e in twin.values())
+        if any(_twin_accuracy(entry, untrained) is not None for entry in rows)
         else " No record states the accuracy of an untrained twin."
     )
     caption = (
@@ -233,6 +226,14 @@ def accuracy(board: Board, entries: Sequence[Entry]) -> Figure:
         f"{legend_words(colour)}{cut_words(many)}"
     )
     return Figure(key, title, caption, drawing)
+
+
+def _twin_accuracy(entry: Entry, untrained: Mapping[str, Entry]) -> float | None:
+    """What the record says of its twin, or else what the twin's own record says."""
+    if entry.card.twin_top1 is not None:
+        return entry.card.twin_top1
+    other = untrained.get(entry.architecture)
+    return None if other is None else other.card.top1
 
 
 def accuracy_against_fit(board: Board, entries: Sequence[Entry]) -> Figure:

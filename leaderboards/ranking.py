@@ -251,6 +251,11 @@ def _model(record: ResultRecord) -> tuple[object, ...]:
     return (record.score.name, card.weights if card else None, card.seed if card else None)
 
 
+def _outcome(score: Score) -> tuple[str, float | None]:
+    """Status and value to nine digits: sums on other machines, or by more threads, end in other last digits."""
+    return score.status, None if math.isnan(score.value) else round(score.value, 9)
+
+
 def _baselines(records: list[ResultRecord]) -> list[Baseline]:
     """Take each baseline once; records of one board should agree on it, and a note says when they do not."""
     found: dict[tuple[str, str], list[Score]] = defaultdict(list)
@@ -261,9 +266,9 @@ def _baselines(records: list[ResultRecord]) -> list[Baseline]:
             found["baseline", name].append(score)
     baselines = []
     for (kind, name), scores in found.items():
-        counts = Counter((score.status, None if math.isnan(score.value) else score.value) for score in scores)
+        counts = Counter(map(_outcome, scores))
         usual = counts.most_common(1)[0][0]
-        score = next(s for s in scores if (s.status, None if math.isnan(s.value) else s.value) == usual)
+        score = next(score for score in scores if _outcome(score) == usual)
         notes: tuple[str, ...] = ()
         if len(counts) > 1:
             values = [value for _, value in counts if value is not None]

@@ -143,6 +143,9 @@ def model_view(board: Board, entry: Entry) -> dict[str, Any]:
     card = entry.card
     task = [("top-1", _words.number(card.top1)), ("interval", _words.span(card.accuracy_interval))]
     task += [("top-5", _words.number(card.top5))] if card.top5 is not None else []
+    if card.twin_top1 is not None:
+        span = _words.span(card.twin_interval)
+        task.append(("untrained twin, top-1", f"{_words.number(card.twin_top1)} {span}".strip()))
     task += [("data (hash)", card.accuracy_data or ""), ("collapsed", "yes" if card.collapsed else "no")]
     return report_view(record) | {
         "title": f"{entry.name}: brainbench leaderboard",

@@ -67,6 +67,16 @@ def test_every_figure_is_drawn_when_the_records_hold_what_it_needs(make_record):
     assert any("untrained twin 0.300" in text for text in _texts(figures["fit"].drawing))
 
 
+def test_the_accuracy_of_a_twin_comes_from_the_trained_record_or_else_from_its_own(make_record):
+    plain = replace(make_record("net", 0.3), card=replace(make_record().card, objective="untrained", seed=0, top1=None))
+    trained = make_record("net.supervised", 0.5)
+    alone = _figures(plain, _trained(trained))["accuracy"]
+    assert "No record states the accuracy of an untrained twin" in alone.caption
+    told = _figures(plain, _trained(trained, twin_top1=0.25))["accuracy"]
+    assert "untrained twin 0.250" in _texts(told.drawing)
+    assert "No record states" not in told.caption
+
+
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=4, max_size=20))
 def test_regression_agrees_with_scipy(points):

@@ -132,6 +132,8 @@ def test_baselines_appear_once_and_disagreement_is_said(make_record, make_score)
         ("raw input", 0.223, ()),
         ("random features", 0.487, ()),
     ]
+    records[0] = replace(records[0], baselines={"raw input": make_score("raw input", 0.223 + 1e-15)})
+    assert not any(item.notes for item in rank(records)[0].baselines)
     records[0] = replace(records[0], baselines={"raw input": make_score("raw input", 0.9)})
     (board,) = rank(records)
     (raw,) = [item for item in board.baselines if item.name == "raw input"]
