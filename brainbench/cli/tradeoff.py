@@ -23,11 +23,14 @@ def whisker(
     collisions: Annotated[
         str, typer.Option(help="Collision geometries of a concave object to measure too, comma-separated, or all.")
     ] = "",
+    solvers: Annotated[
+        str, typer.Option(help="dynamic, quasistatic (of the backend rod), or both, comma-separated.")
+    ] = "dynamic",
     csv: Annotated[Path | None, typer.Option(help="Also write the table as CSV.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Also draw error against cost (.png, .svg, .pdf).")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure error and cost of whisker simulations over links, time step, backend and collision geometry.
+    """Measure error and cost of whisker simulations over links, time step, solver, backend and collision geometry.
 
     The table that ships with the package (brainbench/stimuli/fidelity_table.json) is made by this command.
     """
@@ -46,6 +49,7 @@ def whisker(
         time_steps=steps or tradeoff.TIME_STEPS,
         backends=names,
         collisions=tradeoff.COLLISIONS if shapes == ("all",) else shapes,
+        solvers=tuple(item.strip() for item in solvers.split(",") if item.strip()),
     )
     with progress_bar() as progress:
         points = tradeoff.measure_tradeoff(out, chosen, progress=progress)
@@ -70,6 +74,20 @@ def whisker(
         rows,
         right=(0, 1, 2, 3),
     )
+    still = [point for point in points if point.get("solver") == "quasistatic" and point["error"] is not None]
+    if still:
+        rows = [
+            [
+                *(f"{point[name]:.2%}" for name in ("static_error", "dynamic_error", "sliding_error", "flick_error")),
+                f"{point['cost']:.3g}",
+                str(point["links"]),
+                f"{point['time_step'] * 1e3:g}",
+            ]
+            for point in still
+        ]
+        columns = ["pegs", "whisking", "with friction", "flicks", "processor s / whisker-s", "links", "step ms"]
+        title = "without inertia (rod, quasistatic), error by test:"
+        text += "\n\n" + table(title, columns, rows, right=tuple(range(7)))
     hollow = tradeoff.collision_points(points)
     if hollow:
         rows = [

@@ -15,7 +15,8 @@ def draw_bench(
     """Draw the bench tests of one backend, each named or not, with its front."""
     if not points:
         return
-    label = str(points[0]["backend"])
+    still = points[0].get("solver", "dynamic") == "quasistatic"
+    label = f"{points[0]['backend']}{', without inertia' if still else ''}"
     axes.scatter([p["cost"] for p in points], [p["error"] for p in points], s=16, color=colour, label=label)
     axes.step([p.cost for p in best], [p.error for p in best], where="post", color=colour, lw=1, zorder=0)
     for point, name in zip(points, names, strict=True):

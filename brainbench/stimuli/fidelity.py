@@ -163,7 +163,11 @@ def measured(backend: str = "mujoco") -> tuple[TradeoffPoint, ...]:
     import json
 
     text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
-    points = [point for point in json.loads(text)["points"] if not point.get("collision")]
+    points = [
+        point
+        for point in json.loads(text)["points"]
+        if not point.get("collision") and point.get("solver", "dynamic") == "dynamic"
+    ]
     backends = {point.get("backend", "mujoco") for point in points}
     if backend not in backends:
         raise unknown_name("measured backend", backend, backends)

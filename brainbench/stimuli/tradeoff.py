@@ -9,6 +9,7 @@ Subject: mouse whisker C2, straightened; for the ring-down also the stiffest mou
 - ``sliding_error``: the same with friction .48;
 - ``flick_error``: the same with friction while the whisker sweeps past the post and springs free in every whisk;
 - ``error``: the worst of these five; null when a run failed, with the reason in ``note``;
+  with ``solver`` ``quasistatic``, where nothing rings, ``ring_error`` is null and the worst of the other four counts;
 - ``cost``: processor seconds per simulated second of one whisker in contact, over the three whisking runs.
 
 Points with a ``collision`` measure instead what the collision geometry of a concave object costs and does: C2 whisks
@@ -42,7 +43,7 @@ from brainbench.stimuli._tradeoff_figure import draw_bench, draw_collisions
 from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.backends._reach import touched
 from brainbench.stimuli.backends.protocol import Job
-from brainbench.stimuli.fidelity import Fidelity, list_presets
+from brainbench.stimuli.fidelity import SOLVERS, Fidelity, list_presets
 from brainbench.stimuli.morphology import WhiskerArray
 from brainbench.stimuli.objects import PlacedObject, rodgers_solid
 from brainbench.stimuli.obstacle import Capsule, Obstacle
@@ -89,12 +90,14 @@ def settings(
     time_steps: Sequence[tuple[float, float | None]] = TIME_STEPS,
     backends: Sequence[str] = ("mujoco",),
     collisions: Sequence[str] = (),
+    solvers: Sequence[str] = ("dynamic",),
 ) -> list[Setting]:
     """Return every combination (``time_steps`` pairs a step [s] with steps per period), after the presets.
 
     Args:
         links, time_steps, backends: axes of the bench tests.
         collisions: geometries of a concave object to measure as well, at each preset, as in :data:`COLLISIONS`.
+        solvers: of the backends that know more than one; ``quasistatic`` has no presets and no steps per period.
 
     Raises:
         UsageError: a value lies outside the range of :class:`Fidelity`, or a collision geometry is unknown.
@@ -104,7 +107,19 @@ def settings(
         for count, (step, periods) in itertools.product(links, time_steps)
     ]
     presets = [Fidelity.preset(name) for name in list_presets()]
-    plain = [Setting(fidelity, name) for name in backends for fidelity in dict.fromkeys([*presets, *grid])]
+    still = [
+        Fidelity(links=count, time_step=step, solver="quasistatic")
+        for count, (step, _) in itertools.product(links, time_steps)
+    ]
+    for solver in solvers:
+        if solver not in SOLVERS:
+            raise unknown_name("solver", solver, SOLVERS)
+    plain = [
+        Setting(fidelity, name)
+        for name in backends
+        for fidelity in dict.fromkeys([*presets, *grid] if "dynamic" in solvers else [])
+    ]
+    plain += [Setting(item, name) for name in backends if name == "rod" and "quasistatic" in solvers for item in still]
     return plain + [Setting(*point) for point in itertools.product(presets, backends, collisions)]
 
 
@@ -165,7 +180,8 @@ def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> li
     """Return the points of the bench tests that none beats in both error and cost, cheapest first.
 
     Args:
-        points: a table; its points with a collision geometry are other experiments and are left out.
+        points: a table; its points with a collision geometry are other experiments and are left out, and so are
+            those without inertia, for which some of the errors mean nothing.
         backend: of this backend only; of all when None.
     """
     return pareto_front(
@@ -173,7 +189,7 @@ def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> li
             math.inf if p["error"] is None else p["error"], p["cost"], {n: p[n] for n in (*_NAMES, "backend")}
         )
         for p in points
-        if p["cost"] is not None and not p.get("collision") and backend in (None, p["backend"])
+        if p["cost"] is not None and not p.get("collision") and backend in (None, p["backend"]) and _moves(p)
     )
 
 
@@ -199,9 +215,10 @@ def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]
     figure = Figure(figsize=(11 if hollow else 7, 4.5), layout="constrained")
     axes = figure.subplots(1, 2 if hollow else 1, squeeze=False)[0]
     presets = {_key(_fields(Setting(Fidelity.preset(name))))[: len(_NAMES)]: name for name in list_presets()}
-    for number, backend in enumerate(sorted({point["backend"] for point in chosen})):
-        some = [point for point in chosen if point["backend"] == backend and not point.get("collision")]
-        usable = [point for point in some if point["error"] is not None]
+    groups = sorted({(point["backend"], _moves(point)) for point in chosen if not point.get("collision")}, reverse=True)
+    for number, (backend, moves) in enumerate(sorted(groups, key=lambda group: (not group[1], group[0]))):
+        some = [point for point in chosen if (point["backend"], _moves(point)) == (backend, moves)]
+        usable = [point for point in some if point["error"] is not None and not point.get("collision")]
         names = [presets.get(_key(point)[: len(_NAMES)], "") for point in usable]
         draw_bench(axes[0], usable, names, front(usable), f"C{number}")
     if hollow:
@@ -220,7 +237,11 @@ def _fields(setting: Setting) -> dict[str, Any]:
 
 
 def _key(point: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(point.get(name) for name in (*_NAMES, "backend", "collision"))
+    return (*(point.get(name) for name in (*_NAMES, "backend", "collision")), _moves(point))
+
+
+def _moves(point: dict[str, Any]) -> bool:
+    return point.get("solver", "dynamic") == "dynamic"
 
 
 def _header() -> dict[str, Any]:
@@ -248,12 +269,13 @@ def _measure(setting: Setting, reference: Sequence[Trace]) -> dict[str, Any]:
             for at, offset in PEGS
         ]
         values["static_error"] = max(max(test.moment_error, test.force_error) for test in pegs)
-        values["ring_error"] = max(_ring_error(_straight(name), setting) for name in ("C2", "E5"))
+        if _moves(values):
+            values["ring_error"] = max(_ring_error(_straight(name), setting) for name in ("C2", "E5"))
         traces = _whisking(setting)
         values["cost"] = float(sum(trace.seconds for trace in traces) / (len(traces) * _FRAMES[-1]))
         for name, trace, other in zip(PARTS[2:], traces, reference, strict=True):
             values[name] = _difference(trace, other)
-        values["error"] = max(values[name] for name in PARTS)
+        values["error"] = max(values[name] for name in PARTS if values[name] is not None)
     except BrainbenchError as error:
         values["note"] = str(error)
     return values

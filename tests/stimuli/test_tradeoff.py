@@ -103,3 +103,28 @@ def test_the_grid_holds_the_presets_and_no_setting_twice():
     chosen = tradeoff.settings()
     assert len(set(chosen)) == len(chosen)
     assert Setting(Fidelity.preset("balanced")) in chosen
+
+
+def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_presets():
+    chosen = tradeoff.settings(
+        links=(8,), time_steps=((1e-3, 25.0),), backends=("mujoco", "rod"), solvers=("quasistatic",)
+    )
+    assert [(item.backend, item.fidelity) for item in chosen] == [
+        ("rod", Fidelity(links=8, time_step=1e-3, solver="quasistatic"))
+    ]
+    with pytest.raises(UsageError, match="quasistatic"):
+        tradeoff.settings(solvers=("static",))
+    point = {"links": 8, "links_per_mm": None, "time_step": 1e-3, "steps_per_period": None, "backend": "rod"}
+    moving, still = ({**point, "solver": name, "error": 0.1, "cost": 1.0} for name in ("dynamic", "quasistatic"))
+    assert len(tradeoff.front([moving, {**still, "error": 0.01}])) == 1
+    assert tradeoff.front([still]) == []
+
+
+@pytest.mark.slow
+def test_a_setting_without_inertia_is_measured_in_all_that_does_not_ring(tmp_path):
+    pytest.importorskip("warp")
+    chosen = tradeoff.settings(links=(10,), time_steps=((1e-3, None),), backends=("rod",), solvers=("quasistatic",))
+    (point,) = tradeoff.measure_tradeoff(tmp_path / "table.json", chosen)
+    assert point["ring_error"] is None
+    assert point["static_error"] < 0.02
+    assert point["error"] == max(point[name] for name in ("dynamic_error", "sliding_error", "flick_error"))
