@@ -13,7 +13,6 @@ import numpy as np
 
 from benchmarks.results import table, write_section
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL
 from brainbench.stimuli.backends.rod.fast import SweepLauncher
 from brainbench.stimuli.collections import resolve_objects
 from brainbench.stimuli.sweeps import GRIDS, SweepScenes
@@ -31,16 +30,11 @@ def run(scenes: SweepScenes, picked: dict[str, list[Any]], fidelity: Fidelity) -
     started = time.process_time()
     results = [launcher.launch([(name, sweeps)]) for name, sweeps in picked.items()]
     spent = time.process_time() - started
-    found = {
-        name: np.concatenate([getattr(result, name) for result in results])
-        for name in ("status", "doubt", "crowded", "steps", "touching")
-    }
-    crowded = found["crowded"] > CROWDED * np.maximum(found["steps"], 1)
     return {
         "wrench": np.concatenate([result.wrench.numpy() for result in results]),
-        "flagged": (found["status"] != 0) | crowded | ~(found["doubt"] <= DOUBTFUL),
-        "steps": int(found["steps"].sum()),
-        "touching": int(found["touching"].sum()),
+        "flagged": np.concatenate([result.unstable for result in results]),
+        "steps": int(sum(result.steps.sum() for result in results)),
+        "touching": int(sum(result.touching.sum() for result in results)),
         "seconds": spent,
     }
 

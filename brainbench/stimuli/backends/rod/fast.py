@@ -57,6 +57,12 @@ class SweepResult:
     steps_in_full: int
     """Steps that every whisker takes from start to end."""
 
+    @property
+    def unstable(self) -> NDArray[np.bool_]:
+        """[sweep, whisker] whose wrench cannot be trusted."""
+        crowded = self.crowded > CROWDED * np.maximum(self.steps, 1)
+        return (self.status != 0) | crowded | ~(self.doubt <= DOUBTFUL)
+
 
 class SweepLauncher:
     """The whiskers of a grid of sweeps on a device, ready for any number of sweeps.
@@ -198,8 +204,7 @@ class SweepLauncher:
             moved = np.moveaxis(wrench, 1, 0)
             wrench = np.moveaxis(frames.reduce(moved.astype(float)), 0, 1).astype(np.float32)
             contact = np.asarray(frames.split(np.moveaxis(contact, 1, 0)).any(axis=1)).swapaxes(0, 1)
-        crowded = result.crowded > CROWDED * np.maximum(result.steps, 1)
-        unstable = (result.status != 0) | crowded | ~(result.doubt <= DOUBTFUL)
+        unstable = result.unstable
         names = [mount.name for mount in self.scenes.array]
         reasons = [""] * len(unstable)
         for row in np.flatnonzero(unstable.any(axis=1)):
