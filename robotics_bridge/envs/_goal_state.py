@@ -37,7 +37,7 @@ class GoalState:
         self._turn = None if task.turn_axis is None else torch.tensor(task.turn_axis, device=device)
         window = task.turn_window if self._turn is not None else 1
         self._ring = torch.full((window, num_envs), float("inf"), device=device)
-        self._step = 0
+        self._step = torch.zeros(1, dtype=torch.long, device=device)
         self.turned_before = torch.full((num_envs,), float("inf"), device=device)
 
     def reset(self, mask: torch.Tensor, quat: torch.Tensor, draw: Any) -> None:
@@ -61,8 +61,8 @@ class GoalState:
             twist, _ = twist_and_swing(step, rotate(quat, self._turn))
             self.turned += twist
             place = self._step % self._ring.shape[0]
-            self.turned_before = self._ring[place].clone()
-            self._ring[place] = self.turned
+            self.turned_before.copy_(self._ring.index_select(0, place)[0])
+            self._ring.index_copy_(0, place, self.turned.unsqueeze(0))
             self._step += 1
         if self.goal is None:
             return
@@ -99,16 +99,14 @@ class GoalState:
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return all memory."""
-        import torch
-
         own = {name: value.clone() for name, value in self._memory().items()}
-        return {**own, "step": torch.tensor(self._step)}
+        return {**own, "step": self._step[0].clone()}
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned."""
         for name, value in self._memory().items():
             value.copy_(values[name])
-        self._step = int(values["step"])
+        self._step.copy_(values["step"])
 
     def _memory(self) -> dict[str, torch.Tensor]:
         names = ("quat", "previous", "angle", "angle_before", "left", "reached", "missed", "count", "rate", "off_axis")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from robotics_bridge.tasks.rotations import conjugate, multiply, rotate, six_numbers
+from robotics_bridge.tasks.rotations import conjugate, constant, multiply, rotate, six_numbers
 
 if TYPE_CHECKING:
     import torch
@@ -56,9 +56,8 @@ def _goal(env: Env) -> torch.Tensor:
 def _object(env: Env) -> torch.Tensor:
     import torch
 
-    rows = torch.arange(env.num_envs, device=env.device)
-    pose = env.object_pose[rows, env.target]
-    speed = env.world.qvel[:, env._object_speeds].unflatten(1, (-1, 6))[rows, env.target]
+    pose = env.object_pose[env.rows, env.target]
+    speed = env.world.qvel[:, env._object_speeds].unflatten(1, (-1, 6))[env.rows, env.target]
     quat = pose[:, 3:]
     parts = [pose[:, :3], six_numbers(quat), speed[:, :3], VELOCITY * rotate(quat, speed[:, 3:])]
     if env.task.distances_in == "priv_obj_state":
@@ -87,10 +86,9 @@ def _tactile(env: Env) -> torch.Tensor:
 
 
 def _tilt(env: Env) -> torch.Tensor:
-    import torch
-
-    axis = torch.tensor(env.task.turn_axis, device=env.device)
-    return rotate(env._object_quat(), -axis)[:, 2:].clamp(-1.0, 1.0).acos()
+    quat = env._object_quat()
+    axis = constant(env.task.turn_axis or (0.0, 0.0, -1.0), quat)
+    return rotate(quat, -axis)[:, 2:].clamp(-1.0, 1.0).acos()
 
 
 def _thermal(env: Env) -> torch.Tensor:

@@ -6,21 +6,25 @@ Letters: B environment, A action, J joint, F finger tip, K object, S physics ste
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
-from robotics_bridge._device import pick_device, warp
+from robotics_bridge._device import pick_device
+from robotics_bridge.envs._actions import ActionMap
+from robotics_bridge.envs._captured import Captured
+from robotics_bridge.envs._contacts import Contacts
 from robotics_bridge.envs._drives import Drives
 from robotics_bridge.envs._goal_state import GoalState
 from robotics_bridge.envs._observe import observe, shapes_of
+from robotics_bridge.envs._resets import Resets
+from robotics_bridge.envs._saved import restore, saved
 from robotics_bridge.envs._world import World
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.tasks.moment import Moment
-from robotics_bridge.tasks.rotations import about, conjugate, multiply, rotate
+from robotics_bridge.tasks.rotations import conjugate, from_xyzw, multiply, rotate
 from robotics_bridge.tasks.scenes import build
 
 if TYPE_CHECKING:
@@ -34,23 +38,6 @@ if TYPE_CHECKING:
 ENGINES = ("mujoco", "warp")
 _WILD = 1e4
 """Speed (m/s or rad/s) beyond which an environment counts as diverged."""
-
-
-@dataclass(frozen=True, eq=False)
-class ActionMap:
-    """How actions become targets of the position drives: target = clip(default + scale · action, low, high)."""
-
-    names: tuple[str, ...]
-    """Joints A."""
-    default: np.ndarray
-    """[A] (rad)."""
-    scale: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    def targets(self, action: np.ndarray) -> np.ndarray:
-        """Return the targets [..., A] (rad) of actions [..., A]."""
-        return np.clip(self.default + self.scale * action, self.low, self.high)
 
 
 class Env:
@@ -71,6 +58,8 @@ class Env:
         keep_final: return the last observations of episodes that ended as ``info["final_observations"]``.
         threads: of C MuJoCo.
         knobs: further settings of the tactile sensors, e.g. ``{"points": 500}``.
+        graphs: replay what a control step does around physics as CUDA graphs, recorded in the third step; by default
+            on CUDA. A task whose terms cannot be recorded runs without, and says so; with ``True`` it is an error.
 
     Raises:
         UsageError: a name or number is not valid.
@@ -93,6 +82,7 @@ class Env:
         keep_final: bool = False,
         threads: int | None = None,
         knobs: dict[str, Any] | None = None,
+        graphs: bool | None = None,
     ) -> None:
         import torch
 
@@ -107,6 +97,10 @@ class Env:
         self.model = build(task, hand)
         self.world = World(self.model.models, num_envs, device=device, engine=engine, threads=threads)
         self.device: torch.device = self.world.device
+        if graphs and self.device.type != "cuda":
+            raise UsageError(
+                f"Graphs are recorded on CUDA only, and the environment is on {self.device}; leave it out."
+            )
         self.decimation, self.physics_dt, self.step_dt = task.solver.decimation, self.world.timestep, task.step_dt
         self.max_episode_length = math.ceil(task.episode / self.step_dt)
         self._generator = torch.Generator(device=self.device)
@@ -128,10 +122,18 @@ class Env:
             raise UsageError("Poses of tactile links belong to tactile sensors; choose an observation type.")
         self._with_link_pose = link_pose
         self._buffers()
-        self._sensors(seed)
+        self.contacts = Contacts(self.world, self.model, step_dt=self.step_dt, seed=seed)
         self.watch: Watch | None = None if task.watch is None else task.watch(self)
         """The part of the task with a state of its own."""
-        self._first = True
+        self._resets = Resets(self)
+        self._aim_part: Callable[[], Any] = self._aim
+        self._judge_part: Callable[[], Any] = self._judge
+        if self.device.type == "cuda" and graphs is not False:
+            kept = [self._extent] if self.touch is None else [self._extent, self.touch.reading]
+            self._aim_part, self._judge_part = (
+                Captured(part, self._generator, self.world.warp_device, kept=kept, required=bool(graphs))
+                for part in (self._aim, self._judge)
+            )
         self.observations: dict[str, torch.Tensor] = {}
         """Of the last step or reset."""
         self.reset()
@@ -182,15 +184,25 @@ class Env:
             raise UsageError("There are no tactile links; make the environment with an observation type.")
         pose = self.world.state.pose_torch
         palm, links = pose[:, self._palm : self._palm + 1], pose[:, self._tactile_links]
-        inverse = conjugate(_wxyz(palm[..., 3:])).expand(-1, links.shape[1], -1)
+        inverse = conjugate(from_xyzw(palm[..., 3:])).expand(-1, links.shape[1], -1)
         place = rotate(inverse, links[..., :3] - palm[..., :3])
-        turn = multiply(inverse, _wxyz(links[..., 3:]))
+        turn = multiply(inverse, from_xyzw(links[..., 3:]))
         return torch.cat((place, turn[..., 1:], turn[..., :1]), dim=-1)
 
     @property
     def object_pose(self) -> torch.Tensor:
         """Poses [B, K, 7] of the objects (x y z, qw qx qy qz)."""
         return self.world.qpos[:, self._object_columns].unflatten(1, (-1, 7))
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps [B] by which episodes end; learners write to it to start episodes at random ages."""
+        return self._age
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        if value is not self._age:
+            self._age.copy_(value)
 
     # --- life --------------------------------------------------------------------------------------------------
 
@@ -202,8 +214,8 @@ class Env:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         elif mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
             raise UsageError(f"A mask has one bool per environment ({self.num_envs}); received {tuple(mask.shape)}.")
-        self._begin(mask)
-        self.observations = self._observe()
+        self._resets.begin(mask)
+        self.observations = observe(self)
         return self.observations
 
     def step(
@@ -229,29 +241,11 @@ class Env:
             )
         self.last_action.copy_(self.action)
         self.action.copy_(action.detach())
-        self._drive()
-        diverged = self._contain()
-        moment = self._moment()
-        endings = {n: e.condition(moment, **e.params) for n, e in self.task.endings.items()}
-        if self.watch is not None:
-            self.watch.after(moment)
-        moment.endings = endings
-        reward, parts = self._reward(moment, diverged)
-        self.episode_length_buf += 1
-        self._steps += 1
-        terminated = diverged.clone()
-        for condition in endings.values():
-            terminated |= condition
-        truncated = (self.episode_length_buf >= self.max_episode_length) & ~terminated
-        done = terminated | truncated
-        info = {"time_outs": truncated, "diverged": diverged, "log": self._account(parts, done, diverged)}
-        info |= {"metric": self.metric.clone(), "return": self._return.clone(), "steps": self._steps.clone()}
-        self.goals.advance(self._object_quat(), self._draw)
-        if self.keeps_final:
-            info["final_observations"] = {k: v.clone() for k, v in self._observe().items()}
-        self._begin(done)
-        self.observations = self._observe()
-        return self.observations, reward, terminated, truncated, info
+        self._aim_part()
+        self._advance()
+        result = self._judge_part()
+        self.observations = result[0]
+        return result
 
     def seed(self, seed: int) -> None:
         """Begin the random numbers anew, from the next reset on."""
@@ -270,41 +264,11 @@ class Env:
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return everything that the future depends on, but for the memory of noisy or slow tactile sensors."""
-        own = {name: getattr(self, name).clone() for name in _MEMORY}
-        own["generator"] = self._generator.get_state()
-        parts: dict[str, Any] = {"world": self.world, "drives": self.drives, "goals": self.goals}
-        if self.watch is not None:
-            parts["watch"] = self.watch
-        for part, source in parts.items():
-            own |= {f"{part}.{name}": value for name, value in source.state_dict().items()}
-        if self.touch is not None:
-            own["touch.reading"] = self.touch.reading.clone()
-            own["touch.age"] = warp().to_torch(self.touch.suite.clock.age).clone()
-            own["touch.episode"] = warp().to_torch(self.touch.suite.clock.episode).clone()
-        own |= {f"observations.{name}": value.clone() for name, value in self.observations.items()}
-        return own
+        return saved(self)
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned."""
-
-        def under(part: str) -> dict[str, Any]:
-            return {name[len(part) + 1 :]: value for name, value in values.items() if name.startswith(f"{part}.")}
-
-        for name in _MEMORY:
-            getattr(self, name).copy_(values[name])
-        self._generator.set_state(values["generator"].cpu())
-        self.world.load_state_dict(under("world"))
-        self.drives.load_state_dict(under("drives"))
-        self.goals.load_state_dict(under("goals"))
-        if self.watch is not None:
-            self.watch.load_state_dict(under("watch"))
-        if self.touch is not None:
-            touch = under("touch")
-            self.touch.reading.copy_(touch["reading"])
-            for name in ("age", "episode"):
-                warp().to_torch(getattr(self.touch.suite.clock, name)).copy_(touch[name])
-        self._first = False
-        self.observations = {name: value.to(self.device) for name, value in under("observations").items()}
+        restore(self, values)
 
     # --- parts of a step ---------------------------------------------------------------------------------------
 
@@ -316,8 +280,10 @@ class Env:
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(count, *shape, dtype=dtype, device=self.device)
 
+        self.rows = torch.arange(count, device=self.device)
+        """[B] numbers of the environments, for indexing."""
         self.action, self.last_action = zeros(self.num_actions), zeros(self.num_actions)
-        self.episode_length_buf = zeros(dtype=torch.long)
+        self._age = zeros(dtype=torch.long)
         self._steps, self._return, self.metric = zeros(dtype=torch.long), zeros(), zeros()
         self.friction, self.mass = zeros(), zeros()
         self._push_left = zeros()
@@ -342,60 +308,16 @@ class Env:
         self._object_speeds = torch.as_tensor([a + k for a in speeds for k in range(6)], device=self.device)
         self.target = zeros(dtype=torch.long)
         """[B] number of the object that counts."""
-        shapes = self.model.shapes
-        self._shape_rows = torch.as_tensor(self.world.shape_of, device=self.device)
-        self._extent = floats([shape.extent for shape in shapes])[self._shape_rows]
-        self._bottom = floats([shape.bottom for shape in shapes])[self._shape_rows]
-        self._nominal = {name: value.clone() for name, value in self.world.fields.items()}
-        geoms = np.isin(np.asarray(first.geom_bodyid), bodies)
-        self._object_geoms = torch.as_tensor(np.flatnonzero(geoms), device=self.device)
-        self._grasps = None
-        if self.task.starts == "grasps":
-            from robotics_bridge.tasks.grasps import grasps_for
-
-            self._grasps = {k: floats(v) for k, v in grasps_for(self.task, self.hand, self.model).items()}
-        sites = self.task.placement.sites
-        self._sites = floats(sites) if sites else None
-
-    def _sensors(self, seed: int) -> None:
-        import torch
-
-        from robotics_bridge.envs._actuation_kernels import environment_kernels
-        from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
-
-        wp, scene = warp(), self.world.engine.scene
-        self._kernels = environment_kernels()
+        kind = torch.as_tensor(self.world.shape_of, device=self.device)
+        self._extent = floats([shape.extent for shape in self.model.shapes])[kind]
+        scene = self.world.engine.scene
         self._palm = scene.link_index(self.hand.palm)
-        tips = list(self.model.tips)
-        self._tip_links = torch.as_tensor([scene.link_index(tip) for tip in tips], device=self.device)
-        probes = {
-            tip: SurfaceDistanceProbe(
-                link=tip,
-                probes=Probes(np.array([point]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]), (1,)),
-                track=self.model.objects,
-                max_range=0.5,
-            )
-            for tip, point in self.model.tips.items()
-        }
-        self._distances = SensorSuite(scene, probes, num_envs=self.num_envs, device=self.world.warp_device, seed=seed)
-        (runtime,) = self._distances.runtimes
-        self._distance_planes = wp.to_torch(runtime.measured())
-        order = [runtime.places[tip].start for tip in tips]
-        self._distance_order = torch.as_tensor(order, device=self.device)
-        rows = np.full(len(scene.geometries), -1, dtype=np.int32)
-        for row, link in enumerate((*tips, *self.model.objects)):
-            rows[list(scene.geometries_of(link))] = row
-        self._rows = wp.array(rows, dtype=wp.int32, device=self.world.warp_device)
-        self._forces = wp.zeros(
-            (self.num_envs, len(tips) + len(self.model.objects)), dtype=wp.vec3f, device=self.world.warp_device
-        )
-        self._forces_view = wp.to_torch(self._forces)
         if self.touch is not None:
             links = [scene.link_index(link) for link in self.touch.layout.links]
             self._tactile_links = torch.as_tensor(links, device=self.device)
 
-    def _drive(self) -> None:
-        """Run the physics steps of one control step and read the sensors after each."""
+    def _aim(self) -> None:
+        """Set the drives' targets for the action, and what pushes the object."""
         import torch
 
         target = self.drives.target
@@ -403,17 +325,19 @@ class Env:
         moved = target[:, self._moved] + self._scale * self.action
         target[:, self._moved] = torch.clamp(moved, self._low[self._moved], self._high[self._moved])
         self._shove()
+
+    def _advance(self) -> None:
+        """Run the physics steps of one control step, and sense after each."""
         for substep in range(self.decimation):
             self.drives.launch(substep)
             self.world.step()
             if substep == 0 and self.task.push is not None:
-                self.world.push[:, self._bodies, :3] = 0.0
+                self.world.push.index_fill_(1, self._bodies, 0.0)
                 self.world.apply_push()
             if self.touch is not None:
                 self.touch.update(self.world.state, self.physics_dt, substep)
             if self.watch is not None:
                 self.watch.during(self.physics_dt)
-        self._read()
 
     def _shove(self) -> None:
         push = self.task.push
@@ -427,14 +351,30 @@ class Env:
         self._push_left.copy_(self._push_left.where(~now[:, 0], self._draw(1, *push.interval)[:, 0]))
         self.world.apply_push()
 
-    def _read(self) -> None:
-        """Take distances and contact forces from the state."""
-        wp, state = warp(), self.world.state
-        self._forces.zero_()
-        inputs = [state.contact_count, state.contact_geom, state.contact_env, state.contact_normal]
-        inputs += [state.contact_force, self._rows, self._forces]
-        wp.launch(self._kernels.forces, dim=state.contact_env.shape[0], inputs=inputs, device=self.world.warp_device)
-        self._distances.update(state, self.step_dt)
+    def _judge(self) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Read the state after a control step, reward, begin new episodes, and return what ``step`` returns."""
+        self.contacts.read()
+        diverged = self._contain()
+        moment = self._moment()
+        endings = {n: e.condition(moment, **e.params) for n, e in self.task.endings.items()}
+        if self.watch is not None:
+            self.watch.after(moment)
+        moment.endings = endings
+        reward, parts = self._reward(moment, diverged)
+        self.episode_length_buf += 1
+        self._steps += 1
+        terminated = diverged.clone()
+        for condition in endings.values():
+            terminated |= condition
+        truncated = (self.episode_length_buf >= self.max_episode_length) & ~terminated
+        done = terminated | truncated
+        info = {"time_outs": truncated, "diverged": diverged, "log": self._account(parts, done, diverged)}
+        info |= {"metric": self.metric.clone(), "return": self._return.clone(), "steps": self._steps.clone()}
+        self.goals.advance(self._object_quat(), self._draw)
+        if self.keeps_final:
+            info["final_observations"] = {k: v.clone() for k, v in observe(self).items()}
+        self._resets.begin(done)
+        return observe(self), reward, terminated, truncated, info
 
     def _contain(self) -> torch.Tensor:
         """Return which environments [B] diverged, and put numbers back into them until they are reset."""
@@ -447,49 +387,41 @@ class Env:
         world.qpos.copy_(torch.where(column, world.start, world.qpos))
         world.qvel.masked_fill_(column, 0.0)
         self.drives.power.copy_(torch.nan_to_num(self.drives.power) * ~column)
-        self._forces_view.masked_fill_(column.unsqueeze(2), 0.0)
+        self.contacts.forces.masked_fill_(column.unsqueeze(2), 0.0)
         return diverged
 
     def _moment(self) -> Moment:
-        import torch
-
         quat = self._object_quat()
         self.goals.update(quat)
         goals, world = self.goals, self.world
-        pose, rows = self.object_pose, torch.arange(self.num_envs, device=self.device)
+        pose, rows = self.object_pose, self.rows
         speed = world.qvel[:, self._object_speeds].unflatten(1, (-1, 6))[rows, self.target]
-        tips = len(self.model.tips)
-        size = self._forces_view[rows, tips + self.target].norm(dim=1)
-        self._object_rotation = quat
         return Moment(
             dt=self.step_dt, joint_names=self.model.joints, joint_position=world.qpos[:, self.drives.positions],
             joint_velocity=world.qvel[:, self.drives.speeds], joint_low=self._low, joint_high=self._high,
             start_joints=self._start_joints, power=self.drives.power.sum(dim=1), action=self.action,
             last_action=self.last_action, object_position=pose[rows, self.target, :3], object_quat=quat,
             object_velocity=speed[:, :3], object_spin=rotate(quat, speed[:, 3:]), start_position=self._start_position,
-            object_force=size, tip_force=self.tip_force, surface_distance=self.surface_distance,
-            step_count=self._steps, goal_angle=goals.angle, previous_goal_angle=goals.angle_before,
-            reached=goals.reached, missed=goals.missed, goals_reached=goals.count, axis_rate=goals.rate,
-            off_axis=goals.off_axis, allowed_off_axis=goals.allowed_off_axis, turned=goals.turned,
+            object_force=self.contacts.on_object(rows, self.target), tip_force=self.tip_force,
+            surface_distance=self.surface_distance, step_count=self._steps, goal_angle=goals.angle,
+            previous_goal_angle=goals.angle_before, reached=goals.reached, missed=goals.missed,
+            goals_reached=goals.count, axis_rate=goals.rate, off_axis=goals.off_axis,
+            allowed_off_axis=goals.allowed_off_axis, turned=goals.turned,
             turned_before=goals.turned_before,
         )  # fmt: skip
 
     @property
     def tip_force(self) -> torch.Tensor:
         """Net normal contact force [B, F, 3] on finger tips in their own frame, within ±10 N as published."""
-        turn = conjugate(_wxyz(self.world.state.pose_torch[:, self._tip_links, 3:]))
-        return rotate(turn, self._forces_view[:, : len(self.model.tips)]).clamp(-10.0, 10.0).nan_to_num()
+        return self.contacts.tip_force
 
     @property
     def surface_distance(self) -> torch.Tensor:
         """Distance [B, F] from each finger tip to the object (m), at most 0.5."""
-        return self._distance_planes[0].index_select(1, self._distance_order).nan_to_num(0.5)
+        return self.contacts.surface_distance
 
     def _object_quat(self) -> torch.Tensor:
-        import torch
-
-        rows = torch.arange(self.num_envs, device=self.device)
-        return self.object_pose[rows, self.target, 3:]
+        return self.object_pose[self.rows, self.target, 3:]
 
     def _reward(self, moment: Moment, diverged: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the reward [B] and its terms [B, terms], zero where diverged."""
@@ -527,105 +459,3 @@ class Env:
 
         numbers = torch.rand(self.num_envs, count, generator=self._generator, device=self.device)
         return low + (high - low) * numbers
-
-    def _begin(self, mask: torch.Tensor) -> None:
-        """Start new episodes where the mask [B] is set."""
-        import torch
-
-        column = mask.unsqueeze(1)
-        qpos, home = self._starts()
-        self._home.copy_(torch.where(column, home, self._home))
-        self._change_objects(mask)
-        self.world.reset(mask, qpos)
-        self.drives.reset(mask, self._draw)
-        if self.watch is not None:
-            self.watch.reset(mask)
-        for buffer in (self.action, self.last_action, self._sums):
-            buffer.masked_fill_(column, 0.0)
-        for buffer in (self.episode_length_buf, self._steps, self._return, self.metric):
-            buffer.masked_fill_(mask, 0)
-        joints = self.world.qpos[:, self.drives.positions]
-        self._start_joints.copy_(torch.where(column, joints, self._start_joints))
-        rows = torch.arange(self.num_envs, device=self.device)
-        place = self.object_pose[rows, self.target, :3]
-        self._start_position.copy_(torch.where(column, place, self._start_position))
-        if self.task.push is not None:
-            fresh = self._draw(1, *self.task.push.interval)[:, 0]
-            self._push_left.copy_(torch.where(mask, fresh, self._push_left))
-        self.goals.reset(mask, self._object_quat(), self._draw)
-        if self.touch is not None:
-            self.touch.reset(mask)
-        self._distances.reset(mask)
-        self.world.refresh()
-        self._forces_view.masked_fill_(column.unsqueeze(2), 0.0)
-        self._distances.update(self.world.state, self.step_dt)
-        self._first = False
-
-    def _starts(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return positions [B, nq] for new episodes, and the drives' targets [B, J] without action."""
-        import torch
-
-        place, count = self.task.placement, len(self.model.objects)
-        qpos = self.world.start.clone()
-        qpos[:, self.drives.positions] = self._rest
-        if self._grasps is not None:
-            # Grasps belong to a shape: each environment takes one of its own.
-            table = self._grasps["rows"][self._shape_rows].long()
-            pick = (self._draw(1, 0.0, 1.0)[:, 0] * table.shape[1]).long().clamp(max=table.shape[1] - 1)
-            row = table.gather(1, pick.unsqueeze(1))[:, 0]
-            qpos[:, self.drives.positions] = self._grasps["joints"][row]
-            qpos[:, self._object_columns] = self._grasps["object"][row]
-            return qpos, self._grasps["target"][row]
-        home = torch.tensor(place.quaternion, device=self.device).expand(self.num_envs, -1)
-        up = torch.tensor([0.0, 0.0, 1.0], device=self.device)
-        poses = torch.zeros(self.num_envs, count, 7, device=self.device)
-        if self._sites is not None:
-            order = self._draw(len(self._sites), 0.0, 1.0).argsort(dim=1)[:, :count]
-            poses[..., :3] = self._sites[order]
-        for index in range(count):
-            x, y, yaw = (self._draw(1, *span)[:, 0] for span in (place.x, place.y, place.yaw))
-            poses[:, index, 0] += x
-            poses[:, index, 1] += y
-            poses[:, index, 2] += place.height + self._bottom
-            poses[:, index, 3:] = multiply(about(up, yaw), home)
-        qpos[:, self._object_columns] = poses.flatten(1)
-        return qpos, self._rest.expand_as(self._home)
-
-    def _change_objects(self, mask: torch.Tensor) -> None:
-        """Draw friction and mass of the objects anew where the mask [B] is set."""
-        import torch
-
-        changes, nominal, fields = self.task.object_changes, self._nominal, self.world.fields
-        if not (changes.each_reset or self._first):
-            return
-        ratio, offset = self._draw(1, *changes.friction), self._draw(1, *changes.mass_offset)
-        bodies, geoms, column = self._bodies, self._object_geoms, mask.unsqueeze(1)
-        mass = (nominal["body_mass"][:, bodies] + offset).clamp(min=1e-6)
-        growth = (mass / nominal["body_mass"][:, bodies]).unsqueeze(2)
-        inertia = nominal["body_inertia"][:, bodies] * growth
-        weights = torch.stack((1 / mass, (1 / inertia).mean(dim=2)), dim=2)
-        values = {
-            "body_mass": (bodies, mass), "body_subtreemass": (bodies, mass), "body_inertia": (bodies, inertia),
-            "body_invweight0": (bodies, weights),
-            "geom_friction": (geoms, nominal["geom_friction"][:, geoms] * ratio.unsqueeze(2)),
-        }  # fmt: skip
-        for name, (where, value) in values.items():
-            chosen = column if value.ndim == 2 else column.unsqueeze(2)
-            fields[name][:, where] = torch.where(chosen, value, fields[name][:, where])
-        self.friction.copy_(torch.where(mask, ratio[:, 0], self.friction))
-        self.mass.copy_(torch.where(mask, mass[:, 0], self.mass))
-
-    def _observe(self) -> dict[str, torch.Tensor]:
-        return observe(self)
-
-
-_MEMORY = (
-    "action", "last_action", "episode_length_buf", "_steps", "_return", "metric", "friction", "mass", "_push_left",
-    "_start_joints", "_start_position", "_home", "_sums", "_totals", "target", "_forces_view", "_distance_planes",
-)  # fmt: skip
-
-
-def _wxyz(xyzw: torch.Tensor) -> torch.Tensor:
-    import torch
-
-    return torch.cat((xyzw[..., 3:], xyzw[..., :3]), dim=-1)

@@ -28,7 +28,7 @@ class SensorSuite:
 
     Sensors of one class share one launch, whatever their number. Only what they ask for is built: distance fields
     of the meshes they track, triangle trees, and kernels for the kinds of geometries they meet. On CUDA an update is
-    recorded once and replayed.
+    recorded once and replayed; inside a recording of the caller's it becomes part of that one.
 
     Readings of environments that the state reports as diverged are NaN; the others do not notice.
 
@@ -119,6 +119,10 @@ class SensorSuite:
             raise UsageError(f"dt is the positive time since the last update (s); received {dt!r}.")
         wp = warp()
         if not self.device.is_cuda:
+            self._launch(state, dt)
+        elif self.device.is_capturing:
+            if self._histories or not all(runtime.recordable for runtime in self.runtimes):
+                raise UsageError("Sensors with a history or with meshes that move cannot be part of another recording.")
             self._launch(state, dt)
         elif self._graph and self._graph[1] is state and self._graph[2] == dt:
             wp.capture_launch(self._graph[0])

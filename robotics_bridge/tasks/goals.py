@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from robotics_bridge.tasks.rotations import about, multiply, tilted
+from robotics_bridge.tasks.rotations import about, constant, multiply, tilted
 
 if TYPE_CHECKING:
     import torch
@@ -60,11 +60,8 @@ class SteppingRotation(Goal):
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return the goals one step further."""
-        import torch
-
         del draw
-        axis = torch.tensor(self.axis, dtype=quat.dtype, device=quat.device)
-        turn = about(axis, torch.tensor(self.step, dtype=quat.dtype, device=quat.device))
+        turn = about(constant(self.axis or (0.0, 0.0, 1.0), quat), constant(self.step, quat))
         return multiply(turn.expand_as(goal), goal)
 
 

@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import torch
+
+
+def constant(values: float | Sequence[float], like: torch.Tensor, dtype: torch.dtype | None = None) -> torch.Tensor:
+    """Return numbers as a tensor on the device of another: made once, so that later calls copy nothing to the device.
+
+    Args:
+        values: a number or some numbers [n]; do not write to the result.
+        like: tensor whose device is taken.
+        dtype: of the result; that of ``like`` by default.
+    """
+    own = tuple(values) if isinstance(values, Sequence) else values
+    return _constant(own, like.device, dtype or like.dtype)
+
+
+@cache
+def _constant(values: Any, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
+    import torch
+
+    with torch.inference_mode(False):
+        return torch.tensor(values, device=device, dtype=dtype)
 
 
 def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -30,6 +52,13 @@ def conjugate(q: torch.Tensor) -> torch.Tensor:
     import torch
 
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
+
+
+def from_xyzw(q: torch.Tensor) -> torch.Tensor:
+    """Return quaternions (x, y, z, w) [..., 4] as (w, x, y, z)."""
+    import torch
+
+    return torch.cat((q[..., 3:], q[..., :3]), dim=-1)
 
 
 def rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
@@ -84,8 +113,5 @@ def six_numbers(q: torch.Tensor) -> torch.Tensor:
 
 def tilted(turn_x: torch.Tensor, turn_y: torch.Tensor) -> torch.Tensor:
     """Return the quaternions [..., 4] of a turn about x by angles [...], then about the fixed y (rad)."""
-    import torch
-
-    x = torch.tensor([1.0, 0.0, 0.0], device=turn_x.device)
-    y = torch.tensor([0.0, 1.0, 0.0], device=turn_x.device)
+    x, y = constant((1.0, 0.0, 0.0), turn_x), constant((0.0, 1.0, 0.0), turn_x)
     return multiply(about(y, turn_y), about(x, turn_x))

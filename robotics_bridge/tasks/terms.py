@@ -3,11 +3,17 @@
 A term takes a :class:`~robotics_bridge.tasks.moment.Moment` and its parameters and returns one number per environment
 [B]. Weights are per second: the environment multiplies by its weight and by the time of a control step, as
 manager-based environments do. Formulas behind the names of table 4.8 are not published; those here are ours.
+
+On CUDA the environment records terms into a graph: they run once as Python, later only as what they launched. A term
+that copies numbers to the device takes them from :func:`~robotics_bridge.tasks.rotations.constant`; one that waits for
+the device, or counts in Python, needs ``graphs=False``.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+
+from robotics_bridge.tasks.rotations import constant, rotate
 
 if TYPE_CHECKING:
     import torch
@@ -66,9 +72,7 @@ def off_axis(m: Moment) -> torch.Tensor:
 
 def far_from(m: Moment, *, target: tuple[float, float, float] | None, margin: float) -> torch.Tensor:
     """Return the distance (m) of the object from a place (or from where its episode began) beyond a margin."""
-    import torch
-
-    home = m.start_position if target is None else torch.tensor(target, device=m.object_position.device)
+    home = m.start_position if target is None else constant(target, m.object_position)
     return ((m.object_position - home).norm(dim=1) - margin).clamp(min=0)
 
 
@@ -100,21 +104,13 @@ def work(m: Moment) -> torch.Tensor:
 
 def spin(m: Moment, *, local_axis: tuple[float, float, float], low: float, high: float) -> torch.Tensor:
     """Return the object's angular velocity about its own axis (rad/s), within bounds."""
-    import torch
-
-    from robotics_bridge.tasks.rotations import rotate
-
-    axis = rotate(m.object_quat, torch.tensor(local_axis, device=m.object_quat.device))
+    axis = rotate(m.object_quat, constant(local_axis, m.object_quat))
     return (m.object_spin * axis).sum(dim=1).clamp(low, high)
 
 
 def alignment(m: Moment, local_up: tuple[float, float, float]) -> torch.Tensor:
     """Return the cosine [B] between an axis of the object and the vertical."""
-    import torch
-
-    from robotics_bridge.tasks.rotations import rotate
-
-    return rotate(m.object_quat, torch.tensor(local_up, device=m.object_quat.device))[:, 2]
+    return rotate(m.object_quat, constant(local_up, m.object_quat))[:, 2]
 
 
 def leaning(m: Moment, *, local_up: tuple[float, float, float], margin: float) -> torch.Tensor:
@@ -124,9 +120,7 @@ def leaning(m: Moment, *, local_up: tuple[float, float, float], margin: float) -
 
 def pose_change(m: Moment, *, excluded: str) -> torch.Tensor:
     """Return the squared deviation (rad²) of joints from their start; those named ``excluded`` are free."""
-    import torch
-
-    keep = torch.tensor([excluded not in name for name in m.joint_names], device=m.joint_position.device)
+    keep = constant([float(excluded not in name) for name in m.joint_names], m.joint_position)
     return (((m.joint_position - m.start_joints) ** 2) * keep).sum(dim=1)
 
 

@@ -106,6 +106,7 @@ class Thermometers:
         self._heat = link_temperature(self.suite, links[0])
         numbers = [scene.link_index(name) for name in balls]
         self._balls = torch.as_tensor(numbers, device=env.device)
+        self._numbers = torch.arange(len(balls), device=env.device)
         # 0 where a geometry is no tip and no ball, 1 for tips, 2 + k for ball k.
         roles = np.zeros(len(scene.geometries), dtype=np.int32)
         for tip in env.model.tips:
@@ -159,11 +160,8 @@ class Thermometers:
     def after(self, moment: Moment) -> None:
         """Read the thermometers at the end of a control step, and tell the rewards."""
         self.judge(moment.dt)
-        import torch
-
-        rows = torch.arange(self._env.num_envs, device=self._env.device)
-        tips = self._env.world.state.pose_torch[:, self._env._tip_links, :3]
-        target = self._env.object_pose[rows, self._env.target, :3]
+        tips = self._env.world.state.pose_torch[:, self._env.contacts.tip_links, :3]
+        target = self._env.object_pose[self._env.rows, self._env.target, :3]
         moment.extras["progress"] = progress(self.temperature().amax(dim=1), self.thermal)
         moment.extras["holding"] = (self.latched & self.touching).float()
         moment.extras["latched"] = self.latched.float()
@@ -222,7 +220,7 @@ class Thermometers:
         """Make the target ball hot."""
         import torch
 
-        hot = torch.nn.functional.one_hot(self._env.target, len(self._balls))
+        hot = self._env.target.unsqueeze(1) == self._numbers
         value = self.thermal.ambient + (self.thermal.hot - self.thermal.ambient) * hot
         known = self._heat[:, self._balls]
         self._heat[:, self._balls] = torch.where(mask.unsqueeze(1), value.to(known.dtype), known)
