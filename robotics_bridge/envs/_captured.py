@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -91,15 +92,17 @@ class Captured:
 
         wp = warp()
         where = wp.device_to_torch(self._device)
-        graph = torch.cuda.CUDAGraph()
+        graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream(where)
         graph.register_generator_state(self._generator)
-        # Results outlive the caller's inference mode, tensors of which no gradient could ever pass.
-        with torch.cuda.device(where), torch.inference_mode(False), torch.no_grad():  # noqa: SIM117
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                stream = wp.stream_from_torch(torch.cuda.current_stream(where))
-                # Waiting for Warp's own stream would tie the recording to work outside of it.
-                with wp.ScopedStream(stream, sync_enter=False):
-                    result = work()
+        stream = wp.stream_from_torch(side)
+        with contextlib.ExitStack() as scope:
+            # Results outlive the caller's inference mode, tensors of which no gradient could ever pass.
+            for each in (torch.cuda.device(where), torch.inference_mode(False), torch.no_grad()):
+                scope.enter_context(each)
+            scope.enter_context(torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"))
+            # Waiting for Warp's own stream would tie the recording to work outside of it.
+            scope.enter_context(wp.ScopedStream(stream, sync_enter=False))
+            result = work()
         return graph, result
 
     def _heal(self, state: torch.Tensor) -> None:

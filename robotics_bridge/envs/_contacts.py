@@ -97,7 +97,7 @@ class Contacts:
     @property
     def tip_force(self) -> torch.Tensor:
         """Net normal contact force [B, F, 3] on finger tips in their own frame, within ±10 N as published."""
-        turn = conjugate(from_xyzw(self._world.state.pose_torch[:, self.tip_links, 3:]))
+        turn = conjugate(from_xyzw(self._world.pose[:, self.tip_links, 3:]))
         return rotate(turn, self.forces[:, : self._tips]).clamp(-_LIMIT, _LIMIT).nan_to_num()
 
     @property

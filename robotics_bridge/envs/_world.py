@@ -69,6 +69,9 @@ class World:
             self.fields = {name: torch.from_numpy(np.array(nominal[name], np.float32)) for name in FIELDS}
         self.device = self.qpos.device
         self.state = self.engine.state
+        self.pose: torch.Tensor = self.state.pose_torch
+        """[B, L, 7] world poses of links (m; x y z, qx qy qz qw) as of the last step or refresh; a view."""
+        self._time = self.state.time_torch
         self.warp_device = pick_device(device)
         self.start = self.qpos.clone()
         self._pushed = False
@@ -114,7 +117,7 @@ class World:
         self.qvel.masked_fill_(column, 0.0)
         self.ctrl.masked_fill_(column, 0.0)
         self.push.masked_fill_(column.unsqueeze(2), 0.0)
-        self.state.time_torch.masked_fill_(mask, 0.0)
+        self._time.masked_fill_(mask, 0.0)
         if self.native:
             self._warmstart.masked_fill_(column, 0.0)
             return
@@ -133,7 +136,7 @@ class World:
         own |= {f"field.{name}": value for name, value in self.fields.items()}
         if self.native:
             own["warmstart"] = self._warmstart
-            own["time"] = self.state.time_torch
+            own["time"] = self._time
         else:
             own["integration"] = torch.from_numpy(self.engine.integration_state())
         return {name: value.clone() for name, value in own.items()}
@@ -146,7 +149,7 @@ class World:
             getattr(self, name).copy_(values[name])
         if self.native:
             self._warmstart.copy_(values["warmstart"])
-            self.state.time_torch.copy_(values["time"])
+            self._time.copy_(values["time"])
         else:
             for env in range(self.num_envs):
                 self.engine.set_fields(env, {name: value[env].numpy() for name, value in self.fields.items()})

@@ -182,7 +182,7 @@ class Env:
 
         if self.touch is None:
             raise UsageError("There are no tactile links; make the environment with an observation type.")
-        pose = self.world.state.pose_torch
+        pose = self.world.pose
         palm, links = pose[:, self._palm : self._palm + 1], pose[:, self._tactile_links]
         inverse = conjugate(from_xyzw(palm[..., 3:])).expand(-1, links.shape[1], -1)
         place = rotate(inverse, links[..., :3] - palm[..., :3])

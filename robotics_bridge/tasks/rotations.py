@@ -104,10 +104,7 @@ def six_numbers(q: torch.Tensor) -> torch.Tensor:
     """Return the first two columns of the rotation matrices as [..., 6] (Zhou et al. 2019)."""
     import torch
 
-    x = torch.zeros_like(q[..., 1:])
-    x[..., 0] = 1.0
-    y = torch.zeros_like(x)
-    y[..., 1] = 1.0
+    x, y = constant((1.0, 0.0, 0.0), q), constant((0.0, 1.0, 0.0), q)
     return torch.cat((rotate(q, x), rotate(q, y)), dim=-1)
 
 

@@ -102,7 +102,7 @@ class Thermometers:
                 other=Body("plastic", thermal.ambient), conduction=thermal.conduction, convection=thermal.convection,
             )  # fmt: skip
         self.suite = SensorSuite(scene, sensors, num_envs=env.num_envs, device=env.world.warp_device)
-        self._links = links
+        self._cells = [self.suite.read(link) for link in links]
         self._heat = link_temperature(self.suite, links[0])
         numbers = [scene.link_index(name) for name in balls]
         self._balls = torch.as_tensor(numbers, device=env.device)
@@ -132,7 +132,7 @@ class Thermometers:
         """Return the highest cell temperature [B, F] of every finger link (°C)."""
         import torch
 
-        return torch.stack([self.suite.read(link).flatten(1).amax(dim=1) for link in self._links], dim=1)
+        return torch.stack([cells.flatten(1).amax(dim=1) for cells in self._cells], dim=1)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes: cold fingers, another hot ball."""
@@ -144,9 +144,9 @@ class Thermometers:
             self._env.target.copy_(torch.where(mask, drawn, self._env.target))
         self._apply(mask)
         self.suite.reset(mask)
-        for link in self._links:
+        for cells in self._cells:
             # Until their next update, readings are those of the episode before.
-            self.suite.read(link).masked_fill_(mask.view(-1, 1, 1, 1), self.thermal.ambient)
+            cells.masked_fill_(mask.view(-1, 1, 1, 1), self.thermal.ambient)
         self.latched &= ~mask
         self.touching &= ~mask
         self.latch_time.masked_fill_(mask, float("inf"))
@@ -160,7 +160,7 @@ class Thermometers:
     def after(self, moment: Moment) -> None:
         """Read the thermometers at the end of a control step, and tell the rewards."""
         self.judge(moment.dt)
-        tips = self._env.world.state.pose_torch[:, self._env.contacts.tip_links, :3]
+        tips = self._env.world.pose[:, self._env.contacts.tip_links, :3]
         target = self._env.object_pose[self._env.rows, self._env.target, :3]
         moment.extras["progress"] = progress(self.temperature().amax(dim=1), self.thermal)
         moment.extras["holding"] = (self.latched & self.touching).float()
@@ -200,7 +200,7 @@ class Thermometers:
 
         t = self.thermal
         if group == "thermal":
-            cells = torch.cat([self.suite.read(link).flatten(1) for link in self._links], dim=1)
+            cells = torch.cat([readings.flatten(1) for readings in self._cells], dim=1)
             return ((cells - t.ambient) / (t.hot - t.ambient)).nan_to_num().float()
         flags = torch.stack((self.latched.float(), self.touching.float()), dim=1)
         return torch.cat((progress(self.temperature(), t).nan_to_num().float(), flags), dim=1)
