@@ -74,7 +74,10 @@ def speed(options: argparse.Namespace, out: Path) -> None:
 def one_speed(task: str, sense: str, envs: int, options: argparse.Namespace) -> dict[str, Any]:
     start = time.perf_counter()
     observe = "none" if sense == "none" else "force_torque"
-    env = tasks.make(task, num_envs=envs, device=options.device, observe=observe, placement="hand", resolution="med")
+    env = tasks.make(
+        task, num_envs=envs, device=options.device, observe=observe, placement="hand", resolution="med",
+        graphs=False if options.eager else None,
+    )  # fmt: skip
     actions = torch.randn(8, envs, env.num_actions, device=env.device)
     look = front_end(sense, env)
     count = 0
@@ -91,7 +94,7 @@ def one_speed(task: str, sense: str, envs: int, options: argparse.Namespace) -> 
         made = wait(env.device) - start
         seconds = per_call(step, env.device, repeats=options.repeats)
     row = {"part": "speed", "task": task, "sense": sense, "envs": envs, "device": options.device, "made_s": made}
-    row |= {"step_ms": 1e3 * seconds, "env_steps_per_s": envs / seconds}
+    row |= {"graphs": env.recorded, "step_ms": 1e3 * seconds, "env_steps_per_s": envs / seconds}
     if env.device.type == "cuda":
         row["memory_gb"] = torch.cuda.max_memory_allocated(env.device) / 2**30
     return row
@@ -120,7 +123,9 @@ def split(options: argparse.Namespace, out: Path) -> None:
     """A PPO iteration: physics, touch, the rest of the environment, acting, learning."""
     for envs in options.envs:
         task = tasks.load("in_palm_rotate")
-        env = tasks.make(task, num_envs=envs, device=options.device, observe="force_torque")
+        env = tasks.make(
+            task, num_envs=envs, device=options.device, observe="force_torque", graphs=False if options.eager else None
+        )
         trainer = teacher.Trainer(env, replace(task.teacher, num_envs=envs))
         rows = [trainer.iterate() for _ in range(3)][1:]
         steps = trainer.settings.steps_per_env
@@ -146,7 +151,8 @@ def split(options: argparse.Namespace, out: Path) -> None:
                     repeats=options.repeats,
                 ),
             }  # fmt: skip
-        row = {"part": "split", "envs": envs, "device": options.device, "env_step_ms": 1e3 * whole}
+        row = {"part": "split", "envs": envs, "device": options.device, "graphs": env.recorded}
+        row["env_step_ms"] = 1e3 * whole
         row |= {name: 1e3 * value for name, value in parts.items()}
         row["rest_ms"] = row["env_step_ms"] - row["physics_ms"] - row["touch_ms"]
         row |= {"iteration_s": sum(r["collect_s"] + r["learn_s"] for r in rows) / len(rows)}
@@ -235,6 +241,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=["in_palm_rotate", "in_hand_repose", "screwdriver"])
     parser.add_argument("--senses", nargs="+", default=["none", "force_torque"], choices=SENSES)
     parser.add_argument("--envs", nargs="+", type=int, default=None)
+    parser.add_argument("--eager", action="store_true", help="speed and split without CUDA graphs")
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--minutes", type=float, default=7.5)
     parser.add_argument("--iterations", type=int, default=1_000_000)

@@ -190,6 +190,11 @@ class Env:
         return torch.cat((place, turn[..., 1:], turn[..., :1]), dim=-1)
 
     @property
+    def recorded(self) -> bool:
+        """Whether what a control step does around physics is replayed as CUDA graphs by now."""
+        return isinstance(self._judge_part, Captured) and self._judge_part.recorded
+
+    @property
     def object_pose(self) -> torch.Tensor:
         """Poses [B, K, 7] of the objects (x y z, qw qx qy qz)."""
         return self.world.qpos[:, self._object_columns].unflatten(1, (-1, 7))
@@ -227,9 +232,9 @@ class Env:
             action: [B, A]; 0 is the rest position, 1 is ``task.action_ratio`` of the joint's range from it.
 
         Returns:
-            Observations by group, reward [B], terminated [B] and truncated [B] (bool), and a dictionary with
-            ``time_outs`` (truncated), ``diverged`` [B], of ended episodes ``metric``, ``return`` and ``steps`` [B],
-            and ``final_observations`` if asked for.
+            Observations by group (the next step overwrites ``tactile``), reward [B], terminated [B] and truncated [B]
+            (bool), and a dictionary with ``time_outs`` (truncated), ``diverged`` [B], of ended episodes ``metric``,
+            ``return`` and ``steps`` [B], and ``final_observations`` if asked for.
 
         Raises:
             UsageError: the action has another shape.

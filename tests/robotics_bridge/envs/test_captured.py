@@ -87,7 +87,7 @@ def test_what_would_wait_is_noticed(work: Callable[[torch.Tensor], Any]) -> None
     x = torch.ones(4)
     index = torch.arange(2)
     with _Waits() as waits:
-        x[index], x[:2], x.masked_fill(x > 2, 0.0)
+        _ = x[index], x[:2], x.masked_fill(x > 2, 0.0)
     assert waits.found == []
     with _Waits() as waits:
         work(x)
@@ -189,6 +189,8 @@ def test_nothing_that_changes_from_step_to_step_lives_outside_the_memory_of_a_re
         ended += int((first[2] | first[3]).sum())
         _same(first, second)
     assert all(part.recorded for part in parts)
+    assert two.recorded
+    assert not one.recorded
     assert ended >= 6
     _same(one.state_dict(), two.state_dict())
 
