@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from brainbench.errors import UsageError
@@ -23,7 +24,7 @@ class Captured:
     that it reads stay what they were. Random numbers of the generator are those that the part would draw unrecorded.
 
     Args:
-        work: the part; it takes nothing and returns tensors in dictionaries and tuples, or None.
+        work: the part; it returns tensors in dictionaries and tuples, or None.
         generator: of its random numbers.
         device: Warp device.
         kept: tensors of the result that last anyway and are returned themselves; others are returned as copies.
@@ -33,7 +34,7 @@ class Captured:
 
     def __init__(
         self,
-        work: Callable[[], Any],
+        work: Callable[..., Any],
         generator: torch.Generator,
         device: Any,
         *,
@@ -54,24 +55,27 @@ class Captured:
         """Whether the part is replayed."""
         return self._graph is not None
 
-    def __call__(self) -> Any:
+    def __call__(self, *subjects: Any) -> Any:
         """Run the part and return its result.
+
+        Args:
+            *subjects: what the part takes, the same objects in every call.
 
         Raises:
             UsageError: the part is required to be recorded and cannot be.
         """
         if self._graph is None and not self.failed and self._left <= 0:
-            self._try()
+            self._try(lambda: self._work(*subjects))
         self._left -= 1
         if self._graph is None:
-            return self._work()
+            return self._work(*subjects)
         self._graph.replay()
         return _copied(self._result, self._kept)
 
-    def _try(self) -> None:
+    def _try(self, work: Callable[[], Any]) -> None:
         state = self._generator.get_state()
         try:
-            self._graph, self._result = self._record(self._work)
+            self._graph, self._result = self._record(work)
         except (RuntimeError, UsageError) as error:
             self.failed = _reason(error)
             self._heal(state)
@@ -92,18 +96,25 @@ class Captured:
 
         wp = warp()
         where = wp.device_to_torch(self._device)
+        # What Python throws away meanwhile could free device memory, which ends a recording.
+        gc.collect()
+        own = torch.cuda.ExternalStream(self._device.stream.cuda_stream, device=where)
         graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream(where)
         graph.register_generator_state(self._generator)
         stream = wp.stream_from_torch(side)
         with contextlib.ExitStack() as scope:
+            scope.enter_context(_no_collection())
+            scope.enter_context(torch.cuda.device(where))
+            # A recording that breaks off leaves torch on its stream.
+            scope.enter_context(torch.cuda.stream(torch.cuda.current_stream(where)))
             # Results outlive the caller's inference mode, tensors of which no gradient could ever pass.
-            for each in (torch.cuda.device(where), torch.inference_mode(False), torch.no_grad()):
-                scope.enter_context(each)
+            scope.enter_context(torch.inference_mode(False))
+            scope.enter_context(torch.no_grad())
             scope.enter_context(torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"))
             # Waiting for Warp's own stream would tie the recording to work outside of it.
             scope.enter_context(wp.ScopedStream(stream, sync_enter=False))
             result = work()
-        return graph, result
+        return _Graph(graph, own), result
 
     def _heal(self, state: torch.Tensor) -> None:
         """Take generators out of the recording that broke off: one that ends well does."""
@@ -114,6 +125,33 @@ class Captured:
         except RuntimeError as error:
             _LOG.warning("Random numbers may not recover from a recording that broke off: %s", _reason(error))
         self._generator.set_state(state)
+
+
+class _Graph:
+    """A recorded graph that is replayed on torch's stream, between what Warp does on its own."""
+
+    def __init__(self, graph: torch.cuda.CUDAGraph, warp_stream: torch.cuda.Stream) -> None:
+        self._graph, self._warp = graph, warp_stream
+
+    def replay(self) -> None:
+        """Do it again."""
+        import torch
+
+        current = torch.cuda.current_stream(self._warp.device)
+        current.wait_stream(self._warp)
+        self._graph.replay()
+        self._warp.wait_stream(current)
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _copied(result: Any, kept: Sequence[torch.Tensor]) -> Any:

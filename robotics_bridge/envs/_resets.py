@@ -20,35 +20,37 @@ class Resets:
     def __init__(self, env: Env) -> None:
         import torch
 
-        self._env = env
         self._nominal = {name: value.clone() for name, value in env.world.fields.items()}
         first = env.world.model
         bodies = [first.body(name).id for name in env.model.objects]
         geoms = np.flatnonzero(np.isin(np.asarray(first.geom_bodyid), bodies))
         self._geoms = torch.as_tensor(geoms, device=env.device)
         rows = torch.as_tensor(env.world.shape_of, device=env.device)
-        self._bottom = self._floats([shape.bottom for shape in env.model.shapes])[rows]
+
+        def floats(values: object) -> torch.Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=env.device)
+
+        self._bottom = floats([shape.bottom for shape in env.model.shapes])[rows]
         self._grasps = None
         if env.task.starts == "grasps":
             from robotics_bridge.tasks.grasps import grasps_for
 
-            self._grasps = {k: self._floats(v) for k, v in grasps_for(env.task, env.hand, env.model).items()}
+            self._grasps = {k: floats(v) for k, v in grasps_for(env.task, env.hand, env.model).items()}
             # Grasps belong to a shape: each environment takes one of its own.
             self._grasp_rows = self._grasps["rows"][rows].long()
         sites = env.task.placement.sites
-        self._sites = self._floats(sites) if sites else None
+        self._sites = floats(sites) if sites else None
         self.first = True
         """Whether no episode began yet: friction and mass are drawn then in any case."""
 
-    def begin(self, mask: torch.Tensor) -> None:
+    def begin(self, env: Env, mask: torch.Tensor) -> None:
         """Start new episodes where the mask [B] bool is set."""
         import torch
 
-        env = self._env
         column = mask.unsqueeze(1)
-        qpos, home = self._starts()
+        qpos, home = self._starts(env)
         env._home.copy_(torch.where(column, home, env._home))
-        self._change_objects(mask)
+        self._change_objects(env, mask)
         env.world.reset(mask, qpos)
         env.drives.reset(mask, env._draw)
         if env.watch is not None:
@@ -72,16 +74,10 @@ class Resets:
         env.contacts.refresh(mask)
         self.first = False
 
-    def _floats(self, values: object) -> torch.Tensor:
-        import torch
-
-        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self._env.device)
-
-    def _starts(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _starts(self, env: Env) -> tuple[torch.Tensor, torch.Tensor]:
         """Return positions [B, nq] for new episodes, and the drives' targets [B, J] without action."""
         import torch
 
-        env = self._env
         place, count = env.task.placement, len(env.model.objects)
         qpos = env.world.start.clone()
         if self._grasps is not None:
@@ -107,12 +103,11 @@ class Resets:
         qpos[:, env._object_columns] = poses.flatten(1)
         return qpos, env._rest.expand_as(env._home)
 
-    def _change_objects(self, mask: torch.Tensor) -> None:
+    def _change_objects(self, env: Env, mask: torch.Tensor) -> None:
         """Draw friction and mass of the objects anew where the mask [B] is set."""
         import torch
 
-        env, nominal = self._env, self._nominal
-        changes, fields = env.task.object_changes, env.world.fields
+        nominal, changes, fields = self._nominal, env.task.object_changes, env.world.fields
         if not (changes.each_reset or self.first):
             return
         ratio, offset = env._draw(1, *changes.friction), env._draw(1, *changes.mass_offset)

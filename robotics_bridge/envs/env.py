@@ -126,13 +126,14 @@ class Env:
         self.watch: Watch | None = None if task.watch is None else task.watch(self)
         """The part of the task with a state of its own."""
         self._resets = Resets(self)
-        self._aim_part: Callable[[], Any] = self._aim
-        self._judge_part: Callable[[], Any] = self._judge
+        # Functions, not bound methods: an environment that refers to itself would outlive its use.
+        self._aim_part: Callable[[Env], Any] = Env._aim
+        self._judge_part: Callable[[Env], Any] = Env._judge
         if self.device.type == "cuda" and graphs is not False:
             kept = [self._extent] if self.touch is None else [self._extent, self.touch.reading]
             self._aim_part, self._judge_part = (
                 Captured(part, self._generator, self.world.warp_device, kept=kept, required=bool(graphs))
-                for part in (self._aim, self._judge)
+                for part in (Env._aim, Env._judge)
             )
         self.observations: dict[str, torch.Tensor] = {}
         """Of the last step or reset."""
@@ -219,7 +220,7 @@ class Env:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         elif mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
             raise UsageError(f"A mask has one bool per environment ({self.num_envs}); received {tuple(mask.shape)}.")
-        self._resets.begin(mask)
+        self._resets.begin(self, mask)
         self.observations = observe(self)
         return self.observations
 
@@ -246,9 +247,9 @@ class Env:
             )
         self.last_action.copy_(self.action)
         self.action.copy_(action.detach())
-        self._aim_part()
+        self._aim_part(self)
         self._advance()
-        result = self._judge_part()
+        result = self._judge_part(self)
         self.observations = result[0]
         return result
 
@@ -378,7 +379,7 @@ class Env:
         self.goals.advance(self._object_quat(), self._draw)
         if self.keeps_final:
             info["final_observations"] = {k: v.clone() for k, v in observe(self).items()}
-        self._resets.begin(done)
+        self._resets.begin(self, done)
         return observe(self), reward, terminated, truncated, info
 
     def _contain(self) -> torch.Tensor:

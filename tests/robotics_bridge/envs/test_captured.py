@@ -6,8 +6,10 @@ launches of Warp and the calls of C MuJoCo that a step made are done again on th
 
 from __future__ import annotations
 
+import gc
 import logging
 import traceback
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -163,7 +165,7 @@ class _Imitated(Captured):
 
 def _imitate(env: Env) -> tuple[_Imitated, _Imitated]:
     kept = [env._extent] if env.touch is None else [env._extent, env.touch.reading]
-    parts = (_Imitated(env._aim, env._generator, None), _Imitated(env._judge, env._generator, None, kept=kept))
+    parts = (_Imitated(Env._aim, env._generator, None), _Imitated(Env._judge, env._generator, None, kept=kept))
     env._aim_part, env._judge_part = parts
     return parts
 
@@ -260,6 +262,21 @@ def test_a_recording_that_is_asked_for_and_fails_is_an_error_that_tells_what_to_
         part()
 
 
+def test_an_environment_does_not_outlive_its_last_reference() -> None:
+    # Its device memory would wait for Python's collector, and be freed in the middle of another recording.
+    env = _make("in_palm_rotate", {}, threads=1)
+    _imitate(env)
+    for _ in range(4):
+        env.step(torch.zeros(3, 5))
+    seen = weakref.ref(env)
+    gc.disable()
+    try:
+        del env
+        assert seen() is None
+    finally:
+        gc.enable()
+
+
 def test_graphs_are_refused_on_a_processor() -> None:
     with pytest.raises(UsageError, match="CUDA only, and the environment is on cpu"):
         tasks.make("in_palm_rotate", graphs=True)
@@ -293,7 +310,7 @@ def test_a_replayed_part_is_the_eager_part(task: str) -> None:
         env.load_state_dict(state)
         eager = _pytree.tree_map(torch.clone, env._judge())
         env.load_state_dict(state)
-        replayed = part()
+        replayed = part(env)
         for (path, one), (_, two) in zip(
             _pytree.tree_leaves_with_path(eager), _pytree.tree_leaves_with_path(replayed), strict=True
         ):
