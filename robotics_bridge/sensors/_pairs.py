@@ -67,6 +67,11 @@ class PairTable:
         return any(slot["contact"] for slot in self._slots)
 
     @property
+    def _apart(self) -> bool:
+        # A processor gains nothing from more threads.
+        return self.contacts_needed and bool(self._device.is_cuda)
+
+    @property
     def state_bytes(self) -> int:
         """Memory per environment [bytes]."""
         return 4 * (sum(self._rooms) * 19 + len(self._slots) * (1 + self._words))
@@ -116,7 +121,7 @@ class PairTable:
         inputs = [self.plan, self._solids.struct.link, state.pose, state.velocity, state.contact_count]
         inputs += [state.contact_geom, state.contact_env, self._words, self._bits, state.status, age]
         dim = max(self._num_envs, room) if contacts else self._num_envs
-        wp.launch(start_kernel(contacts), dim=dim, inputs=inputs, device=self._device)
+        wp.launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
 
     def update(self, state: HandState) -> None:
         """List what every slot meets now; contacts were marked by :meth:`start`."""
@@ -124,4 +129,5 @@ class PairTable:
             return
         wp, solids = warp(), self._solids.struct
         inputs = [self.plan, solids, state.pose, state.velocity, self._words, self._bits, self.struct, self.crowded]
-        wp.launch(pair_kernel().pairs, dim=(self._num_envs, len(self._slots)), inputs=inputs, device=self._device)
+        dim = self._num_envs * (len(self._slots) + self._apart * state.pose.shape[1])
+        wp.launch(pair_kernel(self._apart), dim=dim, inputs=[*inputs, state.status], device=self._device)
