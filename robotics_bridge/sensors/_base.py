@@ -358,7 +358,7 @@ class ProbeRuntime(ReadoutRuntime):
 
 _SHARED = 32
 """Probes that one thread of a processor takes in turn."""
-_SHARED_CUDA, _FILL = 4, 4096
+_SHARED_CUDA, _FILL = 4, 2048
 """The same on a GPU, at most, and the threads of a multiprocessor from which on that pays."""
 
 

@@ -96,14 +96,14 @@ def noise_functions() -> SimpleNamespace:
     def minus_two_log(word: wp.uint32) -> float:
         """Return −2 ln(word / 2³²), odd words only, by a series: libraries of devices differ in the last digit."""
         split = split_log(float(word | wp.uint32(1)))
-        return float(-2.0) * ((split[0] - float(32.0)) * float(0.6931471805599453) + split[1])
+        return (float(32.0) - split[0]) * float(1.3862943611198906) - float(2.0) * split[1]
 
     @wp.func
     def normals(first: wp.uint32, second: wp.uint32) -> wp.vec2:
         """Return two independent standard normal numbers of two random words (Box and Muller 1958)."""
-        length = wp.sqrt(wp.max(minus_two_log(first), float(0.0)))
+        length = wp.sqrt(minus_two_log(first))
         # The angle within a quarter turn, counted from its middle: −π/4 … π/4.
-        part = float((second >> wp.uint32(7)) & wp.uint32(0x7FFFFF)) + float(0.5) - float(4194304.0)
+        part = float((second >> wp.uint32(7)) & wp.uint32(0x7FFFFF)) - float(4194303.5)
         x = part * float(1.8725351414619535e-07)
         q = x * x
         sine = x + x * q * (float(-0.16666655) + q * (float(0.008332178) + q * float(-0.000195173)))
@@ -190,10 +190,8 @@ def noise_functions() -> SimpleNamespace:
         drift = walk_state + p.walk * walk
         y = x + p.hysteresis * xi + drift + p.white * white + p.bias
         lag = fading * xi - x
-        if p.quantum > float(0.0):
-            y = p.quantum * wp.rint(y * p.levels)
-        if fixed[1] > float(0.0):
-            y = fixed[2]
+        y = wp.where(p.quantum > float(0.0), p.quantum * wp.rint(y * p.levels), y)
+        y = wp.where(fixed[1] > float(0.0), fixed[2], y)
         finite = wp.isfinite(x)
         return wp.vec3(
             wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state)

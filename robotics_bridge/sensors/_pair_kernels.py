@@ -21,6 +21,7 @@ def pair_structs() -> SimpleNamespace:
     @wp.struct
     class Slots:
         link: wp.array(dtype=wp.int32)
+        watched: wp.array(dtype=wp.int32)
         contact: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
         room: wp.array(dtype=wp.int32)
@@ -80,6 +81,8 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
 
     @wp.func
     def mark(slots: slots_type, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
+        if link < 0:
+            return
         for slot in range(slots.link.shape[0]):
             if slots.contact[slot] == 1 and slots.link[slot] == link:
                 place = slots.place[slot, other]
@@ -92,7 +95,6 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
     @wp.kernel(module="unique", grid_stride=False)
     def start(
         slots: slots_type,
-        link_of: wp.array(dtype=wp.int32),
         pose: wp.array2d(dtype=wp.transformf),
         velocity: wp.array2d(dtype=wp.spatial_vectorf),
         count: wp.array(dtype=wp.int32),
@@ -111,11 +113,13 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
             else:
                 status[tid] = status_of(pose, velocity, tid, count[0], owner.shape[0])
         if wp.static(contacts):
-            if tid < wp.min(count[0], owner.shape[0]):
+            if tid < owner.shape[0]:
+                # Asked for before the count is known, so that one waits for memory once.
                 pair = geometry[tid]
-                if pair[0] >= 0 and pair[1] >= 0:
-                    mark(slots, owner[tid], link_of[pair[0]], pair[1], words, bits)
-                    mark(slots, owner[tid], link_of[pair[1]], pair[0], words, bits)
+                env = owner[tid]
+                if tid < count[0] and pair[0] >= 0 and pair[1] >= 0:
+                    mark(slots, env, slots.watched[pair[0]], pair[1], words, bits)
+                    mark(slots, env, slots.watched[pair[1]], pair[0], words, bits)
 
     return start
 

@@ -93,6 +93,9 @@ class PairTable:
 
         plan = pair_structs().Slots()
         plan.link, plan.contact = ints([s["link"] for s in slots]), ints([int(s["contact"]) for s in slots])
+        # The link of every geometry whose contacts matter, to turn the others away at once.
+        links = self._solids.scene.link_of if self._solids.scene.geometries else np.full(1, -1)
+        plan.watched = ints(np.where(np.isin(links, [s["link"] for s in slots if s["contact"]]), links, -1))
         first = np.cumsum([0, *self._rooms])
         plan.first, plan.room = ints(first), ints(self._rooms)
         plan.members = ints([m for s in slots for m in s["members"]] or [0])
@@ -118,7 +121,7 @@ class PairTable:
         """Count an update, refresh the state's status and mark contacts."""
         wp, contacts = warp(), self.contacts_needed
         room = state.contact_env.shape[0]
-        inputs = [self.plan, self._solids.struct.link, state.pose, state.velocity, state.contact_count]
+        inputs = [self.plan, state.pose, state.velocity, state.contact_count]
         inputs += [state.contact_geom, state.contact_env, self._words, self._bits, state.status, age]
         dim = max(self._num_envs, room) if contacts else self._num_envs
         wp.launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)

@@ -4,7 +4,6 @@ Equation numbers are those of the thesis. Vectors are in the frame of the sensor
 """
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 from robotics_bridge.sensors._io_kernels import CLEAN, FUSED, STAGED, io_functions, io_structs
@@ -174,12 +173,8 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
 
 
 @cache
-def kinematic_functions(physical: bool) -> SimpleNamespace:
-    """Return the structure ``KinematicParams`` and ``wrench(params, x, depth, normal, velocity, spin)`` (4.6–4.9).
-
-    Args:
-        physical: friction and twist follow the object and the normal force never pulls; otherwise as published.
-    """
+def kinematic_params() -> Any:
+    """Return the structure ``KinematicParams``."""
     import warp as wp
 
     @wp.struct
@@ -190,11 +185,25 @@ def kinematic_functions(physical: bool) -> SimpleNamespace:
         shear: wp.float32
         twist: wp.float32
 
-    power = series_functions().power
+    return KinematicParams
+
+
+@cache
+def kinematic_function(physical: bool, fast: bool = False) -> Any:
+    """Return ``wrench(params, x, depth, normal, velocity, spin)`` (4.6–4.9).
+
+    Args:
+        physical: friction and twist follow the object and the normal force never pulls; otherwise as published.
+        fast: the power is the GPU's own (in modules with the option ``fast_math``) in place of a series.
+    """
+    import warp as wp
+
+    params_type = kinematic_params()
+    power = wp.pow if fast else series_functions().power
 
     @wp.func
     def wrench(
-        p: KinematicParams, x: wp.vec3f, depth: float, normal: wp.vec3f, velocity: wp.vec3f, spin: wp.vec3f
+        p: params_type, x: wp.vec3f, depth: float, normal: wp.vec3f, velocity: wp.vec3f, spin: wp.vec3f
     ) -> wp.spatial_vectorf:
         s = power(depth, p.exponent)
         relative = velocity + wp.cross(spin, x)
@@ -211,7 +220,7 @@ def kinematic_functions(physical: bool) -> SimpleNamespace:
         torque = wp.cross(x, f) - turn * normal
         return wp.spatial_vectorf(f[0], f[1], f[2], torque[0], torque[1], torque[2])
 
-    return SimpleNamespace(KinematicParams=KinematicParams, wrench=wrench)
+    return wrench
 
 
 @cache
@@ -241,14 +250,14 @@ def kinematic_kernel(
     probes_type, io_type = types.ProbeSet, types.Io
     noise = noise_functions()
     params_type, radius_noise = noise.NoiseParams, noise.radius_noise
-    law = kinematic_functions(physical)
-    law_type, wrench = law.KinematicParams, law.wrench
+    fast = fast and not raycast
+    law_type, wrench = kinematic_params(), kinematic_function(physical, fast)
 
     @wp.kernel(
         module="unique",
         grid_stride=False,
         launch_bounds=(THREADS, BLOCKS[mode]),
-        module_options={"fast_math": fast and not raycast},
+        module_options={"fast_math": fast},
     )
     def kinematic(
         probes: probes_type,
@@ -266,7 +275,15 @@ def kinematic_kernel(
         variant = int(0)
         if solids.kind.shape[0] > 1:
             variant = env
-        diverged = (io.status[env] & 1) != 0
+        n = span[0]
+        if (io.status[env] & 1) != 0:
+            while n < span[1]:
+                if probes.radius[n] > 0.0:
+                    lost(io, 6, env, n)
+                else:
+                    idle(io, 6, env, n)
+                n += span[2]
+            return
         first = pairs.first[slot]
         count = pairs.count[env, slot]
         law = laws[part]
@@ -282,9 +299,9 @@ def kinematic_kernel(
         rotation = wp.mat33f()
         offset = wp.vec3f()
         limit = float(0.0)
-        for n in range(span[0], span[1], span[2]):
+        while n < span[1]:
             radius = probes.radius[n]
-            if radius > 0.0 and not diverged:
+            if radius > 0.0:
                 lag, drift = recall_six(io, env, n, age)
                 x = probes.position[n]
                 best = float(wp.static(FAR))
@@ -328,9 +345,8 @@ def kinematic_kernel(
                         io.truth[channel, env, n] = truth[channel]
                 else:
                     emit_six(io, knobs, env, n, probe, age, episode, fixed, lag, drift, truth, signal)
-            elif radius > 0.0:
-                lost(io, 6, env, n)
             else:
                 idle(io, 6, env, n)
+            n += span[2]
 
     return kinematic

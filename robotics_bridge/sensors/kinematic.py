@@ -79,13 +79,13 @@ class KinematicRuntime(ProbeRuntime):
     """Serves kinematic taxels."""
 
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: Context) -> None:
-        from robotics_bridge.sensors._probe_kernels import kinematic_functions
+        from robotics_bridge.sensors._probe_kernels import kinematic_params
 
         first = next(iter(sensors.values()))
         scaled = first.total == "engine"
         super().__init__(sensors, 6, context, fusable=not scaled)
         self._options = (first.query == "raycast", first.convention == "physical")
-        kind = kinematic_functions(self._options[1]).KinematicParams
+        kind = kinematic_params()
         laws = []
         for sensor in sensors.values():
             law = kind()
