@@ -50,6 +50,13 @@ def contacts_for(capacity: int) -> int:
 WARP = 32
 """Threads of a GPU that run in step."""
 
+FEW, SOME = 2, 4
+"""Possible contacts of a whisker up to which two or four threads of a GPU find their forces; else eight or more do."""
+GRIP_BOUNDS = 128, 4
+"""CUDA launch bounds of these kernels."""
+AFTER_LOOK, AFTER_GRIP, ANYHOW = 0, 1, 2
+"""Queues of paused whiskers: those that looked, those whose contact forces were found, all others."""
+
 NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 """What whiskers may touch: a kernel holds only the code that its scenes need."""
 
