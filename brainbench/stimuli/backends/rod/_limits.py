@@ -50,8 +50,9 @@ def contacts_for(capacity: int) -> int:
 WARP = 32
 """Threads of a GPU that run in step."""
 
-FEW, SOME = 2, 4
-"""Possible contacts of a whisker up to which two or four threads of a GPU find their forces; else eight or more do."""
+GROUPS = (2, 2), (4, 4)
+"""Possible contacts of a whisker up to which a group of threads finds their forces on a GPU, and its threads; whiskers
+of more have groups of eight, or sixteen."""
 GRIP_BOUNDS = 128, 4
 """CUDA launch bounds of these kernels."""
 AFTER_LOOK, AFTER_GRIP, ANYHOW = 0, 1, 2

@@ -19,16 +19,15 @@ from brainbench.stimuli.backends.rod._limits import (
     AFTER_LOOK,
     ANYHOW,
     BENT,
-    FEW,
     FINEST,
     FOLD,
     GRIP_BOUNDS,
+    GROUPS,
     LARGEST_BEND,
     LOST,
     MESHES,
     NOTHING,
     REST,
-    SOME,
     SPARE,
     STOP,
     TRAVEL,
@@ -81,7 +80,9 @@ def solver(
     most_held = contacts_for(capacity)
     most_seen = most_held + SPARE
     # Threads of a group: for few contacts, for some and for many. A processor takes them one by one.
-    classes = ((FEW, 2), (SOME, 4), (most_held, 8 if most_held <= 8 else 16)) if sliced and cuda else ((most_held, 1),)
+    classes: tuple[tuple[int, int], ...] = ((most_held, 1),)
+    if sliced and cuda:
+        classes = (*GROUPS, (most_held, 8 if most_held <= 8 else 16))
     settle = contacts(real, capacity, most_held, 1).settle
     # Memory of a thread. Vectors and matrices, because arrays in a kernel carry addresses that the compiler loses.
     Links2: Any = wp.types.matrix((capacity, 2), real)
@@ -728,9 +729,9 @@ def solver(
                                 rest_of_frame = left_whole
                                 sort = int(0)
                                 if wp.static(len(classes) > 1):
-                                    if seen > wp.static(SOME):
+                                    if seen > wp.static(GROUPS[1][0]):
                                         sort = int(2)
-                                    elif seen > wp.static(FEW):
+                                    elif seen > wp.static(GROUPS[0][0]):
                                         sort = int(1)
                                 on.grips[sort, wp.atomic_add(on.tally, 3 + sort, 1)] = lane
                                 break
