@@ -21,7 +21,7 @@ from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, MESHES
 from brainbench.stimuli.backends.rod._pack import Chains, Shapes, Tracks, capacity_for, quaternions, still_knots
 from brainbench.stimuli.backends.rod._shapes import MESH
-from brainbench.stimuli.backends.rod._slices import Slices
+from brainbench.stimuli.backends.rod._slices import Slices, make_grips
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.objects import euler_matrix
 
@@ -94,6 +94,8 @@ class SweepLauncher:
         self.device = pick_device(device)
         self.sliced = against == MESHES and self.device.is_cuda if sliced is None else sliced
         self.slices = 0
+        self.tuning: dict[str, Any] = {}
+        """Arguments of :class:`Slices`."""
         self.scenes, self.grid, self.fidelity = scenes, grid, fidelity
         self.seconds: dict[str, float] = {}
         """What the last launch spent on placing objects, uploading, and computing."""
@@ -105,7 +107,12 @@ class SweepLauncher:
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.real = wp.float32 if fidelity.precision == "single" else wp.float64
         self.kernels = solver(
-            self.real, self.capacity, against, BOUNDS if bounds is None else bounds, sliced=self.sliced
+            self.real,
+            self.capacity,
+            against,
+            BOUNDS if bounds is None else bounds,
+            sliced=self.sliced,
+            cuda=self.device.is_cuda,
         )
         self._chains = to_struct(
             self.kernels.Chains, Chains(self.capacity, chains, self.quasistatic).arrays(), self.device
@@ -174,11 +181,13 @@ class SweepLauncher:
             options,
             wp.array(self.readings, dtype=real, device=device),
             out,
+            make_grips(kernels, real, self.capacity, len(row), device),
         ]
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
         if self.sliced:
-            self.slices = Slices(kernels, real, self.capacity, len(row), device).run(inputs, BLOCK)
+            slices = Slices(kernels, real, self.capacity, len(row), device, **self.tuning)
+            self.slices = slices.run(inputs, BLOCK)
         else:
             wp.launch(kernels.run, len(row), [*inputs, kernels.Paused()], device=device, block_dim=BLOCK)
         wp.synchronize_device(device)
