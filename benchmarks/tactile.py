@@ -114,6 +114,8 @@ def part_sensors(options: argparse.Namespace) -> Iterable[Row]:
     cases += [("kinematic", n, scene, noise) for n in options.taxels[1:] for noise in (None, FULL)]
     faster = next((scale for name, scale in BANDWIDTH.items() if name in options.name), 0.0)
     for name, count, where, noise in cases:
+        if options.only and name not in options.only:
+            continue
         label = name if name in CELLS else f"{name} {count}"
         label += (" noisy" if noise else "") + (" mesh 5k" if where is meshed else "")
         seconds, first, suite = timed(where, sensors(name, count, noise=noise), state, options.device)
@@ -269,7 +271,7 @@ def main() -> None:
     parser.add_argument("--taxels", type=int, nargs="+", default=[100, 1000, 10_000])
     parser.add_argument("--settle", type=int, default=200, help="steps before anything is measured")
     parser.add_argument("--genesis-python", help="interpreter of an environment with genesis-world 1.4.5")
-    parser.add_argument("--only", nargs="+", choices=CLASSES[:-1], help="classes set beside Genesis")
+    parser.add_argument("--only", nargs="+", choices=CLASSES[:-1], help="classes of --part sensors and peer")
     parser.add_argument("--write-input", type=Path)
     parser.add_argument("--input", type=Path)
     parser.add_argument("--from", type=Path, nargs="+", dest="records")

@@ -89,11 +89,16 @@ def free(
         options,
         readings,
         out,
+        kernels.Grips(),
         kernels.Paused(),
     ]
-    seconds = timed(
-        wp, device, lambda: wp.launch(kernels.run, lanes, inputs, device=device, block_dim=block, max_blocks=most)
-    )
+
+    def once() -> None:
+        # The kernel goes on counting where it finds a count.
+        out.steps.zero_()
+        wp.launch(kernels.run, lanes, inputs, device=device, block_dim=block, max_blocks=most)
+
+    seconds = timed(wp, device, once)
     done = int(out.steps.numpy().astype(np.int64).sum())
     bad = int((out.status.numpy() != 0).sum())
     print(
@@ -152,13 +157,21 @@ def peer(device_name: str, worlds: int, links: int, steps: int) -> None:
 
 
 def sweep(
-    device_name: str, recipe: str, words: list[str], fidelity: Fidelity, sweeps: int, sliced: bool | None = None
+    device_name: str,
+    recipe: str,
+    words: list[str],
+    fidelity: Fidelity,
+    sweeps: int,
+    sliced: bool | None = None,
+    tuning: dict[str, Any] | None = None,
+    timers: bool = False,
 ) -> None:
     """Sweeps of a recipe over procedural objects: steps, sweeps per second, and what that means for whole sets."""
     wp = warp()
     objects = resolve_objects(words, surfaces=True)
     scenes = SweepScenes(GRIDS[recipe], {name: item.load for name, item in objects.items()})
     launcher = SweepLauncher(scenes, fidelity, device_name, sliced=sliced)
+    launcher.tuning = tuning or {}
     started = time.perf_counter()
     groups = [(name, scenes.grid.sweeps(name)[: max(1, sweeps // len(objects))]) for name in scenes.objects]
     launcher.launch(groups[:1])
@@ -166,7 +179,19 @@ def sweep(
         scenes.solid(name)
     loaded = time.perf_counter() - started
     started = time.perf_counter()
+    if timers:
+        wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
     result = launcher.launch(groups)
+    if timers:
+        spent: dict[str, list[float]] = {}
+        for one in wp.timing_end():
+            spent.setdefault(one.name, []).append(one.elapsed)
+        for name, each in sorted(spent.items()):
+            print(
+                f"      {name[:90]}: {sum(each):.1f} ms in {len(each)}, median {statistics.median(each):.3f}, "
+                f"most {max(each):.3f}",
+                flush=True,
+            )
     wp.synchronize_device(launcher.device)
     seconds = time.perf_counter() - started
     count = sum(len(some) for _, some in groups)
@@ -176,7 +201,7 @@ def sweep(
         f"{launcher.seconds.get('kernel', float('nan')):.2f} s; objects {loaded:.1f} s), "
         f"{steps / seconds:.3e} whisker-steps/s, {steps / full:.1%} of the steps computed, "
         f"{result.touching.sum() / max(steps, 1):.1%} of those in contact; {count / seconds:.0f} sweeps/s; "
-        f"failed {int((result.status != 0).sum())}, unsolved steps {int(result.unsolved.sum())}; "
+        f"tuning {tuning}; failed {int((result.status != 0).sum())}, unsolved steps {int(result.unsolved.sum())}; "
         f"159,696 sweeps in {159696 / count * seconds:.0f} s, 2,076,048 in {2076048 / count * seconds / 60:.1f} min; "
         f"{launcher.slices} slices, most steps {result.steps.max()}; doubtful {int((result.doubt > DOUBTFUL).sum())}; "
         f"phases { ({k: round(v, 3) for k, v in launcher.seconds.items()}) }",
@@ -197,7 +222,11 @@ def main() -> None:
     parser.add_argument("--links", type=int, default=12)
     parser.add_argument("--recipes", default="thesis-low,thesis-high")
     parser.add_argument("--steps", default="2e-4,5e-4,1e-3", help="time steps of the sweeps (s)")
+    parser.add_argument("--budget", type=int, help="steps of a whisker in one slice")
+    parser.add_argument("--recorded", action=argparse.BooleanOptionalAction, help="slices as CUDA graphs")
+    parser.add_argument("--timers", action="store_true", help="time of each kernel (only without graphs)")
     args = parser.parse_args()
+    tuning = {name: value for name in ("budget", "recorded") if (value := getattr(args, name)) is not None}
     small = args.device == "cpu"
     chosen = args.only.split(",")
     if "free" in chosen:
@@ -214,7 +243,16 @@ def main() -> None:
         for step in map(float, args.steps.split(",")):
             fidelity = Fidelity(links=args.links, time_step=step)
             for recipe in args.recipes.split(","):
-                sweep(args.device, recipe, args.objects.split(","), fidelity, args.sweeps, args.sliced)
+                sweep(
+                    args.device,
+                    recipe,
+                    args.objects.split(","),
+                    fidelity,
+                    args.sweeps,
+                    args.sliced,
+                    tuning,
+                    args.timers,
+                )
 
 
 if __name__ == "__main__":

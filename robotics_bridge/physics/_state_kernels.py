@@ -6,8 +6,22 @@ from types import SimpleNamespace
 
 @cache
 def state_kernels() -> SimpleNamespace:
-    """Return the kernel ``check`` and its function ``status_of``: which environments hold numbers not finite."""
+    """Return the kernel ``check`` and its functions ``status_of`` and ``link_fails``: where numbers are not finite."""
     import warp as wp
+
+    @wp.func
+    def link_fails(
+        pose: wp.array2d(dtype=wp.transformf), velocity: wp.array2d(dtype=wp.spatial_vectorf), env: int, link: int
+    ) -> bool:
+        at = pose[env, link]
+        speed = velocity[env, link]
+        total = float(0.0)
+        # Adding zeros keeps a NaN and turns an infinity into one.
+        for k in range(7):
+            total += at[k] * 0.0
+        for k in range(6):
+            total += speed[k] * 0.0
+        return wp.isnan(total)
 
     @wp.func
     def status_of(
@@ -17,18 +31,10 @@ def state_kernels() -> SimpleNamespace:
         contacts: int,
         room: int,
     ) -> int:
-        total = float(0.0)
-        for link in range(pose.shape[1]):
-            at = pose[env, link]
-            speed = velocity[env, link]
-            # Adding zeros keeps a NaN and turns an infinity into one.
-            for k in range(7):
-                total += at[k] * 0.0
-            for k in range(6):
-                total += speed[k] * 0.0
         bits = int(0)
-        if wp.isnan(total):
-            bits = 1
+        for link in range(pose.shape[1]):
+            if link_fails(pose, velocity, env, link):
+                bits = 1
         if contacts > room:
             bits = bits + 2
         return bits
@@ -44,7 +50,7 @@ def state_kernels() -> SimpleNamespace:
         env = wp.tid()
         status[env] = status_of(pose, velocity, env, count[0], room)
 
-    return SimpleNamespace(check=check, status_of=status_of)
+    return SimpleNamespace(check=check, status_of=status_of, link_fails=link_fails)
 
 
 @cache

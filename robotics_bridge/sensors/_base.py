@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -354,6 +354,32 @@ class ProbeRuntime(ReadoutRuntime):
     def launch(self, kernel: Any, *inputs: Any) -> None:
         """Run a kernel over all environments and probes."""
         warp().launch(kernel, dim=(self.context.num_envs, self.count), inputs=inputs, device=self.context.device)
+
+
+_SHARED = 32
+"""Probes that one thread of a processor takes in turn."""
+_SHARED_CUDA, _FILL = 4, 2048
+"""The same on a GPU, at most, and the threads of a multiprocessor from which on that pays."""
+
+
+def probe_rows(places: Iterable[Place], context: Context) -> np.ndarray:
+    """Return rows (first, end, step, number of the sensor) [R, 4] of probes that one thread takes in turn.
+
+    What all probes of an environment share is then read less often. On a GPU the rows of neighbouring threads are
+    interleaved, so that these touch neighbouring memory.
+    """
+    places = list(places)
+    cuda = bool(context.device.is_cuda)
+    total = context.num_envs * sum(place.count for place in places)
+    most = min(_SHARED_CUDA, max(1, total // (_FILL * context.device.sm_count))) if cuda else _SHARED
+    rows = []
+    for part, place in enumerate(places):
+        end, threads = place.start + place.count, -(-place.count // most)
+        if cuda:
+            rows += [(place.start + k, end, threads, part) for k in range(threads)]
+        else:
+            rows += [(place.start + most * k, min(place.start + most * (k + 1), end), 1, part) for k in range(threads)]
+    return np.array(rows, dtype=np.int32).reshape(-1, 4)
 
 
 def enclosing_sphere(probes: Probes) -> tuple[np.ndarray, float]:

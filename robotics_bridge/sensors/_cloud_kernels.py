@@ -38,7 +38,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
     import warp as wp
 
     io = io_functions(mode, hysteresis, walk)
-    emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
+    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
     types, pairs_type, structs = io_structs(), pair_structs().Pairs, cloud_structs()
     probes_type, io_type = types.ProbeSet, types.Io
     cloud_type, law_type = structs.Cloud, structs.ProximityParams
@@ -148,6 +148,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
         if wp.static(mode != CLEAN):
             fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
             signal = fixed[0] * wrench(laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
-        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, truth, signal)
+        lag, drift = recall_six(io, env, n, age)
+        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
 
     return proximity

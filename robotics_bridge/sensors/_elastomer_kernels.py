@@ -301,7 +301,7 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
     import warp as wp
 
     io = io_functions(mode, hysteresis, walk, 3)
-    emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
+    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
     types, gel_type = io_structs(), elastomer_structs().Gel
     pairs_type, cloud_type = pair_structs().Pairs, cloud_structs().Cloud
     probes_type, io_type = types.ProbeSet, types.Io
@@ -473,6 +473,7 @@ def marker_kernel(way: int, layered: bool, planes: int, mode: int, hysteresis: b
         signal = fixed[0] * (signal + slide)
         all_truth = wp.spatial_vectorf(truth[0], truth[1], truth[2], 0.0, 0.0, 0.0)
         all_signal = wp.spatial_vectorf(signal[0], signal[1], signal[2], 0.0, 0.0, 0.0)
-        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, all_truth, all_signal)
+        lag, drift = recall_six(io, env, n, age)
+        emit_six(io, knobs[part], env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
 
     return markers

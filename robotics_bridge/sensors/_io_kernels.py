@@ -45,7 +45,8 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
     """Return the functions that write a reading.
 
     ``emit(io, knobs, env, n, probe, channel, truth, signal)`` writes one channel, ``emit_six`` up to six, drawing all
-    that they share once (``fixed`` is what ``episode_draw`` gave); ``measure`` returns the measured
+    that they share once (``fixed`` is what ``episode_draw`` gave, ``lag`` and ``drift`` what ``recall_six`` read,
+    before anything else so that nothing waits for it); ``measure`` returns the measured
     value and stores its memories without writing it; ``lost(io, channels, env, n)`` marks a diverged environment.
 
     Args:
@@ -110,6 +111,24 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
             io.measured[channel, env, n] = signal
 
     @wp.func
+    def recall(memory: wp.array3d(dtype=wp.float32), env: int, n: int, age: int) -> wp.spatial_vectorf:
+        kept = wp.spatial_vectorf()
+        if age > 0:
+            for channel in range(wp.static(channels)):
+                kept[channel] = memory[channel, env, n]
+        return kept
+
+    @wp.func
+    def recall_six(io: io_type, env: int, n: int, age: int):
+        lag = wp.spatial_vectorf()
+        drift = wp.spatial_vectorf()
+        if wp.static(hysteresis):
+            lag = recall(io.hysteresis, env, n, age)
+        if wp.static(walk):
+            drift = recall(io.walk, env, n, age)
+        return lag, drift
+
+    @wp.func
     def emit_six(
         io: io_type,
         knobs: params_type,
@@ -119,32 +138,35 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
         age: int,
         episode: int,
         fixed: wp.vec3f,
+        lag: wp.spatial_vectorf,
+        drift: wp.spatial_vectorf,
         truth: wp.spatial_vectorf,
         signal: wp.spatial_vectorf,
     ):
-        fading = float(0.0)
-        if wp.static(hysteresis and mode == FUSED):
-            if knobs.hysteresis != 0.0:
-                fading = decay(io.dt / knobs.tau)
-        for pair in range(wp.static((channels + 1) // 2)):
-            z = wp.vec4f(0.0)
-            if wp.static(mode == FUSED):
+        for channel in range(wp.static(channels)):
+            io.truth[channel, env, n] = truth[channel]
+            if wp.static(mode == STAGED):
+                io.measured[channel, env, n] = signal[channel]
+        if wp.static(mode == FUSED):
+            fading = float(0.0)
+            if wp.static(hysteresis):
+                if knobs.hysteresis != 0.0:
+                    fading = decay(io.dt / knobs.tau)
+            for pair in range(wp.static((channels + 1) // 2)):
                 z = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
-            for odd in range(2):
-                channel = 2 * pair + odd
-                if channel < wp.static(channels):
-                    io.truth[channel, env, n] = truth[channel]
-                    if wp.static(mode == STAGED):
-                        io.measured[channel, env, n] = signal[channel]
-                    if wp.static(mode == FUSED):
-                        lag = float(0.0)
-                        drift = float(0.0)
-                        if age > 0:
-                            if wp.static(hysteresis):
-                                lag = io.hysteresis[channel, env, n]
-                            if wp.static(walk):
-                                drift = io.walk[channel, env, n]
-                        y = apply_drawn(knobs, signal[channel], z[2 * odd], z[2 * odd + 1], fixed, fading, lag, drift)
+                for odd in range(2):
+                    channel = 2 * pair + odd
+                    if channel < wp.static(channels):
+                        y = apply_drawn(
+                            knobs,
+                            signal[channel],
+                            z[2 * odd],
+                            z[2 * odd + 1],
+                            fixed,
+                            fading,
+                            lag[channel],
+                            drift[channel],
+                        )
                         io.measured[channel, env, n] = y[0]
                         if wp.static(hysteresis):
                             io.hysteresis[channel, env, n] = y[1]
@@ -166,7 +188,13 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
                 io.measured[channel, env, n] = 0.0
 
     return SimpleNamespace(
-        emit=emit, emit_six=emit_six, episode_draw=episode_draw, measure=measure, lost=lost, idle=idle
+        emit=emit,
+        emit_six=emit_six,
+        recall_six=recall_six,
+        episode_draw=episode_draw,
+        measure=measure,
+        lost=lost,
+        idle=idle,
     )
 
 

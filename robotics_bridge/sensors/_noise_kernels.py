@@ -13,6 +13,8 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+from robotics_bridge.sensors._series_kernels import series_functions
+
 EPISODE, RADIUS, JITTER, CHANNELS = 0, 1, 2, 16
 """Purposes of random numbers: of an episode, the radius, the delay, and from 16 on of pairs of channels."""
 
@@ -25,6 +27,9 @@ def noise_functions() -> SimpleNamespace:
     as documented at each; ``philox``, ``uniform`` and ``normals`` below them.
     """
     import warp as wp
+
+    series = series_functions()
+    split_log, power_of_two = series.split_log, series.power_of_two
 
     @wp.struct
     class NoiseParams:
@@ -50,6 +55,8 @@ def noise_functions() -> SimpleNamespace:
         bias: wp.float32
         quantum: wp.float32
         """Step of the quantisation [output unit]; 0 is none."""
+        levels: wp.float32
+        """1 / quantum, where there is one."""
 
     @wp.func
     def philox(a: wp.uint32, b: wp.uint32, c: wp.uint32, d: wp.uint32, key_low: wp.uint32, key_high: wp.uint32):
@@ -88,54 +95,28 @@ def noise_functions() -> SimpleNamespace:
     @wp.func
     def minus_two_log(word: wp.uint32) -> float:
         """Return −2 ln(word / 2³²), odd words only, by a series: libraries of devices differ in the last digit."""
-        shift = wp.uint32(0)
-        m = word | wp.uint32(1)
-        if (m >> wp.uint32(16)) == wp.uint32(0):
-            m = m << wp.uint32(16)
-            shift = shift + wp.uint32(16)
-        if (m >> wp.uint32(24)) == wp.uint32(0):
-            m = m << wp.uint32(8)
-            shift = shift + wp.uint32(8)
-        if (m >> wp.uint32(28)) == wp.uint32(0):
-            m = m << wp.uint32(4)
-            shift = shift + wp.uint32(4)
-        if (m >> wp.uint32(30)) == wp.uint32(0):
-            m = m << wp.uint32(2)
-            shift = shift + wp.uint32(2)
-        if (m >> wp.uint32(31)) == wp.uint32(0):
-            m = m << wp.uint32(1)
-            shift = shift + wp.uint32(1)
-        # m = f 2³¹ with f in [1, 2); the series wants f in [√½, √2).
-        f = float(m >> wp.uint32(8)) * float(1.1920928955078125e-07)
-        exponent = -float(shift) - float(1.0)
-        if f > float(1.4142135):
-            f = f * float(0.5)
-            exponent = exponent + float(1.0)
-        s = (f - float(1.0)) / (f + float(1.0))
-        q = s * s
-        series = q * (float(1.0 / 3.0) + q * (float(0.2) + q * (float(1.0 / 7.0) + q * float(1.0 / 9.0))))
-        return float(-2.0) * (exponent * float(0.6931471805599453) + float(2.0) * (s + s * series))
+        split = split_log(float(word | wp.uint32(1)))
+        return (float(32.0) - split[0]) * float(1.3862943611198906) - float(2.0) * split[1]
 
     @wp.func
     def normals(first: wp.uint32, second: wp.uint32) -> wp.vec2:
         """Return two independent standard normal numbers of two random words (Box and Muller 1958)."""
-        length = wp.sqrt(wp.max(minus_two_log(first), float(0.0)))
-        quarter = second >> wp.uint32(30)
+        length = wp.sqrt(minus_two_log(first))
         # The angle within a quarter turn, counted from its middle: −π/4 … π/4.
-        part = float((second >> wp.uint32(7)) & wp.uint32(0x7FFFFF)) + float(0.5) - float(4194304.0)
+        part = float((second >> wp.uint32(7)) & wp.uint32(0x7FFFFF)) - float(4194303.5)
         x = part * float(1.8725351414619535e-07)
         q = x * x
-        sine = x - x * q * (float(1.0 / 6.0) - q * (float(1.0 / 120.0) - q * float(1.0 / 5040.0)))
-        cosine = float(1.0) - q * (
-            float(0.5) - q * (float(1.0 / 24.0) - q * (float(1.0 / 720.0) - q * float(1.0 / 40320.0)))
+        sine = x + x * q * (float(-0.16666655) + q * (float(0.008332178) + q * float(-0.000195173)))
+        cosine = float(1.0) + q * (
+            float(-0.5) + q * (float(0.041666646) + q * (float(-0.0013887368) + q * float(2.4438452e-05)))
         )
-        if quarter == wp.uint32(0):
-            return wp.vec2(length * cosine, length * sine)
-        if quarter == wp.uint32(1):
-            return wp.vec2(-length * sine, length * cosine)
-        if quarter == wp.uint32(2):
-            return wp.vec2(-length * cosine, -length * sine)
-        return wp.vec2(length * sine, -length * cosine)
+        # The upper two bits turn by quarters: (c, s), (−s, c), (−c, −s), (s, −c).
+        odd = (second & wp.uint32(0x40000000)) != wp.uint32(0)
+        turned = (second ^ (second << wp.uint32(1))) & wp.uint32(-2147483648)
+        below = second & wp.uint32(-2147483648)
+        a = wp.cast(wp.where(odd, sine, cosine), wp.uint32) ^ turned
+        b = wp.cast(wp.where(odd, cosine, sine), wp.uint32) ^ below
+        return wp.vec2(length * wp.cast(a, wp.float32), length * wp.cast(b, wp.float32))
 
     @wp.func
     def radius_noise(p: NoiseParams, env: int, probe: int, age: int, episode: int) -> float:
@@ -156,14 +137,7 @@ def noise_functions() -> SimpleNamespace:
     @wp.func
     def decay(t: float) -> float:
         """Return exp(−t) for t ≥ 0, by a series."""
-        n = wp.min(wp.floor(t * float(1.4426950408889634) + float(0.5)), float(126.0))
-        r = n * float(0.6931471805599453) - t
-        series = float(1.0) + r * (
-            float(1.0) + r * (float(0.5) + r * (float(1.0 / 6.0) + r * (float(1.0 / 24.0) + r * float(1.0 / 120.0))))
-        )
-        for _ in range(int(n)):
-            series = series * float(0.5)
-        return series
+        return power_of_two(float(0.0), wp.max(t * float(-1.4426950408889634), float(-150.0)))
 
     @wp.func
     def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, episode: int) -> wp.vec4:
@@ -211,24 +185,17 @@ def noise_functions() -> SimpleNamespace:
             hysteresis_state: As there.
             walk_state: As there.
         """
-        if not wp.isfinite(x):
-            return wp.vec3(x, hysteresis_state, walk_state)
-        y = x
-        lag = float(0.0)
-        if p.hysteresis != float(0.0):
-            xi = hysteresis_state + x
-            lag = fading * xi - x
-            y = y + p.hysteresis * xi
-        drift = float(0.0)
-        if p.white > float(0.0) or p.walk > float(0.0):
-            drift = walk_state + p.walk * walk
-            y = y + drift + p.white * white
-        y = y + p.bias
-        if p.quantum > float(0.0):
-            y = p.quantum * wp.rint(y / p.quantum)
-        if fixed[1] > float(0.0):
-            y = fixed[2]
-        return wp.vec3(y, lag, drift)
+        # Knobs that are off add zeros, which costs less than asking.
+        xi = hysteresis_state + x
+        drift = walk_state + p.walk * walk
+        y = x + p.hysteresis * xi + drift + p.white * white + p.bias
+        lag = fading * xi - x
+        y = wp.where(p.quantum > float(0.0), p.quantum * wp.rint(y * p.levels), y)
+        y = wp.where(fixed[1] > float(0.0), fixed[2], y)
+        finite = wp.isfinite(x)
+        return wp.vec3(
+            wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state)
+        )
 
     @wp.func
     def apply_noise(

@@ -21,6 +21,7 @@ def pair_structs() -> SimpleNamespace:
     @wp.struct
     class Slots:
         link: wp.array(dtype=wp.int32)
+        watched: wp.array(dtype=wp.int32)
         contact: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
         room: wp.array(dtype=wp.int32)
@@ -64,11 +65,15 @@ def begin_kernel() -> SimpleNamespace:
 
 
 @cache
-def start_kernel(contacts: bool) -> Any:
+def start_kernel(contacts: bool, apart: bool) -> Any:
     """Return the kernel ``start`` of an update: counts it, checks the state and marks who touches whom.
 
     One launch for three small tasks, since launches are what small updates cost. Dim [max(B, C)], or [B] without
     ``contacts``.
+
+    Args:
+        contacts: whether any slot looks at them.
+        apart: whether :func:`pair_kernel` looks at the numbers of the state, a thread for each link.
     """
     import warp as wp
 
@@ -76,6 +81,8 @@ def start_kernel(contacts: bool) -> Any:
 
     @wp.func
     def mark(slots: slots_type, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
+        if link < 0:
+            return
         for slot in range(slots.link.shape[0]):
             if slots.contact[slot] == 1 and slots.link[slot] == link:
                 place = slots.place[slot, other]
@@ -85,10 +92,9 @@ def start_kernel(contacts: bool) -> Any:
                     if (bits[env, word] & bit) == 0:
                         wp.atomic_or(bits, env, word, bit)
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", grid_stride=False)
     def start(
         slots: slots_type,
-        link_of: wp.array(dtype=wp.int32),
         pose: wp.array2d(dtype=wp.transformf),
         velocity: wp.array2d(dtype=wp.spatial_vectorf),
         count: wp.array(dtype=wp.int32),
@@ -102,26 +108,35 @@ def start_kernel(contacts: bool) -> Any:
         tid = wp.tid()
         if tid < pose.shape[0]:
             age[tid] = age[tid] + 1
-            status[tid] = status_of(pose, velocity, tid, count[0], owner.shape[0])
+            if wp.static(apart):
+                status[tid] = wp.where(count[0] > owner.shape[0], 2, 0)
+            else:
+                status[tid] = status_of(pose, velocity, tid, count[0], owner.shape[0])
         if wp.static(contacts):
-            if tid < wp.min(count[0], owner.shape[0]):
+            if tid < owner.shape[0]:
+                # Asked for before the count is known, so that one waits for memory once.
                 pair = geometry[tid]
-                if pair[0] >= 0 and pair[1] >= 0:
-                    mark(slots, owner[tid], link_of[pair[0]], pair[1], words, bits)
-                    mark(slots, owner[tid], link_of[pair[1]], pair[0], words, bits)
+                env = owner[tid]
+                if tid < count[0] and pair[0] >= 0 and pair[1] >= 0:
+                    mark(slots, env, slots.watched[pair[0]], pair[1], words, bits)
+                    mark(slots, env, slots.watched[pair[1]], pair[0], words, bits)
 
     return start
 
 
 @cache
-def pair_kernel() -> SimpleNamespace:
-    """Return the kernel ``pairs`` that lists what each slot meets, in the order of geometry numbers. Dim [B, S]."""
+def pair_kernel(apart: bool) -> Any:
+    """Return the kernel ``pairs`` that lists what each slot meets, in the order of geometry numbers.
+
+    Dim [B S], and ``apart`` B L more threads, which look for numbers of the state that are not finite.
+    """
     import warp as wp
 
     structs = pair_structs()
     slots_type, pairs_type, solids_type = structs.Slots, structs.Pairs, query_structs().Solids
+    link_fails = state_kernels().link_fails
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", grid_stride=False)
     def pairs(
         slots: slots_type,
         solids: solids_type,
@@ -131,8 +146,18 @@ def pair_kernel() -> SimpleNamespace:
         bits: wp.array2d(dtype=wp.int32),
         out: pairs_type,
         crowded: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
     ):
-        env, slot = wp.tid()
+        tid = wp.tid()
+        listed = pose.shape[0] * slots.link.shape[0]
+        if wp.static(apart):
+            if tid >= listed:
+                owner = (tid - listed) // pose.shape[1]
+                if link_fails(pose, velocity, owner, (tid - listed) % pose.shape[1]):
+                    wp.atomic_or(status, owner, 1)
+                return
+        env = tid // slots.link.shape[0]
+        slot = tid % slots.link.shape[0]
         row = env % solids.kind.shape[0]
         link = slots.link[slot]
         here = pose[env, link]
@@ -183,4 +208,4 @@ def pair_kernel() -> SimpleNamespace:
             crowded[env] = 1
         out.count[env, slot] = wp.min(found, room)
 
-    return SimpleNamespace(pairs=pairs)
+    return pairs

@@ -67,6 +67,11 @@ class PairTable:
         return any(slot["contact"] for slot in self._slots)
 
     @property
+    def _apart(self) -> bool:
+        # A processor gains nothing from more threads.
+        return self.contacts_needed and bool(self._device.is_cuda)
+
+    @property
     def state_bytes(self) -> int:
         """Memory per environment [bytes]."""
         return 4 * (sum(self._rooms) * 19 + len(self._slots) * (1 + self._words))
@@ -88,6 +93,9 @@ class PairTable:
 
         plan = pair_structs().Slots()
         plan.link, plan.contact = ints([s["link"] for s in slots]), ints([int(s["contact"]) for s in slots])
+        # The link of every geometry whose contacts matter, to turn the others away at once.
+        links = self._solids.scene.link_of if self._solids.scene.geometries else np.full(1, -1)
+        plan.watched = ints(np.where(np.isin(links, [s["link"] for s in slots if s["contact"]]), links, -1))
         first = np.cumsum([0, *self._rooms])
         plan.first, plan.room = ints(first), ints(self._rooms)
         plan.members = ints([m for s in slots for m in s["members"]] or [0])
@@ -113,10 +121,10 @@ class PairTable:
         """Count an update, refresh the state's status and mark contacts."""
         wp, contacts = warp(), self.contacts_needed
         room = state.contact_env.shape[0]
-        inputs = [self.plan, self._solids.struct.link, state.pose, state.velocity, state.contact_count]
+        inputs = [self.plan, state.pose, state.velocity, state.contact_count]
         inputs += [state.contact_geom, state.contact_env, self._words, self._bits, state.status, age]
         dim = max(self._num_envs, room) if contacts else self._num_envs
-        wp.launch(start_kernel(contacts), dim=dim, inputs=inputs, device=self._device)
+        wp.launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
 
     def update(self, state: HandState) -> None:
         """List what every slot meets now; contacts were marked by :meth:`start`."""
@@ -124,4 +132,5 @@ class PairTable:
             return
         wp, solids = warp(), self._solids.struct
         inputs = [self.plan, solids, state.pose, state.velocity, self._words, self._bits, self.struct, self.crowded]
-        wp.launch(pair_kernel().pairs, dim=(self._num_envs, len(self._slots)), inputs=inputs, device=self._device)
+        dim = self._num_envs * (len(self._slots) + self._apart * state.pose.shape[1])
+        wp.launch(pair_kernel(self._apart), dim=dim, inputs=[*inputs, state.status], device=self._device)

@@ -4,13 +4,18 @@ Equation numbers are those of the thesis. Vectors are in the frame of the sensor
 """
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
-from robotics_bridge.sensors._io_kernels import CLEAN, io_functions, io_structs
+from robotics_bridge.sensors._io_kernels import CLEAN, FUSED, STAGED, io_functions, io_structs
 from robotics_bridge.sensors._noise_kernels import noise_functions
 from robotics_bridge.sensors._pair_kernels import pair_structs
-from robotics_bridge.sensors._query_kernels import FAR, distance_function, query_structs
+from robotics_bridge.sensors._query_kernels import FAR, distance_function, query_structs, shape_functions
+from robotics_bridge.sensors._series_kernels import series_functions
+
+THREADS = 256
+"""Threads of a block."""
+BLOCKS = {CLEAN: 3, FUSED: 2, STAGED: 3}
+"""Blocks that a multiprocessor holds at once, by mode: what registers are left to a thread."""
 
 
 @cache
@@ -168,12 +173,8 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
 
 
 @cache
-def kinematic_functions(physical: bool) -> SimpleNamespace:
-    """Return the structure ``KinematicParams`` and ``wrench(params, x, depth, normal, velocity, spin)`` (4.6–4.9).
-
-    Args:
-        physical: friction and twist follow the object and the normal force never pulls; otherwise as published.
-    """
+def kinematic_params() -> Any:
+    """Return the structure ``KinematicParams``."""
     import warp as wp
 
     @wp.struct
@@ -184,11 +185,27 @@ def kinematic_functions(physical: bool) -> SimpleNamespace:
         shear: wp.float32
         twist: wp.float32
 
+    return KinematicParams
+
+
+@cache
+def kinematic_function(physical: bool, fast: bool = False) -> Any:
+    """Return ``wrench(params, x, depth, normal, velocity, spin)`` (4.6–4.9).
+
+    Args:
+        physical: friction and twist follow the object and the normal force never pulls; otherwise as published.
+        fast: the power is the GPU's own (in modules with the option ``fast_math``) in place of a series.
+    """
+    import warp as wp
+
+    params_type = kinematic_params()
+    power = wp.pow if fast else series_functions().power
+
     @wp.func
     def wrench(
-        p: KinematicParams, x: wp.vec3f, depth: float, normal: wp.vec3f, velocity: wp.vec3f, spin: wp.vec3f
+        p: params_type, x: wp.vec3f, depth: float, normal: wp.vec3f, velocity: wp.vec3f, spin: wp.vec3f
     ) -> wp.spatial_vectorf:
-        s = wp.pow(depth, p.exponent)
+        s = power(depth, p.exponent)
         relative = velocity + wp.cross(spin, x)
         approach = wp.dot(relative, normal)
         tangential = relative - approach * normal
@@ -203,69 +220,133 @@ def kinematic_functions(physical: bool) -> SimpleNamespace:
         torque = wp.cross(x, f) - turn * normal
         return wp.spatial_vectorf(f[0], f[1], f[2], torque[0], torque[1], torque[2])
 
-    return SimpleNamespace(KinematicParams=KinematicParams, wrench=wrench)
+    return wrench
 
 
 @cache
 def kinematic_kernel(
-    kinds: frozenset[int], raycast: bool, physical: bool, mode: int, hysteresis: bool, walk: bool
+    kinds: frozenset[int], raycast: bool, physical: bool, mode: int, hysteresis: bool, walk: bool, fast: bool = False
 ) -> Any:
-    """Return the kernel of KinematicTaxel (4.6–4.9). Dim [B, N]."""
+    """Return the kernel of KinematicTaxel (4.6–4.9). Dim [B, R], R rows of probes that one thread takes in turn.
+
+    What a thread asks of its environment and of what is met there is read once and kept.
+
+    Args:
+        kinds: of the geometries tracked.
+        raycast: ask triangles.
+        physical: convention of the forces.
+        mode: of the readout.
+        hysteresis: whether it is stored.
+        walk: whether it is stored.
+        fast: square roots and quotients of the GPU's approximate units (2 units in the last place).
+    """
     import warp as wp
 
-    deepest = deepest_function(kinds, raycast)
+    structs, functions = query_structs(), shape_functions(kinds, raycast)
+    shape_of, distance_to = functions.shape_of, functions.distance_to
     io = io_functions(mode, hysteresis, walk)
-    emit_six, episode_draw, lost, idle = io.emit_six, io.episode_draw, io.lost, io.idle
-    types, pairs_type, solids_type = io_structs(), pair_structs().Pairs, query_structs().Solids
+    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
+    types, pairs_type, solids_type, shape_type = io_structs(), pair_structs().Pairs, structs.Solids, structs.Shape
     probes_type, io_type = types.ProbeSet, types.Io
     noise = noise_functions()
     params_type, radius_noise = noise.NoiseParams, noise.radius_noise
-    law = kinematic_functions(physical)
-    law_type, wrench = law.KinematicParams, law.wrench
+    fast = fast and not raycast
+    law_type, wrench = kinematic_params(), kinematic_function(physical, fast)
 
-    @wp.kernel(module="unique")
+    @wp.kernel(
+        module="unique",
+        grid_stride=False,
+        launch_bounds=(THREADS, BLOCKS[mode]),
+        module_options={"fast_math": fast},
+    )
     def kinematic(
         probes: probes_type,
+        rows: wp.array(dtype=wp.vec4i),
         solids: solids_type,
         pairs: pairs_type,
         io: io_type,
-        knobs: wp.array(dtype=params_type),
+        all_knobs: wp.array(dtype=params_type),
         laws: wp.array(dtype=law_type),
     ):
-        env, n = wp.tid()
-        radius = probes.radius[n]
-        if radius <= 0.0:
-            idle(io, 6, env, n)
-            return
+        env, at_row = wp.tid()
+        span = rows[at_row]
+        part = span[3]
+        slot = probes.slot[span[0]]
+        variant = int(0)
+        if solids.kind.shape[0] > 1:
+            variant = env
+        n = span[0]
         if (io.status[env] & 1) != 0:
-            lost(io, 6, env, n)
+            while n < span[1]:
+                if probes.radius[n] > 0.0:
+                    lost(io, 6, env, n)
+                else:
+                    idle(io, 6, env, n)
+                n += span[2]
             return
-        part = probes.part[n]
-        best, normal, place = deepest(probes, solids, pairs, env, n, 0.0)
-        depth = radius - best
-        x = probes.position[n]
-        truth = wp.spatial_vectorf()
-        velocity = wp.vec3f(0.0)
-        spin = wp.vec3f(0.0)
-        if place >= 0:
-            velocity = pairs.velocity[env, place]
-            spin = pairs.spin[env, place]
-            if depth > 0.0:
-                truth = wrench(laws[part], x, depth, normal, velocity, spin)
-        if wp.static(mode == CLEAN):
-            for channel in range(6):
-                io.truth[channel, env, n] = truth[channel]
-        else:
-            probe = probes.probe[n]
+        first = pairs.first[slot]
+        count = pairs.count[env, slot]
+        law = laws[part]
+        knobs = params_type()
+        age = int(0)
+        episode = int(0)
+        if wp.static(mode != CLEAN):
+            knobs = all_knobs[part]
             age = io.age[env]
             episode = io.episode[env]
-            number = env + io.env_offset
-            noisy = wp.max(radius + radius_noise(knobs[part], number, probe, age, episode), 0.0) - best
-            fixed = episode_draw(knobs[part], number, probe, episode)
-            noisy = noisy * fixed[0]
-            signal = wp.spatial_vectorf()
-            if noisy > 0.0:
-                signal = wrench(laws[part], x, noisy, normal, velocity, spin)
-            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, truth, signal)
+        held = int(-1)
+        shape = shape_type()
+        rotation = wp.mat33f()
+        offset = wp.vec3f()
+        limit = float(0.0)
+        while n < span[1]:
+            radius = probes.radius[n]
+            if radius > 0.0:
+                lag, drift = recall_six(io, env, n, age)
+                x = probes.position[n]
+                best = float(wp.static(FAR))
+                normal = wp.vec3f(0.0, 0.0, 1.0)
+                place = int(0)
+                for k in range(count):
+                    # Most links meet one geometry: it is read for the first probe only.
+                    while held != first + k:
+                        held = first + k
+                        geometry = pairs.geometry[env, held]
+                        shape = shape_of(solids, variant, geometry)
+                        rotation = pairs.rotation[env, held]
+                        offset = pairs.offset[env, held]
+                        if wp.static(raycast):
+                            limit = 2.0 * solids.bound[variant, geometry][3]
+                    found = distance_to(solids.values, shape, rotation @ x + offset, limit + radius)
+                    if found[3] < best:
+                        best = found[3]
+                        normal = wp.transpose(rotation) @ wp.vec3f(found[0], found[1], found[2])
+                        place = held
+                probe = probes.probe[n]
+                number = env + io.env_offset
+                fixed = wp.vec3f()
+                noisy = float(0.0)
+                if wp.static(mode != CLEAN):
+                    noisy = wp.max(radius + radius_noise(knobs, number, probe, age, episode), 0.0) - best
+                    fixed = episode_draw(knobs, number, probe, episode)
+                    noisy = noisy * fixed[0]
+                truth = wp.spatial_vectorf()
+                signal = wp.spatial_vectorf()
+                if best < radius or noisy > 0.0:
+                    velocity = pairs.velocity[env, place]
+                    spin = pairs.spin[env, place]
+                    if best < radius:
+                        truth = wrench(law, x, radius - best, normal, velocity, spin)
+                    if wp.static(mode != CLEAN):
+                        if noisy > 0.0:
+                            signal = wrench(law, x, noisy, normal, velocity, spin)
+                if wp.static(mode == CLEAN):
+                    for channel in range(6):
+                        io.truth[channel, env, n] = truth[channel]
+                else:
+                    emit_six(io, knobs, env, n, probe, age, episode, fixed, lag, drift, truth, signal)
+            else:
+                idle(io, 6, env, n)
+            n += span[2]
 
     return kinematic

@@ -16,7 +16,10 @@ FAR = 1.0e6
 
 @cache
 def query_structs() -> SimpleNamespace:
-    """Return the structure ``Solids``: the geometries of a scene on a device. R variant row (1 or B), G geometry."""
+    """Return the structures ``Solids`` and ``Shape``: the geometries of a scene on a device, and one of them.
+
+    R variant row (1 or B), G geometry.
+    """
     import warp as wp
 
     @wp.struct
@@ -34,7 +37,17 @@ def query_structs() -> SimpleNamespace:
         spacing: wp.array(dtype=wp.float32)
         values: wp.array(dtype=wp.float32)
 
-    return SimpleNamespace(Solids=Solids)
+    @wp.struct
+    class Shape:
+        kind: wp.int32
+        size: wp.vec3f
+        mesh: wp.uint64
+        first: wp.int32
+        counts: wp.vec3i
+        origin: wp.vec3f
+        spacing: wp.float32
+
+    return SimpleNamespace(Solids=Solids, Shape=Shape)
 
 
 @cache
@@ -135,19 +148,19 @@ def primitive_functions() -> SimpleNamespace:
 
 @cache
 def field_function() -> Any:
-    """Return ``field(solids, number, x) -> (normal, distance)``: a sampled field, linear within its cells.
+    """Return ``field(values, shape, x) -> (normal, distance)``: a sampled field, linear within its cells.
 
     Beyond the samples the distance is that to the surface point which the nearest border sample points at.
     """
     import warp as wp
 
-    solids_type = query_structs().Solids
+    shape_type = query_structs().Shape
 
     @wp.func
-    def field(solids: solids_type, number: int, x: wp.vec3f) -> wp.vec4f:
-        spacing = solids.spacing[number]
-        n = solids.counts[number]
-        u = (x - solids.origin[number]) / spacing
+    def field(values: wp.array(dtype=wp.float32), shape: shape_type, x: wp.vec3f) -> wp.vec4f:
+        spacing = shape.spacing
+        n = shape.counts
+        u = (x - shape.origin) / spacing
         limit = wp.vec3f(float(n[0] - 1), float(n[1] - 1), float(n[2] - 1))
         c = wp.vec3f(wp.clamp(u[0], 0.0, limit[0]), wp.clamp(u[1], 0.0, limit[1]), wp.clamp(u[2], 0.0, limit[2]))
         i = wp.min(int(c[0]), n[0] - 2)
@@ -156,17 +169,17 @@ def field_function() -> Any:
         fx = c[0] - float(i)
         fy = c[1] - float(j)
         fz = c[2] - float(k)
-        at = solids.first[number] + (i * n[1] + j) * n[2] + k
+        at = shape.first + (i * n[1] + j) * n[2] + k
         row = n[2]
         sheet = n[1] * n[2]
-        v000 = solids.values[at]
-        v001 = solids.values[at + 1]
-        v010 = solids.values[at + row]
-        v011 = solids.values[at + row + 1]
-        v100 = solids.values[at + sheet]
-        v101 = solids.values[at + sheet + 1]
-        v110 = solids.values[at + sheet + row]
-        v111 = solids.values[at + sheet + row + 1]
+        v000 = values[at]
+        v001 = values[at + 1]
+        v010 = values[at + row]
+        v011 = values[at + row + 1]
+        v100 = values[at + sheet]
+        v101 = values[at + sheet + 1]
+        v110 = values[at + sheet + row]
+        v111 = values[at + sheet + row + 1]
         v00 = v000 + fz * (v001 - v000)
         v01 = v010 + fz * (v011 - v010)
         v10 = v100 + fz * (v101 - v100)
@@ -214,8 +227,11 @@ def triangle_function() -> Any:
 
 
 @cache
-def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
-    """Return ``distance(solids, row, geometry, x, reach) -> (normal, distance)`` for the kinds a scene has.
+def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
+    """Return what finds distances for the kinds a scene has.
+
+    ``shape_of(solids, row, geometry)`` reads what is known of a geometry, once for many points;
+    ``distance_to(values, shape, x, reach) -> (normal, distance)`` asks it, with ``solids.values``.
 
     Args:
         kinds: only their code is compiled.
@@ -223,7 +239,8 @@ def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
     """
     import warp as wp
 
-    solids_type = query_structs().Solids
+    structs = query_structs()
+    solids_type, shape_type = structs.Solids, structs.Shape
     p = primitive_functions()
     plane, sphere, capsule, ellipsoid, cylinder, box = p.plane, p.sphere, p.capsule, p.ellipsoid, p.cylinder, p.box
     curved = not raycast
@@ -233,35 +250,67 @@ def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
     has_box = curved and BOX in kinds
     has_field = curved and MESH in kinds
     has_triangles = raycast and bool(kinds - {PLANE})
+    sized = curved and bool(kinds - {PLANE, MESH})
     field = field_function() if has_field else None
     triangles = triangle_function() if has_triangles else None
 
     @wp.func
-    def distance(solids: solids_type, row: int, geometry: int, x: wp.vec3f, reach: float) -> wp.vec4f:
-        kind = solids.kind[row, geometry]
-        if wp.static(has_plane):
-            if kind == wp.static(PLANE):
-                return plane(solids.size[row, geometry], x)
+    def shape_of(solids: solids_type, row: int, geometry: int) -> shape_type:
+        shape = shape_type()
+        shape.kind = solids.kind[row, geometry]
+        if wp.static(sized):
+            shape.size = solids.size[row, geometry]
         if wp.static(has_triangles):
-            return triangles(solids.mesh[row, geometry], x, reach)
-        if wp.static(has_box):
-            if kind == wp.static(BOX):
-                return box(solids.size[row, geometry], x)
-        if wp.static(has_sphere):
-            if kind == wp.static(SPHERE):
-                return sphere(solids.size[row, geometry], x)
-        if wp.static(has_capsule):
-            if kind == wp.static(CAPSULE):
-                return capsule(solids.size[row, geometry], x)
-        if wp.static(has_cylinder):
-            if kind == wp.static(CYLINDER):
-                return cylinder(solids.size[row, geometry], x)
-        if wp.static(has_ellipsoid):
-            if kind == wp.static(ELLIPSOID):
-                return ellipsoid(solids.size[row, geometry], x)
+            shape.mesh = solids.mesh[row, geometry]
         if wp.static(has_field):
-            if kind == wp.static(MESH):
-                return field(solids, solids.field[row, geometry], x)
+            number = wp.max(solids.field[row, geometry], 0)
+            shape.first = solids.first[number]
+            shape.counts = solids.counts[number]
+            shape.origin = solids.origin[number]
+            shape.spacing = solids.spacing[number]
+        return shape
+
+    @wp.func
+    def distance_to(values: wp.array(dtype=wp.float32), shape: shape_type, x: wp.vec3f, reach: float) -> wp.vec4f:
+        if wp.static(has_plane):
+            if shape.kind == wp.static(PLANE):
+                return plane(shape.size, x)
+        if wp.static(has_triangles):
+            return triangles(shape.mesh, x, reach)
+        if wp.static(has_box):
+            if shape.kind == wp.static(BOX):
+                return box(shape.size, x)
+        if wp.static(has_sphere):
+            if shape.kind == wp.static(SPHERE):
+                return sphere(shape.size, x)
+        if wp.static(has_capsule):
+            if shape.kind == wp.static(CAPSULE):
+                return capsule(shape.size, x)
+        if wp.static(has_cylinder):
+            if shape.kind == wp.static(CYLINDER):
+                return cylinder(shape.size, x)
+        if wp.static(has_ellipsoid):
+            if shape.kind == wp.static(ELLIPSOID):
+                return ellipsoid(shape.size, x)
+        if wp.static(has_field):
+            if shape.kind == wp.static(MESH):
+                return field(values, shape, x)
         return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
+
+    return SimpleNamespace(shape_of=shape_of, distance_to=distance_to)
+
+
+@cache
+def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
+    """Return ``distance(solids, row, geometry, x, reach) -> (normal, distance)``, both of :func:`shape_functions`."""
+    import warp as wp
+
+    solids_type = query_structs().Solids
+    functions = shape_functions(kinds, raycast)
+    shape_of, distance_to = functions.shape_of, functions.distance_to
+
+    @wp.func
+    def distance(solids: solids_type, row: int, geometry: int, x: wp.vec3f, reach: float) -> wp.vec4f:
+        return distance_to(solids.values, shape_of(solids, row, geometry), x, reach)
 
     return distance

@@ -10,7 +10,7 @@ import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
 from robotics_bridge._device import warp
-from robotics_bridge.sensors._base import Convention, ProbeRuntime, QuerySensor
+from robotics_bridge.sensors._base import Convention, ProbeRuntime, QuerySensor, probe_rows
 from robotics_bridge.sensors.noise import GRID_KNOBS
 
 if TYPE_CHECKING:
@@ -79,13 +79,13 @@ class KinematicRuntime(ProbeRuntime):
     """Serves kinematic taxels."""
 
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: Context) -> None:
-        from robotics_bridge.sensors._probe_kernels import kinematic_functions
+        from robotics_bridge.sensors._probe_kernels import kinematic_params
 
         first = next(iter(sensors.values()))
         scaled = first.total == "engine"
         super().__init__(sensors, 6, context, fusable=not scaled)
         self._options = (first.query == "raycast", first.convention == "physical")
-        kind = kinematic_functions(self._options[1]).KinematicParams
+        kind = kinematic_params()
         laws = []
         for sensor in sensors.values():
             law = kind()
@@ -101,15 +101,17 @@ class KinematicRuntime(ProbeRuntime):
         slots = self.probes.slot.numpy()
         spans = np.array([(p.start, p.start + p.count, slots[p.start]) for p in self.places.values()], np.int32)
         self._spans = wp.array(spans, dtype=wp.vec3i, device=context.device)
+        self._rows = wp.array(probe_rows(self.places.values(), context), dtype=wp.vec4i, device=context.device)
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
         from robotics_bridge.sensors._probe_kernels import kinematic_kernel
 
         self.begin(state, dt)
-        kernel = kinematic_kernel(self.kinds, *self._options, self.mode, *self.stores)
+        kernel = kinematic_kernel(self.kinds, *self._options, self.mode, *self.stores, self.context.device.is_cuda)
         c = self.context
-        self.launch(kernel, self.probes, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._laws)
+        inputs = [self.probes, self._rows, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._laws]
+        warp().launch(kernel, dim=(c.num_envs, self._rows.shape[0]), inputs=inputs, device=c.device)
         if self._loads is not None:
             self._scale(state)
         self.finish(dt)

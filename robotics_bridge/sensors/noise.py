@@ -154,6 +154,7 @@ class Noise:
         params.gain_low, params.gain_high = self.gain
         params.dead_low, params.dead_high = self.dead_range
         params.tau = self.hysteresis_tau
+        params.levels = 1.0 / self.quantum if self.quantum else 0.0
         for name in ("radius", "dead_probability", "hysteresis", "walk", "white", "bias", "quantum"):
             setattr(params, name, getattr(self, name))
         return params

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +116,7 @@ class SensorSuite:
         """
         if self._status is None or state.status is not self._status:
             self._check(state)
-        if not (np.isfinite(dt) and dt > 0):
+        if not (math.isfinite(dt) and dt > 0):
             raise UsageError(f"dt is the positive time since the last update (s); received {dt!r}.")
         wp = warp()
         if not self.device.is_cuda:

@@ -47,6 +47,10 @@ def sweep(
     ] = None,
     device: Annotated[str, typer.Option(help="cpu, or cuda with a backend that runs there.")] = "cpu",
     shard_size: Annotated[int | None, typer.Option(min=1, help="Sweeps per shard. [default: by backend]")] = None,
+    retry: Annotated[
+        int,
+        typer.Option(min=1, help="Divides the steps of whiskers that cannot be trusted and are simulated again (rod)."),
+    ] = 5,
     unit: Annotated[str | None, typer.Option(help="Length unit of mesh files: m, cm, mm, …")] = None,
     collision: Annotated[str | None, typer.Option(help="What whiskers touch: hull, exact, decomposition, …")] = None,
     whiskers: WhiskersOption = "all",
@@ -81,6 +85,7 @@ def sweep(
         limit=limit,
         sample=sample,
         shard_size=shard_size,
+        retry=retry,
     )
     plan = GenerationPlan(grid, GRIDS[grid], found, settings, whiskers)
     summary = counts(scenes)

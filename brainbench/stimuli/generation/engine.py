@@ -52,6 +52,8 @@ class SweepBatch:
     """Time steps of single whiskers that were computed."""
     steps_in_full: int
     """Time steps that simulating every whisker of every sweep from start to end takes."""
+    retried: int = 0
+    """Sweeps with a whisker that was simulated again with finer steps, because it could not be trusted at first."""
 
     def __post_init__(self) -> None:
         count, _, whiskers, channels = np.shape(self.wrench)
@@ -72,6 +74,7 @@ def simulate_sweeps(
     backend: str = "mujoco",
     device: str = "cpu",
     workers: int | None = None,
+    retry: int = 1,
 ) -> SweepBatch:
     """Simulate some sweeps.
 
@@ -82,6 +85,8 @@ def simulate_sweeps(
         backend: name of the physics engine.
         device: ``cpu`` or ``cuda``.
         workers: threads on the CPU; all usable processors when None.
+        retry: divides the time step for whiskers that cannot be trusted, which are then simulated once more; 1 leaves
+            them. Only backends with a fast path do this.
 
     Raises:
         UsageError: the backend is unknown or does not run on the device.
@@ -90,7 +95,7 @@ def simulate_sweeps(
     if backend in FAST_PATHS:
         module, symbol = FAST_PATHS[backend]
         run = getattr(import_module(module), symbol)
-        return run(scenes, indices, fidelity=fidelity, device=device, workers=workers)
+        return run(scenes, indices, fidelity=fidelity, device=device, workers=workers, retry=retry)
     parts = [
         _one_by_one(scenes, indices[first : first + _TOGETHER], fidelity, _Threads(engine, workers))
         for first in range(0, len(indices), _TOGETHER)
@@ -122,6 +127,7 @@ def join_batches(parts: Sequence[SweepBatch]) -> SweepBatch:
         reasons=tuple(reason for part in parts for reason in part.reasons),
         steps=sum(part.steps for part in parts),
         steps_in_full=sum(part.steps_in_full for part in parts),
+        retried=sum(part.retried for part in parts),
     )
 
 

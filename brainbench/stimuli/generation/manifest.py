@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MANIFEST = "manifest.json"
 
-_COUNTS = ("steps", "steps_in_full", "unstable", "unusable")
+_COUNTS = ("steps", "steps_in_full", "retried", "unstable", "unusable")
 
 
 def is_whole(path: Path, task: ShardTask) -> bool:

@@ -53,6 +53,9 @@ class Settings:
     """Only this fraction of all sweeps, drawn at random; all when None."""
     shard_size: int | None = None
     """Sweeps per shard; by backend and device when None."""
+    retry: int = 5
+    """Whiskers that cannot be trusted are simulated again, once, with steps divided by this (backend ``rod``); 1 leaves
+    them as they are."""
 
     def __post_init__(self) -> None:
         if self.split not in ("object", "sweep"):
@@ -61,6 +64,8 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise UsageError(f"{name} must be at least 1; received {value!r}.")
+        if self.retry < 1:
+            raise UsageError(f"retry divides the time step; it must be at least 1; received {self.retry!r}.")
         if self.sample is not None and not 0 < self.sample <= 1:
             raise UsageError(f"sample is a fraction above 0 and at most 1; received {self.sample!r}.")
         if self.limit is not None and self.sample is not None:

@@ -87,7 +87,7 @@ def simulate_shard(task: ShardTask, prepared: Prepared, workers: int | None = No
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
     reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
-    steps = steps_in_full = 0
+    steps = steps_in_full = retried = 0
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
         named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
@@ -98,13 +98,14 @@ def simulate_shard(task: ShardTask, prepared: Prepared, workers: int | None = No
             backend=task.settings.backend,
             device=task.settings.device,
             workers=workers,
+            retry=task.settings.retry,
         )
         if batch.wrench.shape != (len(chosen), *shape[1:]):
             raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")
         contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)
         for index, reason in zip(chosen.tolist(), batch.reasons, strict=True):
             reasons[index] = reason
-        steps, steps_in_full = batch.steps, batch.steps_in_full
+        steps, steps_in_full, retried = batch.steps, batch.steps_in_full, batch.retried
         wrench = batch.wrench
     if len(chosen) < len(task):
         known, wrench = wrench, np.full(shape, np.nan, dtype=np.float32)
@@ -126,6 +127,7 @@ def simulate_shard(task: ShardTask, prepared: Prepared, workers: int | None = No
         "config_hash": task.config_hash,
         "steps": steps,
         "steps_in_full": steps_in_full,
+        "retried": retried,
         "unstable": int((status == UNSTABLE).any(axis=1).sum()),
         "unusable": int((status == UNUSABLE).any(axis=1).sum()),
     }

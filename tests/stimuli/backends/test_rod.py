@@ -14,7 +14,7 @@ from brainbench.stimuli.collections import resolve_objects
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.obstacle import Box, Capsule, Obstacle, TriangleMesh
 from brainbench.stimuli.sweep_grid import SweepGrid
-from brainbench.stimuli.sweeps import SweepScenes
+from brainbench.stimuli.sweeps import GRIDS, SweepScenes
 from brainbench.stimuli.whisker import Whisker
 
 pytest.importorskip("warp")
@@ -154,6 +154,26 @@ def test_sweeps_do_not_depend_on_which_share_a_launch():
     together = simulate_sweeps(scenes, [0, 1, 2, 3], fidelity=COARSE, workers=2)
     single = [simulate_sweeps(scenes, [index], fidelity=COARSE) for index in range(4)]
     assert np.concatenate([batch.wrench for batch in single]).tobytes() == together.wrench.tobytes()
+
+
+def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_changes():
+    from brainbench.stimuli.backends.rod.fast import simulate_sweeps
+
+    objects = resolve_objects(["chair-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
+    fidelity, chosen = Fidelity(links=10, time_step=5e-4), [0, 140]
+    once = simulate_sweeps(scenes, chosen, fidelity=fidelity)
+    again = simulate_sweeps(scenes, chosen, fidelity=fidelity, retry=5)
+    bad = once.unstable
+    assert bad.any()
+    assert not again.unstable.any()
+    assert (again.retried, once.retried) == (bad.any(axis=1).sum(), 0)
+    assert again.reasons == ("", "")
+    kept = np.broadcast_to(~bad[:, None, :, None], once.wrench.shape)
+    np.testing.assert_array_equal(once.wrench[kept], again.wrench[kept])
+    # What was simulated again is what a finer simulation of everything gives.
+    finer = simulate_sweeps(scenes, chosen, fidelity=Fidelity(links=10, time_step=1e-4))
+    np.testing.assert_array_equal(finer.wrench[~kept], again.wrench[~kept])
 
 
 def test_an_unknown_device_is_refused_in_words():

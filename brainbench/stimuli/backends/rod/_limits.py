@@ -50,6 +50,14 @@ def contacts_for(capacity: int) -> int:
 WARP = 32
 """Threads of a GPU that run in step."""
 
+GROUPS = (2, 2), (4, 4)
+"""Possible contacts of a whisker up to which a group of threads finds their forces on a GPU, and its threads; whiskers
+of more have groups of eight, or sixteen."""
+GRIP_BOUNDS = 128, 4
+"""CUDA launch bounds of these kernels."""
+AFTER_LOOK, AFTER_GRIP, ANYHOW = 0, 1, 2
+"""Queues of paused whiskers: those that looked, those whose contact forces were found, all others."""
+
 NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 """What whiskers may touch: a kernel holds only the code that its scenes need."""
 

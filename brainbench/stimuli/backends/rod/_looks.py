@@ -116,27 +116,52 @@ def looks(real: type, against: int) -> SimpleNamespace:
         end_w = real(0.0)
         start_nearest = real(1e20)
         first = bodies.face[s]
+        length = wp.length(b - a)
+        axis = (b - a) / length
+        zero = real(0.0)
+        widest = reach * reach
+        # Rounding must not hide a triangle.
+        sure = real(0.998)
         while wp.mesh_query_aabb_next(query, candidate):
             row = first + candidate
             p = bodies.corner[row, 0]
             q = bodies.corner[row, 1]
             r = bodies.corner[row, 2]
-            at = segment_triangle(a, b, p, q, r)
-            if at[0] < nearest:
-                nearest = at[0]
-                share = at[1]
-                v = at[2]
-                w = at[3]
-                face = row
-            spot = point_triangle(b, p, q, r)
-            square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
-            if square < end_nearest:
-                end_nearest = square
-                end_v = spot[0]
-                end_w = spot[1]
-                end_face = row
-            spot = point_triangle(a, p, q, r)
-            start_nearest = wp.min(start_nearest, wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1]))
+            # No triangle is nearer than this, squared: beside the axis, and along it from the link and from its ends.
+            tp = wp.dot(p - a, axis)
+            tq = wp.dot(q - a, axis)
+            tr = wp.dot(r - a, axis)
+            beside_p = p - a - axis * tp
+            beside_q = q - a - axis * tq
+            beside_r = r - a - axis * tr
+            way = beside_p + beside_q + beside_r
+            beside = wp.min(wp.dot(beside_p, way), wp.min(wp.dot(beside_q, way), wp.dot(beside_r, way)))
+            beside = wp.max(beside, zero)
+            beside = beside * beside / wp.max(wp.length_sq(way), real(1e-20))
+            start = wp.min(tp, wp.min(tq, tr))
+            stop = wp.max(tp, wp.max(tq, tr))
+            apart = wp.max(zero, wp.max(start - length, -stop))
+            if sure * (beside + apart * apart) < wp.min(nearest, widest):
+                at = segment_triangle(a, b, p, q, r)
+                if at[0] < nearest:
+                    nearest = at[0]
+                    share = at[1]
+                    v = at[2]
+                    w = at[3]
+                    face = row
+            apart = wp.max(zero, wp.max(start - length, length - stop))
+            if sure * (beside + apart * apart) < wp.min(end_nearest, widest):
+                spot = point_triangle(b, p, q, r)
+                square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
+                if square < end_nearest:
+                    end_nearest = square
+                    end_v = spot[0]
+                    end_w = spot[1]
+                    end_face = row
+            apart = wp.max(zero, wp.max(start, -stop))
+            if sure * (beside + apart * apart) < wp.min(start_nearest, widest):
+                spot = point_triangle(a, p, q, r)
+                start_nearest = wp.min(start_nearest, wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1]))
         touch.clear = wp.min(reach, wp.sqrt(wp.min(nearest, wp.min(end_nearest, start_nearest))))
         if face >= 0:
             out_here = outward_of(bodies, face, v, w)
@@ -150,6 +175,7 @@ def looks(real: type, against: int) -> SimpleNamespace:
                 touch.share = share
                 touch.gap = out[3] - radius
                 touch.normal = vec3(out[0], out[1], out[2])
+        if end_face >= 0:
             away = b - corner_point(bodies, end_face, end_v, end_w)
             out = direction(away, wp.sqrt(end_nearest), outward_of(bodies, end_face, end_v, end_w), rb)
             touch.end = 1

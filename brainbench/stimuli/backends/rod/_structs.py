@@ -7,7 +7,7 @@ from typing import Any
 
 @cache
 def structs(real: type) -> SimpleNamespace:
-    """Return ``Chains``, ``Bodies``, ``Lanes``, ``Options``, ``Results`` and ``Paused`` of a precision."""
+    """Return ``Chains``, ``Bodies``, ``Lanes``, ``Options``, ``Results``, ``Paused`` and ``Grips`` of a precision."""
     import warp as wp
 
     vec2: Any = wp.types.vector(2, real)
@@ -133,24 +133,26 @@ def structs(real: type) -> SimpleNamespace:
 
         budget: wp.int32
         """Steps of one slice."""
-        queue: wp.array(dtype=wp.int32)
-        """[lane] whiskers to go on with: those that got an answer from the front, the others from the back."""
-        after: wp.array(dtype=wp.int32)
-        """[lane] the same for the next slice."""
+        queue: wp.array2d(dtype=wp.int32)
+        """[3, lane] whiskers to go on with: after looks, after contact forces, all others."""
+        after: wp.array2d(dtype=wp.int32)
+        """[3, lane] the same for the next slice."""
+        grips: wp.array2d(dtype=wp.int32)
+        """[3, lane] whiskers whose contact forces are to be found: of few, some and many possible contacts."""
         size: wp.array(dtype=wp.int32)
-        """[3] whiskers at the front, at the back, looks."""
+        """[7] whiskers in the queues, in the queues of contact forces, and looks."""
         tally: wp.array(dtype=wp.int32)
-        """[3] the same for the next slice."""
+        """[7] the same for the next slice."""
         joints: wp.array2d(dtype=vec4)
         """[link, lane] angles and rates."""
         ways: wp.array2d(dtype=vec2)
         """[link, lane] lower bound of the distance, and whether triangles were near."""
-        held: wp.array2d(dtype=vec4)
-        """[contact, lane] arc and force of the last step."""
         times: wp.array2d(dtype=real)
-        """[7, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look."""
+        """[8, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look, and
+        quickest in the step whose forces are awaited."""
         counts: wp.array2d(dtype=wp.int32)
-        """[7, lane] reading, reading to write, held contacts, near, resting, waiting, first look."""
+        """[8, lane] reading, reading to write, held contacts, near, resting, waiting, first look, and near in the step
+        whose forces are awaited."""
         look_lane: wp.array(dtype=wp.int32)
         """[look]"""
         look_link: wp.array(dtype=wp.int32)
@@ -160,4 +162,37 @@ def structs(real: type) -> SimpleNamespace:
         found: wp.array2d(dtype=vec4)
         """[look, 3] direction and gap between the ends; at the far end; share, bound, and what there was."""
 
-    return SimpleNamespace(Chains=Chains, Bodies=Bodies, Lanes=Lanes, Options=Options, Results=Results, Paused=Paused)
+    @wp.struct
+    class Grips:
+        """The contact problem of each lane's step, and its answer. Its links and places lie one behind the other."""
+
+        counts: wp.array2d(dtype=wp.int32)
+        """[lane, 5] links, places of possible contact, contacts of the last step; answered with contacts, steps without
+        room for one, and steps not converged."""
+        plan: wp.array(dtype=vec4)
+        """[lane] time step, tip."""
+        chain: wp.array2d(dtype=vec3)
+        """[link, 9] both axes of the joint, their moments about the base point, what a joint passes on of a force (both
+        gains, rotation and translation), inverse inertia (11, 12, 22)."""
+        spot_link: wp.array(dtype=wp.int32)
+        """[place]"""
+        spot_size: wp.array(dtype=vec4)
+        """[place] gap, arc, friction, arc of the link."""
+        spot: wp.array2d(dtype=vec3)
+        """[place, 4] point, normal, velocity against the object without contact forces, direction of the link."""
+        ahead: wp.array(dtype=real)
+        """[place] gap at the end of the step."""
+        held: wp.array2d(dtype=vec4)
+        """[lane, contact] arc and force of the last step; answered with those of this step."""
+        push: wp.array2d(dtype=vec2)
+        """[lane, link] acceleration of the joint without contact forces."""
+        mend: wp.array2d(dtype=vec2)
+        """[lane, link] what they add to it."""
+        answer: wp.array2d(dtype=vec3)
+        """[lane, 7] reaction (moment, force) and acceleration of the tip, completed by the contacts; squares of what
+        was missed and of the forces; sum of the normal forces and of these times arc; force and moment of all of
+        them."""
+
+    return SimpleNamespace(
+        Chains=Chains, Bodies=Bodies, Lanes=Lanes, Options=Options, Results=Results, Paused=Paused, Grips=Grips
+    )

@@ -18,6 +18,7 @@ from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, FINEST, LIGHT, LOST, OK, WIDEST
 from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
+from brainbench.stimuli.backends.rod._slices import make_grips
 from brainbench.stimuli.chain import build_chain
 
 if TYPE_CHECKING:
@@ -176,7 +177,7 @@ def _simulate(
     real = wp.float32 if fidelity.precision == "single" else wp.float64
     # Compiling is once; it is no cost of a whisker.
     paused = time.thread_time()
-    kernels = solver(real, capacity, batch.shapes.needs)
+    kernels = solver(real, capacity, batch.shapes.needs, cuda=device.is_cuda)
     kernels.run.module.load(device, block_dim=1 if device.is_cpu else None)
     started += time.thread_time() - paused
     readings = first.times * MILLI
@@ -197,6 +198,7 @@ def _simulate(
             options,
             wp.array(readings, dtype=real, device=device),
             out,
+            make_grips(kernels, real, capacity, count, device),
             kernels.Paused(),
         ],
         device=device,

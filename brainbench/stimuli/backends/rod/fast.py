@@ -8,7 +8,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, MESHES
 from brainbench.stimuli.backends.rod._pack import Chains, Shapes, Tracks, capacity_for, quaternions, still_knots
 from brainbench.stimuli.backends.rod._shapes import MESH
-from brainbench.stimuli.backends.rod._slices import Slices
+from brainbench.stimuli.backends.rod._slices import Slices, make_grips
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.objects import euler_matrix
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.stimuli.generation.engine import SweepBatch
     from brainbench.stimuli.objects import Solid
     from brainbench.stimuli.sweep_grid import SweepGrid
     from brainbench.stimuli.sweeps import SweepScenes
@@ -91,6 +94,8 @@ class SweepLauncher:
         self.device = pick_device(device)
         self.sliced = against == MESHES and self.device.is_cuda if sliced is None else sliced
         self.slices = 0
+        self.tuning: dict[str, Any] = {}
+        """Arguments of :class:`Slices`."""
         self.scenes, self.grid, self.fidelity = scenes, grid, fidelity
         self.seconds: dict[str, float] = {}
         """What the last launch spent on placing objects, uploading, and computing."""
@@ -102,7 +107,12 @@ class SweepLauncher:
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.real = wp.float32 if fidelity.precision == "single" else wp.float64
         self.kernels = solver(
-            self.real, self.capacity, against, BOUNDS if bounds is None else bounds, sliced=self.sliced
+            self.real,
+            self.capacity,
+            against,
+            BOUNDS if bounds is None else bounds,
+            sliced=self.sliced,
+            cuda=self.device.is_cuda,
         )
         self._chains = to_struct(
             self.kernels.Chains, Chains(self.capacity, chains, self.quasistatic).arrays(), self.device
@@ -113,11 +123,15 @@ class SweepLauncher:
         spans = np.diff(self.readings, prepend=0.0)
         self.steps_each = np.array([int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in self.steps])
 
-    def launch(self, objects: Sequence[tuple[str, Sequence[Any]]]) -> SweepResult:
+    def launch(
+        self, objects: Sequence[tuple[str, Sequence[Any]]], only: NDArray[np.bool_] | None = None, finer: int = 1
+    ) -> SweepResult:
         """Simulate sweeps, object by object.
 
         Args:
             objects: (name, its sweeps) in the order of the result's first axis.
+            only: [sweep, whisker] which whiskers; all when None. Nothing is computed for the others.
+            finer: divides the time steps.
         """
         wp, kernels, device = warp(), self.kernels, self.device
         clock = [time.perf_counter()]
@@ -132,11 +146,13 @@ class SweepLauncher:
         whisker, row = (
             grid.ravel().astype(np.int32) for grid in np.meshgrid(np.arange(whiskers), np.arange(count), indexing="ij")
         )
+        if only is not None:
+            whisker, row = (some[only[row, whisker]] for some in (whisker, row))
         lanes = {
             "whisker": whisker,
             "scene": row,
             "base": np.array(bases, dtype=np.int32)[whisker],
-            "step": self.steps[whisker],
+            "step": self.steps[whisker] / finer,
             "row": row,
             "column": whisker,
             "load_first": np.zeros(len(row) + 1, dtype=np.int32),
@@ -165,17 +181,25 @@ class SweepLauncher:
             options,
             wp.array(self.readings, dtype=real, device=device),
             out,
+            make_grips(kernels, real, self.capacity, len(row), device),
         ]
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
         if self.sliced:
-            self.slices = Slices(kernels, real, self.capacity, len(row), device).run(inputs, BLOCK)
+            slices = Slices(kernels, real, self.capacity, len(row), device, **self.tuning)
+            self.slices = slices.run(inputs, BLOCK)
         else:
             wp.launch(kernels.run, len(row), [*inputs, kernels.Paused()], device=device, block_dim=BLOCK)
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
         self.seconds = dict(zip(("objects", "upload", "kernel"), np.diff(clock).tolist(), strict=True))
-        found = {name: getattr(out, name).numpy().reshape(whiskers, count).T for name in names}
+
+        def table(values: Any) -> NDArray:
+            whole = np.zeros((count, whiskers), dtype=values.dtype)
+            whole[row, whisker] = values
+            return whole
+
+        found = {name: table(getattr(out, name).numpy()) for name in names}
         return SweepResult(
             wrench=out.wrench,
             contact=out.contact,
@@ -184,8 +208,8 @@ class SweepLauncher:
             touching=found["touching"],
             unsolved=found["unsolved"],
             crowded=found["crowded"],
-            depth=out.depth.numpy().reshape(whiskers, count).T,
-            doubt=np.sqrt(out.miss.numpy() / np.maximum(out.load.numpy(), 1e-30)).reshape(whiskers, count).T,
+            depth=table(out.depth.numpy()),
+            doubt=table(np.sqrt(out.miss.numpy() / np.maximum(out.load.numpy(), 1e-30))),
             steps_in_full=int(self.steps_each.sum()) * count,
         )
 
@@ -194,7 +218,7 @@ class SweepLauncher:
         """Most sweeps of one object that are launched together on this device."""
         return 4096 if self.device.is_cuda else 4
 
-    def batch(self, result: SweepResult) -> Any:
+    def batch(self, result: SweepResult) -> SweepBatch:
         """Return a result as frames in the form of data generation."""
         from brainbench.stimuli.generation.engine import SweepBatch
 
@@ -220,6 +244,39 @@ class SweepLauncher:
             reasons=tuple(reasons),
             steps=int(result.steps.sum()),
             steps_in_full=result.steps_in_full,
+        )
+
+    def trusted(self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int) -> SweepBatch:
+        """Simulate sweeps, and whiskers that cannot be trusted once more with their steps divided by ``retry``.
+
+        Args:
+            objects: as for :meth:`launch`.
+            retry: 1 leaves such whiskers as they are.
+        """
+        batch = self.batch(self.launch(objects))
+        rows = np.flatnonzero(batch.unstable.any(axis=1))
+        if retry == 1 or not len(rows):
+            return batch
+        flat = [(name, sweep) for name, sweeps in objects for sweep in sweeps]
+        chosen = [flat[row] for row in rows]
+        groups = [(name, [sweep for _, sweep in some]) for name, some in groupby(chosen, key=itemgetter(0))]
+        only = batch.unstable[rows]
+        again = self.batch(self.launch(groups, only, retry))
+        wrench, contact, unstable = batch.wrench, batch.contact, batch.unstable.copy()
+        wrench[rows] = np.where(only[:, None, :, None], again.wrench, wrench[rows])
+        contact[rows] = np.where(only, again.contact, contact[rows])
+        unstable[rows] = again.unstable
+        reasons = list(batch.reasons)
+        for row, reason in zip(rows.tolist(), again.reasons, strict=True):
+            reasons[row] = reason
+        return replace(
+            batch,
+            wrench=wrench,
+            contact=contact,
+            unstable=unstable,
+            reasons=tuple(reasons),
+            steps=batch.steps + again.steps,
+            retried=len(rows),
         )
 
     def _add(self, shapes: Shapes, tracks: Tracks, solid: Solid, sweeps: Sequence[Any]) -> None:
@@ -275,22 +332,28 @@ def _base_knot(mount: Any, grid: SweepGrid) -> NDArray[np.float64]:
 
 
 def simulate_sweeps(
-    scenes: SweepScenes, indices: Sequence[int], *, fidelity: Fidelity, device: str = "cpu", workers: int | None = None
-) -> Any:
+    scenes: SweepScenes,
+    indices: Sequence[int],
+    *,
+    fidelity: Fidelity,
+    device: str = "cpu",
+    workers: int | None = None,
+    retry: int = 1,
+) -> SweepBatch:
     """Simulate sweeps as :func:`brainbench.stimuli.generation.engine.simulate_sweeps` asks; see there.
 
     On the CPU one thread takes one object at a time; ``workers`` of them run side by side.
     """
-    from brainbench.stimuli.generation.engine import SweepBatch, join_batches
+    from brainbench.stimuli.generation.engine import join_batches
 
     launcher = SweepLauncher(scenes, fidelity, device)
     groups = list(_by_object(scenes, indices, launcher.limit))
 
     def run(group: tuple[str, list[Any]]) -> SweepBatch:
-        return launcher.batch(launcher.launch([group]))
+        return launcher.trusted([group], retry)
 
     if launcher.device.is_cuda:
-        return launcher.batch(launcher.launch(groups))
+        return launcher.trusted(groups, retry)
     with ThreadPoolExecutor(max_workers=workers or 1) as pool:
         return join_batches(list(pool.map(run, groups)))
 
