@@ -190,6 +190,8 @@ def train(options: argparse.Namespace, out: Path) -> None:
     kept = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
     for path in kept[:-2]:
         path.unlink()
+    if not options.episodes:
+        return
     env = tasks.make(task, num_envs=min(envs, 512), device=options.device, seed=options.seed + 1)
     for who, act in (
         ("teacher", teacher.load_teacher(run, env)), ("zero", agent("zero", env)), ("random", agent("random", env)),
@@ -245,7 +247,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--minutes", type=float, default=7.5)
     parser.add_argument("--iterations", type=int, default=1_000_000)
-    parser.add_argument("--episodes", type=int, default=512, help="per seed")
+    parser.add_argument("--episodes", type=int, default=512, help="per seed; 0 does not evaluate")
     parser.add_argument("--config", default="default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--resume", type=Path, help="folder teacher-<task> of an earlier machine")
