@@ -1,7 +1,7 @@
-"""Adapter to ``gymnasium.vector``: ``gymnasium.make_vec("brainbench/InPalmRotate-v0", num_envs=8)``.
+"""Adapters to gymnasium: ``make_vec("brainbench/InPalmRotate-v0", num_envs=8)``, and ``make`` for a single one.
 
-Autoreset mode is SAME_STEP: an episode that ends is followed by the first observation of the next one in the same
-call, with the last observation in ``info["final_obs"]``. Importing this module registers the ids.
+Autoreset mode of vectors is SAME_STEP: an episode that ends is followed by the first observation of the next one in
+the same call, with the last observation in ``info["final_obs"]``. Importing this module registers the ids.
 """
 
 from __future__ import annotations
@@ -116,6 +116,50 @@ class GymVectorEnv(VectorEnv):
         return {name: observations[name].detach().cpu().numpy().copy() for name in self._groups}
 
 
+class GymEnv(gymnasium.Env):
+    """One environment of a task; the user resets it when an episode has ended.
+
+    Args:
+        vector: a vector of one.
+
+    Raises:
+        UsageError: the vector holds more than one.
+    """
+
+    def __init__(self, vector: GymVectorEnv) -> None:
+        if vector.num_envs != 1:
+            raise UsageError(f"A single environment has num_envs=1; received {vector.num_envs}. Use make_vec for more.")
+        self.vector = vector
+        self.metadata = {"render_modes": []}
+        self.observation_space, self.action_space = vector.single_observation_space, vector.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start a new episode."""
+        super().reset(seed=seed)
+        observations, _ = self.vector.reset(seed=seed, options=options)
+        return {name: value[0] for name, value in observations.items()}, {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Advance by one control step with an action [A].
+
+        The last observation of an episode is its own; ``info`` has ``diverged``, at the end ``metric`` and ``return``.
+        """
+        found, reward, terminated, truncated, facts = self.vector.step(np.asarray(action)[None])
+        info: dict[str, Any] = {"diverged": bool(facts["diverged"][0])}
+        observations = {name: value[0] for name, value in found.items()}
+        if "final_obs" in facts:
+            observations = facts["final_obs"][0]
+            info |= {name: float(value[0]) for name, value in facts["final_info"].items()}
+        return observations, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+
+def make(task: str, *, groups: tuple[str, ...] = (), **options: Any) -> GymEnv:
+    """Return one environment of a task for gymnasium; options as for :func:`make_vec`."""
+    return GymEnv(make_vec(task, 1, groups=groups, **options))
+
+
 def make_vec(task: str, num_envs: int = 1, *, groups: tuple[str, ...] = (), **options: Any) -> GymVectorEnv:
     """Return the environments of a task for gymnasium; options are those of :func:`robotics_bridge.tasks.make`."""
     from robotics_bridge import tasks
@@ -128,7 +172,10 @@ def register() -> None:
     for name, task in IDS.items():
         if name not in gymnasium.registry:
             gymnasium.register(
-                id=name, vector_entry_point="robotics_bridge.envs.gymnasium:make_vec", kwargs={"task": task}
+                id=name,
+                entry_point="robotics_bridge.envs.gymnasium:make",
+                vector_entry_point="robotics_bridge.envs.gymnasium:make_vec",
+                kwargs={"task": task},
             )
 
 

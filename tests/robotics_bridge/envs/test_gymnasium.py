@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from brainbench.errors import UsageError
 from robotics_bridge import tasks
-from robotics_bridge.envs.gymnasium import IDS, GymVectorEnv
+from robotics_bridge.envs.gymnasium import IDS, GymEnv, GymVectorEnv
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +27,27 @@ def test_registered_ids_make_every_task_that_needs_no_grasps() -> None:
     assert made.observation_space.contains(observations)
     assert set(IDS) <= set(gymnasium.registry)
     made.close()
+
+
+@pytest.mark.parametrize("name", ["brainbench/InPalmRotate-v0", "brainbench/HotBall-v0"])
+def test_a_single_environment_passes_the_checker_of_gymnasium(name: str) -> None:
+    made = gymnasium.make(name, threads=1, observe="force_torque", placement="tips")
+    # Its only remark is that actions reach further than -1 … 1, on purpose.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(action space|infinity).*")
+        check_env(made.unwrapped)
+    made.close()
+
+
+def test_a_single_environment_shows_the_last_observation_of_an_episode() -> None:
+    task = replace(tasks.load("in_palm_rotate"), episode=0.1)
+    single = GymEnv(GymVectorEnv(tasks.make(task, num_envs=1, keep_final=True, threads=1)))
+    single.reset(seed=4)
+    for _ in range(4):
+        observations, _, terminated, truncated, info = single.step(np.ones(5, dtype=np.float32))
+    assert (terminated, truncated) == (False, True)
+    assert observations["proprio"][-5:].tolist() == [1.0] * 5
+    assert set(info) == {"diverged", "metric", "return"}
 
 
 def test_it_declares_its_autoreset_mode_and_spaces(env: GymVectorEnv) -> None:
@@ -77,7 +100,9 @@ def test_a_mask_starts_some_environments_anew(env: GymVectorEnv) -> None:
     assert observations["proprio"][:, -1].tolist() == [0.0, 1.0, 1.0]
 
 
-def test_wrong_requests_are_refused() -> None:
+def test_wrong_requests_are_refused(env: GymVectorEnv) -> None:
+    with pytest.raises(UsageError, match="num_envs=1; received 3"):
+        GymEnv(env)
     with pytest.raises(UsageError, match="keep_final=True"):
         GymVectorEnv(tasks.make("in_palm_rotate", threads=1))
     with pytest.raises(UsageError, match="no observation group 'vision'"):

@@ -110,3 +110,27 @@ def test_published_sensors_carry_the_published_parameters():
     assert force.convention == "thesis"
     assert set(sensors_for("proximity", layout)["right_thumb_DP"].probes.radius) == {0.01}
     assert sensors_for("none", layout) == {}
+
+
+TABLE_4_12 = {
+    # white noise, random walk, quantum, radius noise, release threshold, dead taxels, gain, hysteresis and its time
+    "bool": (0, 0, 0, 0, 2e-4, 0.05, (1, 1), 0, None),
+    "agg_bool": (0, 0, 0, 0, 2e-4, 0.05, (1, 1), 0, None),
+    "depth": (2e-4, 0, 1e-4, 3e-4, None, 0.05, (0.85, 1.15), 0.5, 0.05),
+    "agg_force": (2e-4, 0, 1e-4, 3e-4, None, 0.05, (0.85, 1.15), 0.5, 0.05),
+    "force": (5e-3, 1e-4, 1e-2, 3e-4, None, 0.05, (0.85, 1.15), 0.5, 0.05),
+    "force_torque": (5e-3, 1e-4, 1e-2, 3e-4, None, 0.05, (0.85, 1.15), 0.5, 0.05),
+    "proximity": (1e-2, 1e-3, 1e-2, 6e-4, None, 0.05, (0.85, 1.15), 0.5, 0.05),
+    "elastomer": (1e-4, 1e-5, 1e-4, 3e-4, None, 0.05, (0.85, 1.15), 0.5, 0.05),
+}
+
+
+@pytest.mark.parametrize("name", TABLE_4_12)
+def test_the_noisy_condition_is_that_of_table_4_12(name):
+    layout = hands.load("xhand1").layout("med", "tips")
+    for sensor in sensors_for(name, layout, noisy=True).values():
+        noise = sensor.noise
+        found = (noise.white, noise.walk, noise.quantum, noise.radius, getattr(sensor, "release", None))
+        found += (noise.dead_probability, tuple(noise.gain), noise.hysteresis)
+        assert (*found, noise.hysteresis_tau if noise.hysteresis else None) == TABLE_4_12[name]
+    assert not any(sensor.noise.active for sensor in sensors_for(name, layout).values())
