@@ -12,11 +12,12 @@ RESULTS = Path(__file__).parent / "RESULTS.md"
 HEAD = "# Benchmark results\n\nEach section is written by the command it names.\n"
 
 
-def write_section(title: str, command: str, body: str, path: Path = RESULTS) -> None:
-    """Replace the section ``title`` of ``path``, or append it."""
+def write_section(title: str, command: str, body: str, path: Path = RESULTS, *, where: str = "") -> None:
+    """Replace the section ``title`` of ``path``, or append it; ``where`` says what measured it if not this machine."""
     text = path.read_text(encoding="utf-8") if path.exists() else HEAD
     load = f"{os.getloadavg()[0]:.1f}"
-    stamp = f"`{command}` — {platform.machine()}, {os.cpu_count()} processors, load {load} at the end."
+    machine = f"{platform.machine()}, {os.cpu_count()} processors, load {load} at the end"
+    stamp = f"`{command}` — {where or machine}."
     section = f"## {title}\n\n{stamp}\n\n{body.strip()}\n"
     parts = text.split("\n## ")
     kept = [parts[0].rstrip() + "\n"]

@@ -358,20 +358,28 @@ class ProbeRuntime(ReadoutRuntime):
 
 _SHARED = 32
 """Probes that one thread of a processor takes in turn."""
-_SHARED_CUDA, _FILL = 4, 2048
-"""The same on a GPU, at most, and the threads of a multiprocessor from which on that pays."""
+_SHARED_CUDA = {CLEAN: (8, 3072), FUSED: (4, 6144), STAGED: (8, 3072)}
+"""The same on a GPU by mode: at most, and probes of a multiprocessor for each of them (measured on an H200)."""
 
 
-def probe_rows(places: Iterable[Place], context: Context) -> np.ndarray:
+def probe_rows(places: Iterable[Place], context: Context, mode: int) -> np.ndarray:
     """Return rows (first, end, step, number of the sensor) [R, 4] of probes that one thread takes in turn.
 
     What all probes of an environment share is then read less often. On a GPU the rows of neighbouring threads are
     interleaved, so that these touch neighbouring memory.
+
+    Args:
+        places: of the sensors, in the order of their numbers.
+        context: of the suite.
+        mode: of the readout; noise leaves fewer registers to share.
     """
     places = list(places)
     cuda = bool(context.device.is_cuda)
     total = context.num_envs * sum(place.count for place in places)
-    most = min(_SHARED_CUDA, max(1, total // (_FILL * context.device.sm_count))) if cuda else _SHARED
+    most = _SHARED
+    if cuda:
+        limit, fill = _SHARED_CUDA[mode]
+        most = min(limit, max(1, total // (fill * context.device.sm_count)))
     rows = []
     for part, place in enumerate(places):
         end, threads = place.start + place.count, -(-place.count // most)

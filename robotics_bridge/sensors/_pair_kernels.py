@@ -64,12 +64,16 @@ def begin_kernel() -> SimpleNamespace:
     return SimpleNamespace(begin=begin, reset=reset)
 
 
+CONTACTS = 4
+"""Contacts that one thread looks at, so that it waits for memory once for all of them."""
+
+
 @cache
 def start_kernel(contacts: bool, apart: bool) -> Any:
     """Return the kernel ``start`` of an update: counts it, checks the state and marks who touches whom.
 
-    One launch for three small tasks, since launches are what small updates cost. Dim [max(B, C)], or [B] without
-    ``contacts``.
+    One launch for three small tasks, since launches are what small updates cost. Dim [max(B, C / CONTACTS)], or [B]
+    without ``contacts``.
 
     Args:
         contacts: whether any slot looks at them.
@@ -81,8 +85,6 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
 
     @wp.func
     def mark(slots: slots_type, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
-        if link < 0:
-            return
         for slot in range(slots.link.shape[0]):
             if slots.contact[slot] == 1 and slots.link[slot] == link:
                 place = slots.place[slot, other]
@@ -113,13 +115,48 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
             else:
                 status[tid] = status_of(pose, velocity, tid, count[0], owner.shape[0])
         if wp.static(contacts):
-            if tid < owner.shape[0]:
-                # Asked for before the count is known, so that one waits for memory once.
-                pair = geometry[tid]
-                env = owner[tid]
-                if tid < count[0] and pair[0] >= 0 and pair[1] >= 0:
-                    mark(slots, env, slots.watched[pair[0]], pair[1], words, bits)
-                    mark(slots, env, slots.watched[pair[1]], pair[0], words, bits)
+            # All is asked for before anything is looked at; neighbouring threads read neighbouring contacts.
+            threads = (owner.shape[0] + wp.static(CONTACTS - 1)) // wp.static(CONTACTS)
+            if tid < threads:
+                one = wp.vec4i(-1)
+                two = wp.vec4i(-1)
+                envs = wp.vec4i(0)
+                for k in range(wp.static(CONTACTS)):
+                    at = tid + k * threads
+                    if at < owner.shape[0]:
+                        pair = geometry[at]
+                        one[k] = pair[0]
+                        two[k] = pair[1]
+                        envs[k] = owner[at]
+                first = wp.vec4i(-1)
+                second = wp.vec4i(-1)
+                # Two bits for each contact: whose contact with what is to be marked.
+                todo = int(0)
+                for k in range(wp.static(CONTACTS)):
+                    if tid + k * threads < count[0] and one[k] >= 0 and two[k] >= 0:
+                        first[k] = slots.watched[one[k]]
+                        second[k] = slots.watched[two[k]]
+                        if first[k] >= 0:
+                            todo = todo | (1 << (2 * k))
+                        if second[k] >= 0:
+                            todo = todo | (2 << (2 * k))
+                # Few are: the threads of a warp take theirs together, whichever of the contacts they are.
+                while todo != 0:
+                    env = int(0)
+                    link = int(-1)
+                    other = int(0)
+                    lowest = todo & (-todo)
+                    todo = todo - lowest
+                    for k in range(wp.static(CONTACTS)):
+                        if lowest == (1 << (2 * k)):
+                            env = envs[k]
+                            link = first[k]
+                            other = two[k]
+                        if lowest == (2 << (2 * k)):
+                            env = envs[k]
+                            link = second[k]
+                            other = one[k]
+                    mark(slots, env, link, other, words, bits)
 
     return start
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotics_bridge._device import warp
-from robotics_bridge.sensors._pair_kernels import pair_kernel, pair_structs, start_kernel
+from robotics_bridge.sensors._pair_kernels import CONTACTS, pair_kernel, pair_structs, start_kernel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -123,7 +123,7 @@ class PairTable:
         room = state.contact_env.shape[0]
         inputs = [self.plan, state.pose, state.velocity, state.contact_count]
         inputs += [state.contact_geom, state.contact_env, self._words, self._bits, state.status, age]
-        dim = max(self._num_envs, room) if contacts else self._num_envs
+        dim = max(self._num_envs, -(-room // CONTACTS)) if contacts else self._num_envs
         wp.launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
 
     def update(self, state: HandState) -> None:

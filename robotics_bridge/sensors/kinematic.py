@@ -101,7 +101,9 @@ class KinematicRuntime(ProbeRuntime):
         slots = self.probes.slot.numpy()
         spans = np.array([(p.start, p.start + p.count, slots[p.start]) for p in self.places.values()], np.int32)
         self._spans = wp.array(spans, dtype=wp.vec3i, device=context.device)
-        self._rows = wp.array(probe_rows(self.places.values(), context), dtype=wp.vec4i, device=context.device)
+        self._rows = wp.array(
+            probe_rows(self.places.values(), context, self.mode), dtype=wp.vec4i, device=context.device
+        )
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
