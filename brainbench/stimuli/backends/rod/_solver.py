@@ -215,6 +215,7 @@ def solver(
         inverse = Links3()
         clear = Links()
         close = LinksWhole()
+        until = Links()
         # Where contact is possible within one step.
         k_link = SeenWhole()
         k_arc = Seen()
@@ -295,56 +296,81 @@ def solver(
                     at = pose0.place
                     # Nothing can come near after the last reading.
                     look = object_speed * (readings[readings.shape[0] - 1] - before) + real(0.5)
+                    # While at rest, ``clear`` keeps until when nothing can reach a link.
+                    fresh = int(0)
+                    if idle_before == zero or before == opt.start:
+                        fresh = 1
                     asked = int(1)
                     far_place = int(0)
                     if wp.static(sliced):
                         if waiting != 4:
                             # Ask for these distances like for all others, and wait.
+                            nigh_links = int(0)
+                            for i in range(links):
+                                if fresh == 1 or clear[i] < upto:
+                                    nigh_links = nigh_links + 1
                             asked = int(0)
                             paused = 2
-                            look_first = wp.atomic_add(on.tally, 6, links)
-                            if look_first + links <= on.look_lane.shape[0]:
+                            look_first = wp.atomic_add(on.tally, 6, nigh_links)
+                            if look_first + nigh_links <= on.look_lane.shape[0]:
                                 asked = int(1)
                                 paused = 4
-                                far_place = wp.atomic_add(on.tally, 8, links)
+                                far_place = wp.atomic_add(on.tally, 8, nigh_links)
                                 on.times[5, lane] = before
                                 on.times[6, lane] = -look
+                    place = look_first
                     for i in range(links * asked):
                         b4 = ch.build[i, who]
                         turned = x * b4[1] + y * b4[2]
                         y = y * b4[1] - x * b4[2]
                         x = turned
                         ahead_at = at + x * b4[0]
-                        if wp.static(sliced):
-                            if paused == 4:
-                                on.order[1, far_place + i] = look_first + i
-                                on.look_lane[look_first + i] = lane
-                                on.look_link[look_first + i] = i
-                                on.look_ends[look_first + i, 0] = at
-                                on.look_ends[look_first + i, 1] = ahead_at
-                        for s in range(shapes_from, shapes_to):
-                            slack = zero
-                            if wp.static(sliced):
-                                if paused != 0:
-                                    continue
-                                slack = on.found[look_first + i, 2][1]
+                        until[i] = clear[i]
+                        if fresh == 1 or clear[i] < upto:
+                            if wp.static(sliced) and paused == 4:
+                                on.order[1, far_place] = place
+                                on.look_lane[place] = lane
+                                on.look_link[place] = i
+                                on.look_ends[place, 0] = at
+                                on.look_ends[place, 1] = ahead_at
+                                far_place = far_place + 1
                             else:
-                                slack = far_at(bodies, s, pose_at(tr, bodies.track[s], before), at, ahead_at, look)
-                            slack = slack - ch.taper[i, who][0] - real(0.05)
-                            if slack <= zero:
-                                idle = before
-                            elif object_speed > zero:
-                                idle = wp.min(idle, before + slack / (real(1.02) * object_speed))
+                                slack = real(1e30)
+                                if wp.static(sliced):
+                                    slack = on.found[place, 2][1]
+                                else:
+                                    for s in range(shapes_from, shapes_to):
+                                        body = pose_at(tr, bodies.track[s], before)
+                                        slack = wp.min(slack, far_at(bodies, s, body, at, ahead_at, look))
+                                slack = slack - ch.taper[i, who][0] - real(0.05)
+                                until[i] = real(1e30)
+                                if slack <= zero:
+                                    until[i] = before
+                                elif object_speed > zero:
+                                    until[i] = before + slack / (real(1.02) * object_speed)
+                            place = place + 1
+                        idle = wp.min(idle, until[i])
                         at = ahead_at
-                if wp.static(sliced):
-                    if paused != 0:
-                        idle = idle_before
-                        first_reading = reading
-                        break
-                    waiting = 0
+                    if wp.static(sliced):
+                        if paused != 0:
+                            idle = idle_before
+                            first_reading = reading
+                            break
+                        waiting = 0
+                    for i in range(links):
+                        if upto > idle:
+                            # Not at rest any longer: a distance again.
+                            bound = zero
+                            if until[i] > before:
+                                bound = (
+                                    (until[i] - before) * real(1.02) * object_speed + ch.taper[i, who][0] + real(0.04)
+                                )
+                            if fresh == 1:
+                                bound = wp.max(bound, clear[i])
+                            until[i] = bound
+                        clear[i] = until[i]
                 if upto <= idle:
                     for i in range(links):
-                        clear[i] = zero
                         close[i] = 0
                         q[i] = vec2(zero, zero)
                         qd[i] = vec2(zero, zero)
