@@ -258,4 +258,20 @@ def looks(real: type, against: int) -> SimpleNamespace:
         touch.end_gap = touch.end_gap * scale
         return touch
 
-    return SimpleNamespace(Touch=Touch, far_mesh=far_mesh, look_at=look_at)
+    @wp.func
+    def far_at(bodies: Bodies, s: int, body: Pose, a_world: vec3, b_world: vec3, look: real) -> real:
+        """Lower bound of the distance of a straight axis from a shape, up to ``look``; lengths of the scene."""
+        turn_s = bodies.turn[s]
+        scale = bodies.scale[s]
+        local = unrotate(body.turn, a_world - body.place) - bodies.place[s]
+        a = unrotate(turn_s, local) / scale
+        local = unrotate(body.turn, b_world - body.place) - bodies.place[s]
+        b = unrotate(turn_s, local) / scale
+        zero = real(0.0)
+        if bodies.kind[s] == wp.static(MESH):
+            touch = far_mesh(bodies, s, a, b, zero, zero, look / scale)
+            return touch.clear * scale
+        tip = primitive(bodies.kind[s], bodies.size[s] / scale, real(0.5) * (a + b))
+        return tip[3] * scale - real(0.5) * wp.length(b_world - a_world)
+
+    return SimpleNamespace(Touch=Touch, far_at=far_at, look_at=look_at)

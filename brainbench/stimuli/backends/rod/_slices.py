@@ -54,14 +54,15 @@ class Slices:
         queue[ANYHOW] = np.arange(lanes)
         on.queue = wp.array(queue, device=device)
         on.after, on.grips = (empty(3, lanes, kind=wp.int32) for _ in range(2))
-        size = np.zeros(7, dtype=np.int32)
+        size = np.zeros(9, dtype=np.int32)
         size[ANYHOW] = lanes
         on.size = wp.array(size, device=device)
-        on.tally = wp.zeros(7, dtype=wp.int32, device=device)
+        on.tally = wp.zeros(9, dtype=wp.int32, device=device)
         on.joints, on.ways = empty(capacity, lanes, kind=vec4), empty(capacity, lanes, kind=vec2)
         on.times = empty(8, lanes)
         on.counts = wp.zeros((8, lanes), dtype=wp.int32, device=device)
         on.look_lane, on.look_link = (wp.zeros(self.looks, dtype=wp.int32, device=device) for _ in range(2))
+        on.order = empty(2, self.looks, kind=wp.int32)
         on.look_ends = empty(self.looks, 2, kind=vec3)
         on.found = empty(self.looks, 3, kind=vec4)
 
@@ -93,7 +94,7 @@ class Slices:
         for _ in range(ROUNDS):
             wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, block_dim=block)
             on.queue, on.after = on.after, on.queue
-            wp.launch(kernels.turn_over, 1, [on, self.looks], device=device)
+            wp.launch(kernels.turn_over, 1, [on], device=device)
             for (kernel, threads), stream in zip(kernels.settle, self.streams, strict=True):
                 # Whole warps: the threads of a group speak with each other.
                 many = -(-left * threads // WARP) * WARP

@@ -36,7 +36,7 @@ from brainbench.stimuli.backends.rod._limits import (
     contacts_for,
 )
 from brainbench.stimuli.backends.rod._looks import looks
-from brainbench.stimuli.backends.rod._shapes import MESH, distances
+from brainbench.stimuli.backends.rod._shapes import distances
 from brainbench.stimuli.backends.rod._structs import structs
 from brainbench.stimuli.backends.rod._tracks import tracks
 
@@ -74,8 +74,8 @@ def solver(
     Chains, Bodies, Lanes, Options = kinds.Chains, kinds.Bodies, kinds.Lanes, kinds.Options
     Results, Paused, Grips = kinds.Results, kinds.Paused, kinds.Grips
     sym, sym_pair, sine, cosine = maths.sym, maths.sym_pair, maths.sine, maths.cosine
-    first_axis, rotate, unrotate = maths.first_axis, maths.rotate, maths.unrotate
-    Touch, far_mesh, look_at = near_by.Touch, near_by.far_mesh, near_by.look_at
+    first_axis, rotate = maths.first_axis, maths.rotate
+    Touch, far_at, look_at = near_by.Touch, near_by.far_at, near_by.look_at
     Tracks, pose_at = track.Tracks, track.pose_at
     most_held = contacts_for(capacity)
     most_seen = most_held + SPARE
@@ -116,17 +116,26 @@ def solver(
         return settle_queue
 
     @wp.kernel(enable_backward=False, module="unique")
-    def turn_over(on: Paused, looks: int):
-        for d in range(7):
+    def turn_over(on: Paused):
+        for d in range(9):
             on.size[d] = on.tally[d]
             on.tally[d] = 0
-        on.size[6] = wp.min(on.size[6], looks)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def look_all(ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, on: Paused, threads: int):
         """Answer the looks of all waiting whiskers."""
-        which = wp.tid()
-        while which < on.size[6]:
+        place = wp.tid()
+        near_looks = on.size[7]
+        far_from = ((near_looks + wp.static(WARP - 1)) // wp.static(WARP)) * wp.static(WARP)
+        while place < far_from + on.size[8]:
+            which = int(-1)
+            if place < near_looks:
+                which = on.order[0, place]
+            elif place >= far_from:
+                which = on.order[1, place - far_from]
+            place = place + threads
+            if which < 0:
+                continue
             lane = on.look_lane[which]
             i = on.look_link[which]
             s = bodies.first[ln.scene[lane]]
@@ -134,12 +143,17 @@ def solver(
             margin = on.times[6, lane]
             start = on.look_ends[which, 0]
             stop = on.look_ends[which, 1]
-            close = int(on.ways[i, lane][1])
-            touch = look_at(bodies, s, body, start, stop, ch.taper[i, ln.whisker[lane]], margin, close)
-            on.found[which, 0] = vec4(touch.normal[0], touch.normal[1], touch.normal[2], touch.gap)
-            on.found[which, 1] = vec4(touch.end_normal[0], touch.end_normal[1], touch.end_normal[2], touch.end_gap)
-            on.found[which, 2] = vec4(touch.share, touch.clear, real(touch.between + 2 * touch.end), real(touch.close))
-            which = which + threads
+            zero = real(0.0)
+            if margin < zero:
+                # A whisker at rest asks how far away everything is.
+                on.found[which, 2] = vec4(zero, far_at(bodies, s, body, start, stop, -margin), zero, zero)
+            else:
+                close = int(on.ways[i, lane][1])
+                touch = look_at(bodies, s, body, start, stop, ch.taper[i, ln.whisker[lane]], margin, close)
+                on.found[which, 0] = vec4(touch.normal[0], touch.normal[1], touch.normal[2], touch.gap)
+                on.found[which, 1] = vec4(touch.end_normal[0], touch.end_normal[1], touch.end_normal[2], touch.end_gap)
+                what = real(touch.between + 2 * touch.end)
+                on.found[which, 2] = vec4(touch.share, touch.clear, what, real(touch.close))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=options, launch_bounds=bounds)
     def run(
@@ -201,6 +215,7 @@ def solver(
         inverse = Links3()
         clear = Links()
         close = LinksWhole()
+        until = Links()
         # Where contact is possible within one step.
         k_link = SeenWhole()
         k_arc = Seen()
@@ -272,6 +287,7 @@ def solver(
                 continue
             if resting == 1 and upto > idle and rest_of_frame == zero:
                 # When may an object come near at the earliest? The whisker stands straight out of its base.
+                idle_before = idle
                 idle = real(1e30)
                 if object_speed > zero or before == opt.start:
                     pose0 = pose_at(tr, base, before)
@@ -280,40 +296,86 @@ def solver(
                     at = pose0.place
                     # Nothing can come near after the last reading.
                     look = object_speed * (readings[readings.shape[0] - 1] - before) + real(0.5)
-                    for i in range(links):
+                    # While at rest, ``clear`` keeps until when nothing can reach a link.
+                    fresh = int(0)
+                    if idle_before == zero or before == opt.start:
+                        fresh = 1
+                    asked = int(1)
+                    far_place = int(0)
+                    if wp.static(sliced):
+                        if waiting != 4:
+                            # Ask for these distances like for all others, and wait.
+                            nigh_links = int(0)
+                            for i in range(links):
+                                if fresh == 1 or clear[i] < upto:
+                                    nigh_links = nigh_links + 1
+                            asked = int(0)
+                            paused = 2
+                            look_first = wp.atomic_add(on.tally, 6, nigh_links)
+                            if look_first + nigh_links <= on.look_lane.shape[0]:
+                                asked = int(1)
+                                paused = 4
+                                far_place = wp.atomic_add(on.tally, 8, nigh_links)
+                                on.times[5, lane] = before
+                                on.times[6, lane] = -look
+                    place = look_first
+                    for i in range(links * asked):
                         b4 = ch.build[i, who]
                         turned = x * b4[1] + y * b4[2]
                         y = y * b4[1] - x * b4[2]
                         x = turned
                         ahead_at = at + x * b4[0]
-                        for s in range(shapes_from, shapes_to):
-                            body = pose_at(tr, bodies.track[s], before)
-                            turn_s = bodies.turn[s]
-                            scale = bodies.scale[s]
-                            local = unrotate(body.turn, at - body.place) - bodies.place[s]
-                            a = unrotate(turn_s, local) / scale
-                            local = unrotate(body.turn, ahead_at - body.place) - bodies.place[s]
-                            b = unrotate(turn_s, local) / scale
-                            slack = zero
-                            if bodies.kind[s] == wp.static(MESH):
-                                touch = far_mesh(bodies, s, a, b, zero, zero, look / scale)
-                                slack = touch.clear * scale
+                        until[i] = clear[i]
+                        if fresh == 1 or clear[i] < upto:
+                            if wp.static(sliced) and paused == 4:
+                                on.order[1, far_place] = place
+                                on.look_lane[place] = lane
+                                on.look_link[place] = i
+                                on.look_ends[place, 0] = at
+                                on.look_ends[place, 1] = ahead_at
+                                far_place = far_place + 1
                             else:
-                                tip = primitive(bodies.kind[s], bodies.size[s] / scale, real(0.5) * (a + b))
-                                slack = tip[3] * scale - real(0.5) * b4[0]
-                            slack = slack - ch.taper[i, who][0] - real(0.05)
-                            if slack <= zero:
-                                idle = before
-                            elif object_speed > zero:
-                                idle = wp.min(idle, before + slack / (real(1.02) * object_speed))
+                                slack = real(1e30)
+                                if wp.static(sliced):
+                                    slack = on.found[place, 2][1]
+                                else:
+                                    for s in range(shapes_from, shapes_to):
+                                        body = pose_at(tr, bodies.track[s], before)
+                                        slack = wp.min(slack, far_at(bodies, s, body, at, ahead_at, look))
+                                slack = slack - ch.taper[i, who][0] - real(0.05)
+                                until[i] = real(1e30)
+                                if slack <= zero:
+                                    until[i] = before
+                                elif object_speed > zero:
+                                    until[i] = before + slack / (real(1.02) * object_speed)
+                            place = place + 1
+                        idle = wp.min(idle, until[i])
                         at = ahead_at
+                    if wp.static(sliced):
+                        if paused != 0:
+                            idle = idle_before
+                            first_reading = reading
+                            break
+                        waiting = 0
+                    for i in range(links):
+                        if upto > idle:
+                            # Not at rest any longer: a distance again.
+                            bound = zero
+                            if until[i] > before:
+                                bound = (
+                                    (until[i] - before) * real(1.02) * object_speed + ch.taper[i, who][0] + real(0.04)
+                                )
+                            if fresh == 1:
+                                bound = wp.max(bound, clear[i])
+                            until[i] = bound
+                        clear[i] = until[i]
+                if upto <= idle:
+                    for i in range(links):
+                        close[i] = 0
+                        q[i] = vec2(zero, zero)
+                        qd[i] = vec2(zero, zero)
             if resting == 1 and upto <= idle and rest_of_frame == zero:
                 # At rest, and nothing can have come near: the wrench stays zero.
-                for i in range(links):
-                    clear[i] = zero
-                    close[i] = 0
-                    q[i] = vec2(zero, zero)
-                    qd[i] = vec2(zero, zero)
                 before = upto
                 pending = int(-1)
                 continue
@@ -407,11 +469,13 @@ def solver(
                     was_near = near
                     near = int(0)
                     nigh = int(0)
+                    near_looks = int(0)
                     if wp.static(against > NOTHING):
                         for i in range(links):
                             if clear[i] - real(1.02) * travel <= margin + ch.taper[i, who][0]:
                                 near = 1
                                 nigh = nigh + 1
+                                near_looks = near_looks + close[i]
                     if wp.static(sliced):
                         if near == 1 and waiting != 1:
                             # Ask for looks, and wait; when there is no room for more, try again.
@@ -420,12 +484,21 @@ def solver(
                             if look_first + nigh <= on.look_lane.shape[0]:
                                 paused = 1
                                 asked_for = look_first
+                                # Those among triangles and those through the tree, each side by side.
+                                near_place = wp.atomic_add(on.tally, 7, near_looks)
+                                far_place = wp.atomic_add(on.tally, 8, nigh - near_looks)
                                 for i in range(links):
                                     if clear[i] - real(1.02) * travel <= margin + ch.taper[i, who][0]:
                                         on.look_lane[asked_for] = lane
                                         on.look_link[asked_for] = i
                                         on.look_ends[asked_for, 0] = node[i] + origin
                                         on.look_ends[asked_for, 1] = node[i + 1] + origin
+                                        if close[i] == 1:
+                                            on.order[0, near_place] = asked_for
+                                            near_place = near_place + 1
+                                        else:
+                                            on.order[1, far_place] = asked_for
+                                            far_place = far_place + 1
                                         asked_for = asked_for + 1
                                 on.times[5, lane] = now
                                 on.times[6, lane] = margin
@@ -831,7 +904,7 @@ def solver(
             after = wp.static(AFTER_LOOK)
             if paused == 3:
                 after = wp.static(AFTER_GRIP)
-            elif paused == 2:
+            elif paused != 1:
                 after = wp.static(ANYHOW)
             on.after[after, wp.atomic_add(on.tally, after, 1)] = lane
         out.depth[lane] = deepest

@@ -140,19 +140,21 @@ def structs(real: type) -> SimpleNamespace:
         grips: wp.array2d(dtype=wp.int32)
         """[3, lane] whiskers whose contact forces are to be found: of few, some and many possible contacts."""
         size: wp.array(dtype=wp.int32)
-        """[7] whiskers in the queues, in the queues of contact forces, and looks."""
+        """[9] whiskers in the queues, in the queues of contact forces; looks, those among triangles, others."""
         tally: wp.array(dtype=wp.int32)
-        """[7] the same for the next slice."""
+        """[9] the same for the next slice."""
         joints: wp.array2d(dtype=vec4)
         """[link, lane] angles and rates."""
         ways: wp.array2d(dtype=vec2)
         """[link, lane] lower bound of the distance, and whether triangles were near."""
         times: wp.array2d(dtype=real)
-        """[8, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look, and
-        quickest in the step whose forces are awaited."""
+        """[8, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look (how
+        far to look, negative, at rest), and quickest in the step whose forces are awaited."""
         counts: wp.array2d(dtype=wp.int32)
         """[8, lane] reading, reading to write, held contacts, near, resting, waiting, first look, and near in the step
         whose forces are awaited."""
+        order: wp.array2d(dtype=wp.int32)
+        """[2, look] looks of links that were near triangles, and others."""
         look_lane: wp.array(dtype=wp.int32)
         """[look]"""
         look_link: wp.array(dtype=wp.int32)

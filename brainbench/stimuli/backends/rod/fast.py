@@ -288,14 +288,15 @@ class SweepLauncher:
         diagonal = solid.diagonal
         mesh, face = shapes.add_mesh(surface.vertices * MILLI, surface.faces)
         radius = float(np.linalg.norm(surface.vertices, axis=1).max()) * MILLI
-        turned: dict[float, tuple[NDArray, NDArray]] = {}
+        rotations = sorted({sweep.rotation for sweep in sweeps})
+        turns = np.array([euler_matrix((0.0, 0.0, rotation)) for rotation in rotations])
+        # Turned about z: how far it then reaches along x and y.
+        flat = surface.vertices[:, :2] @ turns[:, :2, :2].reshape(-1, 2).T
+        lows = dict(zip(rotations, flat.min(axis=0).reshape(-1, 2), strict=True))
+        turned = dict(zip(rotations, quaternions(head.T @ turns), strict=True))
         for sweep in sweeps:
-            if sweep.rotation not in turned:
-                turn = euler_matrix((0.0, 0.0, sweep.rotation))
-                turned[sweep.rotation] = (surface.vertices @ turn.T).min(axis=0), quaternions((head.T @ turn)[None])[0]
             scale = sweep.size / diagonal
-            low, quaternion = turned[sweep.rotation]
-            low = low * scale
+            low, quaternion = lows[sweep.rotation] * scale, turned[sweep.rotation]
             y = grid.start - low[1] if grid.placing == "clear" else grid.start + low[1]
             place = head.T @ (np.array([sweep.distance - low[0], y, sweep.height]) - self._origin)
             knot = still_knots(place, quaternion)
