@@ -110,7 +110,7 @@ class SweepLauncher:
             self.real,
             self.capacity,
             against,
-            BOUNDS if bounds is None else bounds,
+            bounds or (SLICED_BOUNDS if self.sliced else BOUNDS),
             sliced=self.sliced,
             cuda=self.device.is_cuda,
         )
@@ -323,6 +323,8 @@ BLOCK = 64
 """Threads of one block on a GPU."""
 BOUNDS = (BLOCK, 8)
 """CUDA launch bounds: registers are spilled for twice as many threads at a time (benchmarks/RESULTS.md)."""
+SLICED_BOUNDS = (BLOCK, 4)
+"""The same for whiskers in slices, whose registers are needed more than further threads."""
 
 
 def _base_knot(mount: Any, grid: SweepGrid) -> NDArray[np.float64]:
