@@ -160,11 +160,26 @@ def split(options: argparse.Namespace, out: Path) -> None:
         put(out, row)
 
 
+def changed(task: Any, words: list[str]) -> Any:
+    """Return a task with other numbers: ``is_dropped=-300`` (a weight), ``rotation_progress.clip=2``, ``entropy=0``."""
+    rewards, settings = dict(task.rewards), {}
+    for word in words:
+        name, _, value = word.partition("=")
+        name, _, key = name.partition(".")
+        if name not in rewards:
+            settings[name] = type(getattr(task.teacher, name))(float(value))
+        elif key:
+            rewards[name] = replace(rewards[name], params={**rewards[name].params, key: float(value)})
+        else:
+            rewards[name] = replace(rewards[name], weight=float(value))
+    return replace(task, rewards=rewards, teacher=replace(task.teacher, **settings))
+
+
 def train(options: argparse.Namespace, out: Path) -> None:
     """Train a teacher for some minutes, then hold it against zero and random."""
     (name,) = options.tasks[:1]
     envs = options.envs[-1]
-    task = tasks.load(name, options.config)
+    task = changed(tasks.load(name, options.config), options.change)
     run = out / f"teacher-{name}"
     if options.resume and not run.exists():
         shutil.copytree(options.resume, run)
@@ -251,6 +266,7 @@ def main() -> None:
     parser.add_argument("--config", default="default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--resume", type=Path, help="folder teacher-<task> of an earlier machine")
+    parser.add_argument("--change", nargs="*", default=[], help="weights of rewards, their parameters, settings")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     options.envs = options.envs or ([1024, 8192] if options.device != "cpu" else [16, 64])
