@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency
-from brainbench.files import provenance, read_json, write_json
+from brainbench.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies import _tree
 
@@ -158,6 +158,31 @@ class Trainer:
         """Return the present actor."""
         return Policy(self.algorithm.get_policy(), self.env.num_envs, self.env.device)
 
+    def begin_from(self, path: Path) -> None:
+        """Take up actor and critic of another run, with what they know of their inputs; learning begins anew.
+
+        Args:
+            path: a folder of a run, or one of its ``model_<iteration>.safetensors``.
+
+        Raises:
+            DataError: there is no model, or it has other inputs, outputs or layers.
+        """
+        file = newest(path) if path.is_dir() else path
+        found, own = _tree.load(file), self.algorithm.save()
+        for name in ("actor", "critic"):
+            theirs, mine = (
+                {k: tuple(v.shape) for k, v in tree.items()} for tree in (found[name], own[f"{name}_state_dict"])
+            )
+            if theirs != mine:
+                odd = next(key for key in {**mine, **theirs} if mine.get(key) != theirs.get(key))
+                raise DataError(
+                    f"The {name} of {str(file)!r} does not fit: {odd!r} has the shape {theirs.get(odd)}, here "
+                    f"{mine.get(odd)}. Take a run of a task with the same observations, actions and layers."
+                )
+            own[f"{name}_state_dict"] = found[name]
+        parts = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
+        self.algorithm.load(own, parts, strict=True)
+
     def state(self) -> dict[str, Any]:
         """Return all that the next iteration depends on, random numbers included."""
         import torch
@@ -201,6 +226,7 @@ def train(
     seed: int = 0,
     save_every: int = 50,
     keep_env: bool = True,
+    start: Path | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> TeacherResult:
     """Train a teacher in a folder, or go on with the run that the folder holds.
@@ -215,20 +241,24 @@ def train(
         save_every: iterations between checkpoints.
         keep_env: keep the environments' state too, which makes resuming exact; large batches may save without and
             go on with new episodes.
+        start: another run, or one of its models, whose actor and critic a new run begins with.
         progress: called with iteration, total and a word.
 
     Raises:
         UsageError: the folder holds a run of other settings.
+        DataError: the start does not fit.
     """
     settings = settings or env.task.teacher
     total = iterations or settings.iterations
     trainer = Trainer(env, settings, seed=seed)
+    if start is not None:
+        trainer.begin_from(start)
     run.mkdir(parents=True, exist_ok=True)
     facts = {
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
-        "action_names": list(env.action_names),
+        "action_names": list(env.action_names), "start": None if start is None else _origin(start),
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = _writer(run)
@@ -254,6 +284,11 @@ def train(
     writer.close()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
     return TeacherResult(run, trainer.iteration, steps, time.monotonic() - start, tuple(rows))
+
+
+def _origin(start: Path) -> dict[str, str]:
+    file = newest(start) if start.is_dir() else start
+    return {"file": str(file), "hash": file_hash(file)}
 
 
 def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:

@@ -85,3 +85,18 @@ def default() -> Task:
     rewards["rotation_progress"] = Reward(10.0, terms.rotation_progress, {"clip": 6.0, "penalty_scale": 1.0})
     rewards["obj_dist_penalty"] = Reward(-100.0, terms.far_from, {"target": (0.0, 0.0, 0.52), "margin": 0.04})
     return replace(task, joints={"xhand1": CUPPED}, rewards=rewards)
+
+
+@register("in_palm_rotate", "careful")
+def careful() -> Task:
+    """Return what a teacher goes on with that has learned to turn the block, but throws it.
+
+    On the default, throwing pays: a drop costs 2.5, the turn before it earns ten times that. From the beginning, a
+    dearer drop ends in a hand that holds still. Here a drop costs 10, and only slow turns count.
+    """
+    task = default()
+    rewards = dict(task.rewards)
+    rewards["is_dropped"] = Reward(-400.0, terms.ended, {"names": ("obj_dropped",)})
+    rewards["rotation_progress"] = Reward(10.0, terms.rotation_progress, {"clip": 2.5, "penalty_scale": 1.0})
+    settings = replace(task.teacher, rnd_weight=0.0, entropy=0.0, learning_rate=3e-4)
+    return replace(task, rewards=rewards, teacher=settings)

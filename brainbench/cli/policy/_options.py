@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 TaskArgument = Annotated[str, typer.Argument(help="A task: in_palm_rotate, in_hand_repose, screwdriver, hot_ball.")]
 HandOption = Annotated[str, typer.Option(help="xhand1, sharpa, or a URDF or MJCF file.")]
-ConfigOption = Annotated[str, typer.Option("--config", help="Configuration of the task: default or published.")]
+ConfigOption = Annotated[str, typer.Option("--config", help="Configuration of the task: default, published, …")]
 TaskFileOption = Annotated[
     Path | None, typer.Option("--task-file", help="Python file that registers a task of your own.")
 ]

@@ -33,6 +33,9 @@ def train(
     steps: Annotated[int | None, typer.Option(help="Control steps per environment and iteration.")] = None,
     curiosity: Annotated[float | None, typer.Option(help="Weight of the RND reward (published: 100).")] = None,
     initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Begin with the networks of another run: its folder or one of its models.")
+    ] = None,
     save_every: Annotated[int, typer.Option(help="Iterations between checkpoints.")] = 50,
     device: DeviceOption = "cpu",
     seed: SeedOption = 0,
@@ -57,7 +60,7 @@ def train(
     with progress_bar() as progress:
         result = teacher.train(
             env, run, iterations=iterations, minutes=minutes, settings=settings, seed=seed, save_every=save_every,
-            progress=progress,
+            start=start, progress=progress,
         )  # fmt: skip
     last = dict(result.history[-1]) if result.history else {}
     facts = {

@@ -86,6 +86,24 @@ def test_a_trained_actor_acts_alike_after_loading(tmp_path: Path) -> None:
     policy.reset(torch.ones(4, dtype=torch.bool))
 
 
+def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
+    train(_env(), tmp_path / "first", settings=SMALL, iterations=2)
+    env = tasks.make("in_palm_rotate", config="careful", num_envs=4, threads=1)
+    settings = replace(SMALL, rnd_weight=0.0)
+    trainer = Trainer(env, settings)
+    trainer.begin_from(tmp_path / "first")
+    given = _tree.load(newest(tmp_path / "first"))
+    own = trainer.algorithm.save()
+    for name in ("actor", "critic"):
+        assert all(torch.equal(value, own[f"{name}_state_dict"][key]) for key, value in given[name].items())
+    result = train(env, tmp_path / "second", settings=settings, iterations=1, start=tmp_path / "first")
+    assert result.iterations == 1
+    config = json.loads((tmp_path / "second" / "config.json").read_text())
+    assert config["start"]["file"].endswith("first/model_2.safetensors")
+    with pytest.raises(DataError, match=r"actor of .* does not fit: 'mlp\.0\.weight' has the shape \(16"):
+        Trainer(env, replace(settings, hidden=(32, 16))).begin_from(tmp_path / "first")
+
+
 def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1)
     with pytest.raises(UsageError, match="Choose another folder"):
