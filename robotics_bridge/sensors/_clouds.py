@@ -101,9 +101,9 @@ def halve(points: NDArray, order: NDArray[np.int64], most: int) -> list[NDArray[
         return [order]
     chosen = points[order]
     axis = int(np.ptp(chosen, axis=0).argmax())
-    sorted_ = order[np.argsort(chosen[:, axis], kind="stable")]
+    ranked = order[np.argsort(chosen[:, axis], kind="stable")]
     middle = len(order) // 2
-    return halve(points, sorted_[:middle], most) + halve(points, sorted_[middle:], most)
+    return halve(points, ranked[:middle], most) + halve(points, ranked[middle:], most)
 
 
 def _in_blocks(points: NDArray) -> NDArray[np.float32]:

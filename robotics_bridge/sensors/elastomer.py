@@ -11,6 +11,7 @@ import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
 from robotics_bridge._device import warp
+from robotics_bridge.sensors._anchor_kernels import anchor_kernel
 from robotics_bridge.sensors._base import Asks, ProbeRuntime, QuerySensor
 from robotics_bridge.sensors._cloud_kernels import BLOCK, cloud_structs
 from robotics_bridge.sensors._clouds import sample_cloud
@@ -20,7 +21,7 @@ from robotics_bridge.sensors.noise import TAXEL_KNOBS
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import Scene
     from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors._base import Context
+    from robotics_bridge.sensors._base import Context, Place
 
 _NEGLIGIBLE = 1e-7
 
@@ -113,7 +114,8 @@ class ElastomerTaxel(QuerySensor):
     @property
     def planar(self) -> bool:
         """Whether its markers form a regular planar grid without fillers."""
-        return self.probes.pitch is not None and bool(self.probes.active.all())
+        probes = self.probes
+        return probes.pitch is not None and len(probes.shape) == 2 and bool(probes.active.all())
 
     @property
     def way(self) -> str:
@@ -188,7 +190,7 @@ class ElastomerRuntime(ProbeRuntime):
         self._in_turn = not device.is_cuda
         # Only a processor finds a grid's shear cheaper by rows and columns than marker by marker.
         self._apart = self._followed and self._way != "direct" and self._in_turn
-        sides = [sensor.probes.shape if len(sensor.probes.shape) == 2 else (1, 1) for sensor in self._sensors]
+        sides = [_sides(place) for place in self.places.values()]
         rows, columns = (max(side) for side in zip(*sides, strict=True))
         drag = (envs, self.count), (envs, -(-columns // 4), CHUNK), (envs, rows, CHUNK)
         self._drag, self._along, self._across = (
@@ -235,7 +237,7 @@ class ElastomerRuntime(ProbeRuntime):
         if self._followed:
             inputs = [self._gels, self._own, self._tracked, solids, pairs, self._points, self.io]
             inputs += [self._blocks, self._anchor, self._held, self._moved, self._dragged, self._drive, self._order]
-            kernel = kernels.anchor_kernel(self._own_kinds, self._raycast, self._side_by_side, self._in_turn)
+            kernel = anchor_kernel(self._own_kinds, self._raycast, self._side_by_side, self._in_turn)
             dim = (self._held.shape[0], c.num_envs)
             wp.launch(kernel, dim=dim if self._side_by_side else dim[::-1], inputs=inputs, device=c.device)
         shear = [self._moved, self._dragged, self._anchor, self._drive, self._order]
@@ -265,7 +267,7 @@ class ElastomerRuntime(ProbeRuntime):
         gels, owned = [], 0
         for index, (sensor, place) in enumerate(zip(self._sensors, self.places.values(), strict=True)):
             gel, probes, layer = kind(), sensor.probes, sensor.layer or Layer()
-            rows, columns = place.layout if len(place.layout) == 2 else (1, place.count)
+            rows, columns = _sides(place)
             widening = layer.expansion if isinstance(layer.expansion, tuple) else (layer.expansion,) * 2
             along, across, normal = _axes(sensor)
             values = {
@@ -344,6 +346,11 @@ class ElastomerRuntime(ProbeRuntime):
                     out[3 * plane + channel, :, span] = field[
                         :, rows - 1 : 2 * rows - 1, columns - 1 : 2 * columns - 1
                     ].flatten(1)
+
+
+def _sides(place: Place) -> tuple[int, int]:
+    """Rows and columns of a sensor's markers."""
+    return (place.layout[0], place.layout[1]) if len(place.layout) == 2 else (1, place.count)
 
 
 def _axes(sensor: ElastomerTaxel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -159,14 +159,18 @@ def test_shear_does_not_depend_on_the_order_of_threads_that_a_gpu_has() -> None:
 
 def test_shear_by_rows_and_columns_is_that_of_every_marker_by_itself() -> None:
     wide = Probes.grid(3, 6, size=(0.2, 0.1), center=(0, 0, 0.005), along=(0.2, 1.0, 0), radius=0.001)
+    line = Probes.grid(1, 40, size=(0.01, 0.02), center=(0, 0, 0.005))
+    row = Probes(line.position, line.normal, line.radius, pitch=line.pitch)
     sensors = {
         "grid": _taxel(points=20_000),
         "narrow": _taxel(points=20_000, shear_spread=2e5),
         "wide": _taxel(points=20_000, probes=wide, shear_spread=0.0),
         "line": _taxel(points=20_000, probes=Probes.grid(1, 5, size=(0.01, 0.01), center=(0, 0, 0.005))),
+        "row": _taxel(points=20_000, probes=row),
         "layer": _taxel(points=20_000, layer=Layer(thickness=2e-3)),
         "fft": _taxel(points=20_000, dilation="fft"),
     }
+    assert sensors["row"].way == "direct"
     suites = [_suite({**sensors, "press": _taxel(points=0)}, envs=3) for _ in range(2)]
     for runtime in suites[1].runtimes:
         runtime._apart = False  # type: ignore[attr-defined]
