@@ -95,6 +95,17 @@ def surface_area(geometry: Geometry) -> float:
     )
 
 
+def halve(points: NDArray, order: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
+    """Cut points [P, 3], of which ``order`` are taken, across their longest side until no part has over ``most``."""
+    if len(order) <= most:
+        return [order]
+    chosen = points[order]
+    axis = int(np.ptp(chosen, axis=0).argmax())
+    ranked = order[np.argsort(chosen[:, axis], kind="stable")]
+    middle = len(order) // 2
+    return halve(points, ranked[:middle], most) + halve(points, ranked[middle:], most)
+
+
 def _in_blocks(points: NDArray) -> NDArray[np.float32]:
     """Order points along a space-filling curve and fill the last block up with NaN."""
     low, high = points.min(axis=0), points.max(axis=0)

@@ -11,15 +11,17 @@ import numpy as np
 
 from brainbench.errors import UsageError, unknown_name
 from robotics_bridge._device import warp
+from robotics_bridge.sensors._anchor_kernels import anchor_kernel
 from robotics_bridge.sensors._base import Asks, ProbeRuntime, QuerySensor
 from robotics_bridge.sensors._cloud_kernels import BLOCK, cloud_structs
 from robotics_bridge.sensors._clouds import sample_cloud
+from robotics_bridge.sensors._drag_kernels import CHUNK, drag_kernel
 from robotics_bridge.sensors.noise import TAXEL_KNOBS
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import Scene
     from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors._base import Context
+    from robotics_bridge.sensors._base import Context, Place
 
 _NEGLIGIBLE = 1e-7
 
@@ -112,7 +114,8 @@ class ElastomerTaxel(QuerySensor):
     @property
     def planar(self) -> bool:
         """Whether its markers form a regular planar grid without fillers."""
-        return self.probes.pitch is not None and bool(self.probes.active.all())
+        probes = self.probes
+        return probes.pitch is not None and len(probes.shape) == 2 and bool(probes.active.all())
 
     @property
     def way(self) -> str:
@@ -183,6 +186,17 @@ class ElastomerRuntime(ProbeRuntime):
         self._drive = floats(total, envs) if self._side_by_side else floats(envs, total).transpose((1, 0))
         order = wp.zeros((total, envs) if self._side_by_side else (envs, total), dtype=wp.uint8, device=device)
         self._order = order if self._side_by_side else order.transpose((1, 0))
+        # A processor starts a thread for every marker at a cost that markers in turn do not have.
+        self._in_turn = not device.is_cuda
+        # Only a processor finds a grid's shear cheaper by rows and columns than marker by marker.
+        self._apart = self._followed and self._way != "direct" and self._in_turn
+        sides = [_sides(place) for place in self.places.values()]
+        rows, columns = (max(side) for side in zip(*sides, strict=True))
+        drag = (envs, self.count), (envs, -(-columns // 4), CHUNK), (envs, rows, CHUNK)
+        self._drag, self._along, self._across = (
+            wp.zeros(shape if self._apart else (1,) * len(shape), dtype=kind, device=device)
+            for shape, kind in zip(drag, (wp.vec2f, wp.vec4f, wp.vec2f), strict=True)
+        )
         stores = (max(count * self._blocks, 1), envs)
         self._held, self._moved = (wp.zeros(stores, dtype=wp.int32, device=device) for _ in range(2))
         exponents = np.array([sensor.exponent for sensor in self._sensors], np.float32)
@@ -201,6 +215,8 @@ class ElastomerRuntime(ProbeRuntime):
         """Memory per environment [bytes] that every update writes anew: heights, their sums and drives of points."""
         spread = 3 * self._planes if self._way != "direct" else 0
         followed = (5 * self._total + 4 * self._blocks) * len(self._sensors)
+        if self._apart:
+            followed += 8 * self.count + CHUNK * (16 * self._along.shape[1] + 8 * self._across.shape[1])
         return followed + 4 * self.count * (2 * self._planes + spread)
 
     def update(self, state: HandState, dt: float) -> None:
@@ -210,25 +226,38 @@ class ElastomerRuntime(ProbeRuntime):
         wp, c = warp(), self.context
         self.begin(state, dt)
         solids, pairs = c.solids.struct, c.pairs.struct
-        indent = kernels.indent_kernel(self.kinds, self._raycast, self._planes)
-        self.launch(indent, self.probes, solids, pairs, self.io, self.knobs, self._stamp, self._exponents, self._height)
+        indent = kernels.indent_kernel(self.kinds, self._raycast, self._planes, self._in_turn)
+        inputs = [self.probes, solids, pairs, self.io, self.knobs, self._stamp, self._exponents, self._height]
+        self.launch(indent, *inputs)
         if self._way == "separable":
             inputs = [self.probes, self.io, self._gels, self._weights, self._reach, self._stamp, self._height]
-            self.launch(kernels.spread_kernel(self._planes), *inputs, self._spread)
+            self.launch(kernels.spread_kernel(self._planes, self._in_turn), *inputs, self._spread)
         elif self._way == "fft":
             self._transform()
         if self._followed:
             inputs = [self._gels, self._own, self._tracked, solids, pairs, self._points, self.io]
             inputs += [self._blocks, self._anchor, self._held, self._moved, self._dragged, self._drive, self._order]
-            kernel = kernels.anchor_kernel(self._own_kinds, self._raycast, self._side_by_side)
+            kernel = anchor_kernel(self._own_kinds, self._raycast, self._side_by_side, self._in_turn)
             dim = (self._held.shape[0], c.num_envs)
             wp.launch(kernel, dim=dim if self._side_by_side else dim[::-1], inputs=inputs, device=c.device)
+        shear = [self._moved, self._dragged, self._anchor, self._drive, self._order]
+        if self._apart:
+            inputs = [self.probes, self.io, self._gels, self._blocks, self._tracked, pairs, self._points, *shear]
+            inputs += [self._along, self._across, self._drag]
+            wp.launch(drag_kernel(), dim=c.num_envs, inputs=inputs, device=c.device)
         way = ("direct", "separable", "fft").index(self._way)
-        kernel = kernels.marker_kernel(way, self._layered, self._planes, self.mode, *self.stores)
+        kernel = kernels.marker_kernel(
+            way, self._layered, self._planes, self.mode, *self.stores, self._in_turn, self._apart
+        )
         inputs = [self.probes, self.io, self.knobs, self._gels, self._weights, self._reach, self._stamp, self._height]
         inputs += [self._spread, self._blocks, self._tracked, pairs, self._points]
-        self.launch(kernel, *inputs, self._moved, self._dragged, self._anchor, self._drive, self._order)
+        self.launch(kernel, *inputs, *shear, self._drag)
         self.finish(dt)
+
+    def launch(self, kernel: Any, *inputs: Any) -> None:
+        """Run a kernel over all environments and markers."""
+        dim = (self.context.num_envs, 1 if self._in_turn else self.count)
+        warp().launch(kernel, dim=dim, inputs=inputs, device=self.context.device)
 
     def _describe(self, own: list[tuple[int, ...]]) -> Any:
         from robotics_bridge.sensors._elastomer_kernels import elastomer_structs
@@ -238,7 +267,7 @@ class ElastomerRuntime(ProbeRuntime):
         gels, owned = [], 0
         for index, (sensor, place) in enumerate(zip(self._sensors, self.places.values(), strict=True)):
             gel, probes, layer = kind(), sensor.probes, sensor.layer or Layer()
-            rows, columns = place.layout if len(place.layout) == 2 else (1, place.count)
+            rows, columns = _sides(place)
             widening = layer.expansion if isinstance(layer.expansion, tuple) else (layer.expansion,) * 2
             along, across, normal = _axes(sensor)
             values = {
@@ -317,6 +346,11 @@ class ElastomerRuntime(ProbeRuntime):
                     out[3 * plane + channel, :, span] = field[
                         :, rows - 1 : 2 * rows - 1, columns - 1 : 2 * columns - 1
                     ].flatten(1)
+
+
+def _sides(place: Place) -> tuple[int, int]:
+    """Rows and columns of a sensor's markers."""
+    return (place.layout[0], place.layout[1]) if len(place.layout) == 2 else (1, place.count)
 
 
 def _axes(sensor: ElastomerTaxel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from brainbench.errors import UsageError
 from robotics_bridge._device import warp
 from robotics_bridge.sensors._base import Convention, ProbeRuntime, ProbeSensor
-from robotics_bridge.sensors._clouds import sample_cloud
+from robotics_bridge.sensors._clouds import halve, sample_cloud
 from robotics_bridge.sensors.kinematic import check_convention
 from robotics_bridge.sensors.noise import TAXEL_KNOBS
 
@@ -85,13 +85,53 @@ class ProximityRuntime(ProbeRuntime):
         self._densities = wp.array(densities, dtype=wp.float32, device=device)
         links = [context.scene.link_index(sensor.link) for sensor in sensors.values()]
         self._links = wp.array(np.array(links, np.int32), dtype=wp.int32, device=device)
+        # A processor walks through all probes of an environment anyway, so it may list their points in between.
+        self._gathered = not device.is_cuda
+        room = self.cloud.total + len(tracked) + 1
+        shape = (context.num_envs, room) if self._gathered else (1, 1)
+        self._near = wp.zeros(shape, dtype=wp.int32, device=device)
+        self._cells = self._cluster(list(sensors.values())) if self._gathered else ()
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
         from robotics_bridge.sensors._cloud_kernels import proximity_kernel
 
         self.begin(state, dt)
-        kernel = proximity_kernel(self._physical, self.mode, *self.stores)
-        shared = [self.probes, self.context.pairs.struct, self.cloud.struct, self.io, self.knobs]
-        self.launch(kernel, *shared, self._laws, self._densities, self._links, state.pose, state.velocity)
+        kernel = proximity_kernel(self._physical, self.mode, *self.stores, self._gathered)
+        inputs = [self.probes, self.context.pairs.struct, self.cloud.struct, self.io, self.knobs]
+        inputs += [self._laws, self._densities, self._links, state.pose, state.velocity, self._near]
+        if self._gathered:
+            inputs += self._cells
+            warp().launch(kernel, dim=self.context.num_envs, inputs=inputs, device=self.context.device)
+        else:
+            self.launch(kernel, *inputs)
         self.finish(dt)
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Memory per environment [bytes] that every update writes anew: points near a cell of probes."""
+        return 4 * self._near.shape[1] if self._gathered else 0
+
+    def _cluster(self, sensors: list[ProximityTaxel]) -> tuple[Any, Any, Any]:
+        """Return the probes [N] cell by cell, cells (first, end, slot) [C, 3], and spheres [C, 4] that hold all they
+        sense."""
+        from robotics_bridge.sensors._cloud_kernels import CELL
+
+        wp, device, slots = warp(), self.context.device, self.probes.slot.numpy()
+        members, cells, around = [], [], []
+        for sensor, place in zip(sensors, self.places.values(), strict=True):
+            position, radius = sensor.probes.position, sensor.probes.radius + sensor.noise.radius
+            first = place.start
+            for chosen in halve(position, np.arange(place.count), CELL):
+                middle = 0.5 * (position[chosen].min(axis=0) + position[chosen].max(axis=0))
+                far = (np.linalg.norm(position[chosen] - middle, axis=1) + radius[chosen]).max()
+                # Rounding must not lose a point at the rim.
+                around.append((*middle, far * (1 + 1e-5) + 1e-7))
+                cells.append((first, first + len(chosen), slots[place.start]))
+                members.append(place.start + chosen)
+                first += len(chosen)
+        return (
+            wp.array(np.concatenate(members).astype(np.int32), dtype=wp.int32, device=device),
+            wp.array(np.array(cells, np.int32), dtype=wp.vec3i, device=device),
+            wp.array(np.array(around, np.float32), dtype=wp.vec4f, device=device),
+        )

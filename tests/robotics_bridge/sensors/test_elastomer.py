@@ -157,6 +157,38 @@ def test_shear_does_not_depend_on_the_order_of_threads_that_a_gpu_has() -> None:
         np.testing.assert_array_equal(suites[0].read(name), suites[1].read(name))
 
 
+def test_shear_by_rows_and_columns_is_that_of_every_marker_by_itself() -> None:
+    wide = Probes.grid(3, 6, size=(0.2, 0.1), center=(0, 0, 0.005), along=(0.2, 1.0, 0), radius=0.001)
+    line = Probes.grid(1, 40, size=(0.01, 0.02), center=(0, 0, 0.005))
+    row = Probes(line.position, line.normal, line.radius, pitch=line.pitch)
+    sensors = {
+        "grid": _taxel(points=20_000),
+        "narrow": _taxel(points=20_000, shear_spread=2e5),
+        "wide": _taxel(points=20_000, probes=wide, shear_spread=0.0),
+        "line": _taxel(points=20_000, probes=Probes.grid(1, 5, size=(0.01, 0.01), center=(0, 0, 0.005))),
+        "row": _taxel(points=20_000, probes=row),
+        "layer": _taxel(points=20_000, layer=Layer(thickness=2e-3)),
+        "fft": _taxel(points=20_000, dilation="fft"),
+    }
+    assert sensors["row"].way == "direct"
+    suites = [_suite({**sensors, "press": _taxel(points=0)}, envs=3) for _ in range(2)]
+    for runtime in suites[1].runtimes:
+        runtime._apart = False  # type: ignore[attr-defined]
+    for suite in suites:
+        _press(suite, (0, 0, -0.001), (0.0005, -0.0002, -0.0012))
+        suite.reset([1])
+        _press(suite, (0.0008, 0.0003, -0.0012))
+    moved = suites[0].runtimes[0]._moved.numpy()  # type: ignore[attr-defined]
+    # More than are kept at once, and environments that differ.
+    assert (moved % 64).sum(axis=0)[0] > 4 * 32
+    assert not moved[:, 1].any()
+    for name in sensors:
+        found, expected = (suite.read(name).flatten(1, 2).numpy() for suite in suites)
+        drag = np.abs(expected[0] - expected[1]).max()
+        assert drag > 1e-5
+        np.testing.assert_allclose(found, expected, atol=1e-6 * drag, err_msg=name)
+
+
 def test_a_layer_with_recoil_pushes_less_by_twice_its_share_however_it_is_summed() -> None:
     fine = Probes.grid(41, 41, size=(0.04, 0.04), center=(0, 0, 0.005), radius=0.0005)
     layers = {"published": Layer(), "half": Layer(recoil=0.25), "none": Layer(recoil=0.5)}

@@ -99,3 +99,29 @@ def test_points_cover_a_surface_evenly() -> None:
     assert cells.min() >= 2
     quarters = cells.reshape(2, 5, 2, 5).sum(axis=(1, 3))
     assert quarters.max() / quarters.min() < 1.1
+
+
+def test_points_gathered_by_cells_are_summed_as_each_probe_would_find_them() -> None:
+    noise = Noise(radius=1e-3, gain=(0.5, 1.5))
+    free = Probes(np.random.default_rng(0).normal(0, 0.01, (75, 3)), [[0, 0, 1.0]] * 75, [0.0, *np.full(74, 0.006)])
+    sensors = {
+        "grid": ProximityTaxel(link="hand", probes=Probes.grid(7, 11, size=(0.03, 0.02), center=(0, 0, 0.005))),
+        "free": ProximityTaxel(link="hand", probes=free, noise=noise),
+    }
+    scene = pad_scene(*OBJECTS)
+    suites = [SensorSuite(scene, sensors, num_envs=3) for _ in range(2)]
+    suites[1].runtimes[0]._gathered = False  # type: ignore[attr-defined]
+    poses = poses_at(len(scene.links), {}, 3)
+    poses[:, 2, :3] = (0.002, 0.001, 0.011)
+    poses[:, 3, :3] = (-0.006, 0.002, 0.012)
+    poses[1, 3, 2] = 0.5
+    poses[2, 2, 0] = np.nan
+    velocity = np.random.default_rng(1).normal(0, 0.5, (3, len(scene.links), 6))
+    for suite in suites:
+        suite.update(state_of(scene, poses, velocity, touch=False))
+    for name in sensors:
+        assert np.isnan(suites[0].read(name)[2].flatten(0, -2).numpy()[5]).all()
+        for read in ("read", "read_ground_truth"):
+            found, expected = (getattr(suite, read)(name).numpy() for suite in suites)
+            assert (np.abs(expected[:2]).max(axis=(1, 2) if name == "free" else (1, 2, 3)) > 0.05).all()
+            np.testing.assert_array_equal(found, expected)
