@@ -262,7 +262,7 @@ def train(
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = _writer(run)
-    start, rows = time.monotonic(), []
+    began, rows = time.monotonic(), []
     saved = trainer.iteration
     while trainer.iteration < total:
         row = trainer.iterate()
@@ -273,7 +273,7 @@ def train(
             writer.add_scalar(name, value, trainer.iteration)
         if progress:
             progress(trainer.iteration, total, "training")
-        over = minutes is not None and time.monotonic() - start > 60 * minutes
+        over = minutes is not None and time.monotonic() - began > 60 * minutes
         if over or trainer.iteration % save_every == 0 or trainer.iteration == total:
             _save(trainer, run, keep_env=keep_env)
             saved = trainer.iteration
@@ -283,7 +283,7 @@ def train(
         _save(trainer, run, keep_env=keep_env)
     writer.close()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
-    return TeacherResult(run, trainer.iteration, steps, time.monotonic() - start, tuple(rows))
+    return TeacherResult(run, trainer.iteration, steps, time.monotonic() - began, tuple(rows))
 
 
 def _origin(start: Path) -> dict[str, str]:
