@@ -304,7 +304,6 @@ def _waiting(m: Moment) -> torch.Tensor:
     return m.power * float(m.power.sum())
 
 
-@pytest.mark.slow
 @pytest.mark.gpu
 @pytest.mark.parametrize("task", [case[0] for case in CASES])
 def test_a_replayed_part_is_the_eager_part(task: str) -> None:
@@ -328,7 +327,6 @@ def test_a_replayed_part_is_the_eager_part(task: str) -> None:
     assert part.recorded
 
 
-@pytest.mark.slow
 @pytest.mark.gpu
 def test_a_task_that_cannot_be_recorded_runs_on_a_gpu_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
     task = tasks.load("in_palm_rotate")
