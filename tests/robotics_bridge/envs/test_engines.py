@@ -39,7 +39,6 @@ def test_both_engines_run_the_same_task_and_contain_a_diverging_environment() ->
     assert not two.step(action)[4]["diverged"].any()
 
 
-@pytest.mark.slow
 @pytest.mark.gpu
 def test_a_gpu_runs_many_environments_without_divergence() -> None:
     env = tasks.make("in_palm_rotate", num_envs=256, device="cuda", observe="force_torque")
