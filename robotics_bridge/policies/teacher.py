@@ -167,7 +167,7 @@ class Trainer:
         Raises:
             DataError: there is no model, or it has other inputs, outputs or layers.
         """
-        file = newest(path) if path.is_dir() else path
+        file = model_file(path)
         found, own = _tree.load(file), self.algorithm.save()
         for name in ("actor", "critic"):
             theirs, mine = (
@@ -251,14 +251,16 @@ def train(
     settings = settings or env.task.teacher
     total = iterations or settings.iterations
     trainer = Trainer(env, settings, seed=seed)
-    if start is not None:
+    origin = None
+    if start is not None and not (run / RESUME).is_file():
         trainer.begin_from(start)
+        origin = {"file": str(model_file(start)), "hash": file_hash(model_file(start))}
     run.mkdir(parents=True, exist_ok=True)
     facts = {
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
-        "action_names": list(env.action_names), "start": None if start is None else _origin(start),
+        "action_names": list(env.action_names), "start": origin,
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = _writer(run)
@@ -284,11 +286,6 @@ def train(
     writer.close()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
     return TeacherResult(run, trainer.iteration, steps, time.monotonic() - began, tuple(rows))
-
-
-def _origin(start: Path) -> dict[str, str]:
-    file = newest(start) if start.is_dir() else start
-    return {"file": str(file), "hash": file_hash(file)}
 
 
 def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
@@ -347,6 +344,11 @@ def newest(run: Path) -> Path:
     return found[-1]
 
 
+def model_file(path: Path) -> Path:
+    """Return the last model of a run, given its folder, or the model itself."""
+    return newest(path) if path.is_dir() else path
+
+
 def load_teacher(run: str | Path, env: Env) -> Policy:
     """Return the trained actor of a run for an environment.
 
@@ -358,7 +360,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
         DataError: there is no model, or it was trained on other observations.
     """
     path = Path(run)
-    file = newest(path) if path.is_dir() else path
+    file = model_file(path)
     facts = read_json(file.parent / "config.json")
     settings = replace(env.task.teacher, **_plain(facts["settings"]))
     trainer = Trainer(env, settings)

@@ -262,7 +262,7 @@ class SweepLauncher:
         groups = [(name, [sweep for _, sweep in some]) for name, some in groupby(chosen, key=itemgetter(0))]
         only = batch.unstable[rows]
         again = self.batch(self.launch(groups, only, retry))
-        wrench, contact, unstable = batch.wrench, batch.contact, batch.unstable.copy()
+        wrench, contact, unstable = batch.wrench, batch.contact, batch.unstable
         wrench[rows] = np.where(only[:, None, :, None], again.wrench, wrench[rows])
         contact[rows] = np.where(only, again.contact, contact[rows])
         unstable[rows] = again.unstable
