@@ -3,6 +3,7 @@
     python benchmarks/policy.py --part speed --device cuda --out $OUT       # environment steps/s per task and sense
     python benchmarks/policy.py --part split --device cuda --out $OUT       # a PPO iteration in its parts
     python benchmarks/policy.py --part teacher --device cuda --out $OUT --minutes 7.5 [--resume FOLDER]
+        [--start RUN --start-std 0.5] [--change is_dropped=-300 goal.start_threshold=0.4 entropy=0]
     python benchmarks/policy.py --part tables --out FOLDER --write          # lay out what was measured
 
 Every row is printed and appended to ``$OUT/policy.jsonl`` when it is measured; small sizes come first. The teacher
@@ -28,6 +29,7 @@ from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies import teacher
 from robotics_bridge.policies.evaluate import agent, evaluate
+from robotics_bridge.tasks.changes import changed
 
 SENSES = ("none", "force_torque", "encoder-small", "encoder")
 ENCODERS = {"encoder-small": "zhuang-intersection-ln-small", "encoder": "zhuang-intersection-ln"}
@@ -160,21 +162,6 @@ def split(options: argparse.Namespace, out: Path) -> None:
         put(out, row)
 
 
-def changed(task: Any, words: list[str]) -> Any:
-    """Return a task with other numbers: ``is_dropped=-300`` (a weight), ``rotation_progress.clip=2``, ``entropy=0``."""
-    rewards, settings = dict(task.rewards), {}
-    for word in words:
-        name, _, value = word.partition("=")
-        name, _, key = name.partition(".")
-        if name not in rewards:
-            settings[name] = type(getattr(task.teacher, name))(float(value))
-        elif key:
-            rewards[name] = replace(rewards[name], params={**rewards[name].params, key: float(value)})
-        else:
-            rewards[name] = replace(rewards[name], weight=float(value))
-    return replace(task, rewards=rewards, teacher=replace(task.teacher, **settings))
-
-
 def train(options: argparse.Namespace, out: Path) -> None:
     """Train a teacher for some minutes, then hold it against zero and random."""
     (name,) = options.tasks[:1]
@@ -184,13 +171,15 @@ def train(options: argparse.Namespace, out: Path) -> None:
     if options.resume and not run.exists():
         shutil.copytree(options.resume, run)
     env = tasks.make(task, num_envs=envs, device=options.device, seed=options.seed)
+    put(out, {"part": "teacher", "task": name, "config": options.config, "changes": options.change})
     began = time.perf_counter()
 
     def tell(iteration: int, _total: int, _word: str) -> None:
         if iteration % 10 == 0:
             with (run / "log.jsonl").open(encoding="utf-8") as file:
                 row = json.loads(file.readlines()[-1])
-            kept = ("iteration", "steps", "reward", "curiosity", "std", "collect_s", "learn_s", "episode/success")
+            kept = ("iteration", "steps", "reward", "curiosity", "std", "threshold", "learning_rate", "collect_s")
+            kept += ("learn_s", "episode/return", "episode/success")
             kept += ("episode/metric", "episode/length", "episode/diverged")
             put(
                 out, {"part": "teacher", "task": name, "s": time.perf_counter() - began} | {k: row.get(k) for k in kept}
@@ -199,7 +188,7 @@ def train(options: argparse.Namespace, out: Path) -> None:
     settings = replace(task.teacher, num_envs=envs)
     result = teacher.train(
         env, run, iterations=options.iterations, minutes=options.minutes, settings=settings, seed=options.seed,
-        save_every=50, keep_env=envs <= 256, progress=tell,
+        save_every=50, keep_env=envs <= 256, start=options.start, start_std=options.start_std, progress=tell,
     )  # fmt: skip
     put(out, {"part": "teacher", "task": name, "iterations": result.iterations, "control_steps": result.steps})
     kept = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
@@ -266,7 +255,9 @@ def main() -> None:
     parser.add_argument("--config", default="default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--resume", type=Path, help="folder teacher-<task> of an earlier machine")
-    parser.add_argument("--change", nargs="*", default=[], help="weights of rewards, their parameters, settings")
+    parser.add_argument("--start", type=Path, help="another run or model, whose networks a new teacher begins with")
+    parser.add_argument("--start-std", type=float, help="standard deviation of its actions to begin with")
+    parser.add_argument("--change", nargs="*", default=[], help="name=value, see robotics_bridge.tasks.changes")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     options.envs = options.envs or ([1024, 8192] if options.device != "cpu" else [16, 64])

@@ -23,6 +23,12 @@ class GoalState:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
 
         self.goal, self._dt = task.goal, task.step_dt
+        self._least = 0.0 if task.goal is None else task.goal.threshold
+        self.threshold = torch.full((), self._least, device=device)
+        """Angle [] below which a goal counts as reached now (rad)."""
+        self._won = task.success.threshold if task.success.metric == "goals" else 1.0
+        self._tally = torch.zeros(2, device=device)
+        """[2] episodes that ended since the threshold was last judged, and successful ones among them."""
         self.quat, self.previous = zeros(4), zeros(4)
         self.quat[:, 0] = self.previous[:, 0] = 1.0
         """Goal, and orientation one step before [B, 4] (w, x, y, z)."""
@@ -75,9 +81,35 @@ class GoalState:
             _, swing = twist_and_swing(error, self._axis)
             self.off_axis.copy_(swing)
         self.left -= self._dt
-        self.reached.copy_(self.angle < self.goal.threshold)
+        self.reached.copy_(self.angle < self.threshold)
         self.missed.copy_((self.left <= 0) & ~self.reached)
         self.count += self.reached
+
+    def practise(self) -> None:
+        """Begin the curriculum of a goal that has one: from now on its threshold is wide and narrows."""
+        if self.goal is not None and self.goal.start_threshold is not None:
+            self.threshold.fill_(self.goal.start_threshold)
+            self._tally.zero_()
+
+    def account(self, done: torch.Tensor) -> None:
+        """Count the episodes that end [B] bool, and narrow the threshold when enough of them succeeded."""
+        import torch
+
+        if self.goal is None or self.goal.start_threshold is None:
+            return
+        won = done & (self.count >= self._won)
+        self._tally += torch.stack((done.sum(), won.sum()))
+        full = self._tally[0] >= len(done)
+        narrow = full & (self._tally[1] > self.goal.mastered * self._tally[0])
+        closer = (self.threshold * self.goal.narrowing).clamp(min=self._least)
+        self.threshold.copy_(torch.where(narrow, closer, self.threshold))
+        self._tally.masked_fill_(full, 0.0)
+
+    def curriculum(self) -> dict[str, torch.Tensor]:
+        """Return what remembers how far the curriculum went; nothing without one."""
+        if self.goal is None or self.goal.start_threshold is None:
+            return {}
+        return {"threshold": self.threshold, "tally": self._tally}
 
     def advance(self, quat: torch.Tensor, draw: Any) -> None:
         """Propose the next goals where the present ones are reached or their time is up."""
@@ -111,4 +143,4 @@ class GoalState:
     def _memory(self) -> dict[str, torch.Tensor]:
         names = ("quat", "previous", "angle", "angle_before", "left", "reached", "missed", "count", "rate", "off_axis")
         own = {name: getattr(self, name) for name in (*names, "turned")}
-        return {**own, "ring": self._ring}
+        return {**own, "ring": self._ring, **self.curriculum()}

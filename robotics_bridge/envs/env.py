@@ -376,6 +376,7 @@ class Env:
         done = terminated | truncated
         info = {"time_outs": truncated, "diverged": diverged, "log": self._account(parts, done, diverged)}
         info |= {"metric": self.metric.clone(), "return": self._return.clone(), "steps": self._steps.clone()}
+        self.goals.account(done)
         self.goals.advance(self._object_quat(), self._draw)
         if self.keeps_final:
             info["final_observations"] = {k: v.clone() for k, v in observe(self).items()}

@@ -10,6 +10,7 @@ import contextlib
 import io
 import json
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -20,13 +21,13 @@ from brainbench.errors import DataError, DataFileNotFoundError, UsageError, miss
 from brainbench.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies import _tree
+from robotics_bridge.tasks.settings import TeacherSettings
 
 if TYPE_CHECKING:
     import torch
     from tensordict import TensorDict
 
     from robotics_bridge.envs.env import Env
-    from robotics_bridge.tasks.settings import TeacherSettings
 
 _LOG = logging.getLogger(__name__)
 RESUME = "resume.safetensors"
@@ -151,6 +152,8 @@ class Trainer:
         }
         if algorithm.rnd:
             row["curiosity"] = float(curiosity) / steps
+        if self._curriculum:
+            row["threshold"] = float(env.unwrapped.goals.threshold)
         row |= {f"episode/{name}": value for name, value in env.unwrapped.statistics().items()}
         return row
 
@@ -158,11 +161,16 @@ class Trainer:
         """Return the present actor."""
         return Policy(self.algorithm.get_policy(), self.env.num_envs, self.env.device)
 
-    def begin_from(self, path: Path) -> None:
+    @property
+    def _curriculum(self) -> dict[str, torch.Tensor]:
+        return self.env.unwrapped.goals.curriculum()
+
+    def begin_from(self, path: Path, *, std: float | None = None) -> None:
         """Take up actor and critic of another run, with what they know of their inputs; learning begins anew.
 
         Args:
             path: a folder of a run, or one of its ``model_<iteration>.safetensors``.
+            std: standard deviation of actions to begin with; None takes that of the other run.
 
         Raises:
             DataError: there is no model, or it has other inputs, outputs or layers.
@@ -182,12 +190,17 @@ class Trainer:
             own[f"{name}_state_dict"] = found[name]
         parts = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
         self.algorithm.load(own, parts, strict=True)
+        if std is not None:
+            spread: Any = self.algorithm.get_policy().distribution
+            log = spread.std_type == "log"
+            (spread.log_std_param if log else spread.std_param).data.fill_(math.log(std) if log else std)
 
     def state(self) -> dict[str, Any]:
         """Return all that the next iteration depends on, random numbers included."""
         import torch
 
         state = {"algorithm": self.algorithm.save(), "env": self.env.unwrapped.state_dict()}
+        state |= {name: value.clone() for name, value in _named(self._curriculum).items()}
         state |= {"iteration": self.iteration, "torch_rng": torch.get_rng_state()}
         if self.env.device.type == "cuda":
             state["cuda_rng"] = torch.cuda.get_rng_state(self.env.device)
@@ -204,6 +217,9 @@ class Trainer:
 
         self.env.unwrapped.load_state_dict(state["env"])
         self.algorithm.load(dict(state["algorithm"]), None, strict=True)
+        for name, value in _named(self._curriculum).items():
+            # A run that was begun without a curriculum begins it now.
+            value.copy_(state.get(name, value))
         self.iteration = int(state["iteration"])
         if self.algorithm.rnd:
             self.algorithm.rnd.update_counter = int(state["rnd_updates"])
@@ -227,6 +243,7 @@ def train(
     save_every: int = 50,
     keep_env: bool = True,
     start: Path | None = None,
+    start_std: float | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> TeacherResult:
     """Train a teacher in a folder, or go on with the run that the folder holds.
@@ -242,6 +259,7 @@ def train(
         keep_env: keep the environments' state too, which makes resuming exact; large batches may save without and
             go on with new episodes.
         start: another run, or one of its models, whose actor and critic a new run begins with.
+        start_std: standard deviation of actions that it begins with; by default that of the other run.
         progress: called with iteration, total and a word.
 
     Raises:
@@ -251,9 +269,12 @@ def train(
     settings = settings or env.task.teacher
     total = iterations or settings.iterations
     trainer = Trainer(env, settings, seed=seed)
+    env.goals.practise()
     origin = None
+    if start_std is not None and (start is None or not start_std > 0):
+        raise UsageError(f"start_std is a positive number and goes with a run to start from; received {start_std!r}.")
     if start is not None and not (run / RESUME).is_file():
-        trainer.begin_from(start)
+        trainer.begin_from(start, std=start_std)
         origin = {"file": str(model_file(start)), "hash": file_hash(model_file(start))}
     run.mkdir(parents=True, exist_ok=True)
     facts = {
@@ -294,8 +315,10 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
         write_json(config, facts | {"provenance": provenance()})
         return
     known = read_json(config)
+    # Settings that came later than the run had their defaults in it.
+    known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
     for name in ("task", "hand", "num_envs", "seed", "settings"):
-        if json.loads(json.dumps(facts[name])) != known.get(name):
+        if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
             raise UsageError(
                 f"The run in {str(run)!r} has {name} = {known.get(name)!r}; this one {facts[name]!r}. "
                 "Choose another folder."
@@ -372,6 +395,10 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
             f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
         ) from error
     return Policy(trainer.algorithm.get_policy().to(env.device), env.num_envs, env.device)
+
+
+def _named(curriculum: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {f"curriculum_{name}": value for name, value in curriculum.items()}
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from brainbench.errors import UsageError
 from robotics_bridge.tasks.rotations import about, constant, multiply, tilted
 
 if TYPE_CHECKING:
@@ -28,6 +29,31 @@ class Goal(abc.ABC):
     """Range of the time after which another goal is proposed [s]; None waits for ever."""
     axis: tuple[float, float, float] | None = None
     """World axis of the commanded rotation; None for goals about any axis."""
+    start_threshold: float | None = None
+    """Wider threshold with which a teacher begins to learn [rad]; None learns with ``threshold`` from the start.
+
+    While it learns, the threshold is multiplied by ``narrowing`` whenever the share of successful episodes, over as
+    many as there are environments, exceeds ``mastered``, down to ``threshold``. Whoever does not learn (evaluations,
+    students, ``play``) has ``threshold``.
+    """
+    mastered: float = 0.3
+    """Share of successful episodes above which the threshold narrows."""
+    narrowing: float = 0.9
+    """Factor by which it narrows."""
+
+    def __post_init__(self) -> None:
+        if not self.threshold > 0:
+            raise UsageError(f"The threshold of a goal is a positive angle (rad); received {self.threshold!r}.")
+        if self.start_threshold is not None and not self.threshold <= self.start_threshold:
+            raise UsageError(
+                f"Learning begins with a wider threshold than {self.threshold:g} rad; received start_threshold = "
+                f"{self.start_threshold!r}."
+            )
+        if not (0 < self.mastered < 1 and 0 < self.narrowing < 1):
+            raise UsageError(
+                "The share 'mastered' and the factor 'narrowing' of a goal lie between 0 and 1; received "
+                f"{self.mastered!r} and {self.narrowing!r}."
+            )
 
     @abc.abstractmethod
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:

@@ -5,6 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from brainbench.errors import UsageError, unknown_name
+
+SCHEDULES = ("adaptive", "fixed")
+BOUNDED = "robotics_bridge.policies._ppo:BoundedPPO"
+"""The algorithm of runs whose learning rate has other bounds than rsl_rl's."""
+_WIDEST = (1e-5, 1e-2)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TeacherSettings:
@@ -21,6 +28,10 @@ class TeacherSettings:
     clip: float = 0.2
     desired_kl: float = 0.01
     """Aim of the adaptive learning rate."""
+    schedule: str = "adaptive"
+    """``adaptive``: the rate follows the KL divergence of updates; ``fixed``: it stays."""
+    learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
+    """Bounds of the adaptive rate; the widest are those of rsl_rl."""
     entropy: float = 2e-3
     value_loss: float = 1.0
     max_grad_norm: float = 1.0
@@ -28,10 +39,24 @@ class TeacherSettings:
     initial_std: float = 1.0
     std_type: str = "log"
     """How the policy's standard deviation is kept (text above table 4.4; the released settings say ``log``)."""
+    std_range: tuple[float, float] = (1e-6, 1e6)
+    """Bounds of the standard deviation of actions."""
     rnd_weight: float = 100.0
     """Of the curiosity reward, per second; 0 trains without it."""
     rnd_outputs: int = 8
     rnd_learning_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.schedule not in SCHEDULES:
+            raise unknown_name("schedule of the learning rate", self.schedule, SCHEDULES)
+        low, high = self.learning_rate_range
+        if not _WIDEST[0] <= low <= self.learning_rate <= high <= _WIDEST[1]:
+            raise UsageError(
+                f"A learning rate lies within its range, and that within {_WIDEST}; received {self.learning_rate!r} "
+                f"and {(low, high)}."
+            )
+        if not 0 < self.std_range[0] <= self.std_range[1]:
+            raise UsageError(f"std_range is a range of positive numbers; received {self.std_range!r}.")
 
     def config(self, groups: dict[str, tuple[str, ...]]) -> dict[str, Any]:
         """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``).
@@ -45,13 +70,18 @@ class TeacherSettings:
             "activation": "elu",
             "obs_normalization": True,
         }
-        spread = {"class_name": "GaussianDistribution", "init_std": self.initial_std, "std_type": self.std_type}
+        spread = {
+            "class_name": "GaussianDistribution",
+            "init_std": self.initial_std,
+            "std_type": self.std_type,
+            "std_range": list(self.std_range),
+        }
         algorithm: dict[str, Any] = {
             "class_name": "PPO",
             "num_learning_epochs": self.epochs,
             "num_mini_batches": self.minibatches,
             "learning_rate": self.learning_rate,
-            "schedule": "adaptive",
+            "schedule": self.schedule,
             "gamma": self.discount,
             "lam": self.gae_lambda,
             "entropy_coef": self.entropy,
@@ -61,6 +91,8 @@ class TeacherSettings:
             "use_clipped_value_loss": True,
             "clip_param": self.clip,
         }
+        if tuple(self.learning_rate_range) != _WIDEST:
+            algorithm |= {"class_name": BOUNDED, "learning_rate_range": list(self.learning_rate_range)}
         sets = {name: list(groups[name]) for name in ("actor", "critic")}
         if self.rnd_weight:
             sets["rnd_state"] = list(groups["rnd_state"])

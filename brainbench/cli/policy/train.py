@@ -15,7 +15,7 @@ from brainbench.cli.policy._options import (
     SeedOption,
     TaskArgument,
     TaskFileOption,
-    make_env,
+    read_task_file,
 )
 
 
@@ -36,6 +36,13 @@ def train(
     start: Annotated[
         Path | None, typer.Option(help="Begin with the networks of another run: its folder or one of its models.")
     ] = None,
+    start_std: Annotated[
+        float | None, typer.Option(help="Of the actions of --start's policy, to explore anew.")
+    ] = None,
+    change: Annotated[
+        list[str] | None,
+        typer.Option(help="Another number of the task: is_dropped=-300, goal.start_threshold=0.4, entropy=0, …"),
+    ] = None,
     save_every: Annotated[int, typer.Option(help="Iterations between checkpoints.")] = 50,
     device: DeviceOption = "cpu",
     seed: SeedOption = 0,
@@ -50,17 +57,21 @@ def train(
 
     from robotics_bridge import tasks
     from robotics_bridge.policies import teacher
+    from robotics_bridge.tasks.changes import changed
 
     count = envs or (8192 if device != "cpu" else 64)
-    env = make_env(task, task_file=task_file, num_envs=count, hand=hand, config=config, device=device, seed=seed)
+    if task_file is not None:
+        read_task_file(task_file)
+    chosen_task = changed(tasks.load(task, config), change or ())
+    env = tasks.make(chosen_task, num_envs=count, hand=hand, device=device, seed=seed)
     given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = replace(tasks.load(task, config).teacher, num_envs=count, **chosen)
+    settings = replace(chosen_task.teacher, num_envs=count, **chosen)
     run = out or Path("runs") / f"{task}-{env.hand.name}-{seed}"
     with progress_bar() as progress:
         result = teacher.train(
             env, run, iterations=iterations, minutes=minutes, settings=settings, seed=seed, save_every=save_every,
-            start=start, progress=progress,
+            start=start, start_std=start_std, progress=progress,
         )  # fmt: skip
     last = dict(result.history[-1]) if result.history else {}
     facts = {

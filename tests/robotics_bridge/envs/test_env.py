@@ -14,6 +14,7 @@ from robotics_bridge import tasks
 from robotics_bridge._device import mujoco_module, warp
 from robotics_bridge.envs import Env
 from robotics_bridge.hands.observations import observe, sensors_for
+from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation
 
 
@@ -112,6 +113,28 @@ def test_episodes_end_when_their_time_is_up_and_say_so() -> None:
     assert not any(bool(step[2].any()) for step in flags)
     assert env.episode_length_buf.tolist() == [0, 0]
     assert env.statistics()["length"] == 4.0
+
+
+def test_the_goal_narrows_when_enough_episodes_succeed_and_only_while_a_teacher_learns() -> None:
+    goal = SteppingRotation(start_threshold=0.4, narrowing=0.5, mastered=0.4)
+    goals = _make(4, _calm(goal=goal)).goals
+    assert float(goals.threshold) == pytest.approx(0.1)
+    goals.practise()
+    assert float(goals.threshold) == pytest.approx(0.4)
+    some, all_of_them = torch.tensor([True, True, False, False]), torch.ones(4, dtype=torch.bool)
+    goals.count.copy_(torch.tensor([1.0, 0.0, 2.0, 0.0]))
+    goals.account(some)
+    assert float(goals.threshold) == pytest.approx(0.4)
+    goals.account(~some)
+    assert float(goals.threshold) == pytest.approx(0.2)
+    goals.count.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
+    goals.account(all_of_them)
+    assert float(goals.threshold) == pytest.approx(0.2)
+    goals.count.fill_(1.0)
+    for _ in range(3):
+        goals.account(all_of_them)
+    assert float(goals.threshold) == pytest.approx(0.1)
+    assert not _make(4).goals.curriculum()
 
 
 def test_drives_reach_their_targets_and_held_joints_stay() -> None:

@@ -20,6 +20,7 @@ from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies import _tree
 from robotics_bridge.policies.teacher import RESUME, Trainer, load_teacher, newest, train
+from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.settings import TeacherSettings
 
 SMALL = TeacherSettings(num_envs=4, steps_per_env=6, iterations=4, epochs=2, minibatches=2, hidden=(16, 16))
@@ -102,6 +103,44 @@ def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
     assert config["start"]["file"].endswith("first/model_2.safetensors")
     with pytest.raises(DataError, match=r"actor of .* does not fit: 'mlp\.0\.weight' has the shape \(16"):
         Trainer(env, replace(settings, hidden=(32, 16))).begin_from(tmp_path / "first")
+
+
+def test_exploration_may_begin_anew_with_the_networks_of_another(tmp_path: Path) -> None:
+    train(_env(), tmp_path / "first", settings=SMALL, iterations=1)
+    settings = replace(SMALL, std_range=(0.1, 0.5), learning_rate_range=(9e-4, 1.1e-3), entropy=10.0)
+    for std, expected in ((0.25, 0.25), (3.0, 0.5)):
+        trainer = Trainer(_env(), settings)
+        trainer.begin_from(tmp_path / "first", std=std)
+        assert trainer.algorithm.act(trainer.env.get_observations()).shape == (4, 5)
+        assert trainer.algorithm.get_policy().output_std.mean().item() == pytest.approx(expected)
+    for _ in range(3):
+        assert 9e-4 <= trainer.iterate()["learning_rate"] <= 1.1e-3
+    with pytest.raises(UsageError, match="goes with a run to start from"):
+        train(_env(), tmp_path / "second", settings=SMALL, iterations=1, start_std=0.3)
+
+
+def test_a_run_of_before_a_setting_existed_goes_on(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1, save_every=1)
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["settings"]["std_range"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    assert train(_env(), tmp_path, settings=SMALL, iterations=2, save_every=1).iterations == 2
+
+
+def test_learning_begins_with_the_wide_goal_and_goes_on_with_the_one_it_reached(tmp_path: Path) -> None:
+    goal = SteppingRotation(start_threshold=3.2, narrowing=0.5)
+    # A threshold of half a turn and more is always met, so the first episodes to end narrow it.
+    changes: dict[str, Any] = {"goal": goal, "episode": 0.2}
+    whole = train(_env(**changes), tmp_path / "whole", settings=SMALL, iterations=4, save_every=1)
+    found = [row["threshold"] for row in whole.history]
+    assert found[0] > found[-1] > 0.1
+    train(_env(**changes), tmp_path / "parts", settings=SMALL, iterations=2, save_every=1, keep_env=False)
+    env = _env(**changes)
+    assert float(env.goals.threshold) == pytest.approx(0.1)
+    parts = Trainer(env, SMALL)
+    state = _tree.load(tmp_path / "parts" / RESUME)
+    parts.load({**state, "env": env.state_dict()})
+    assert float(env.goals.threshold) == pytest.approx(found[1])
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
