@@ -34,6 +34,13 @@ class Rollout:
         """T."""
         return len(self.teacher)
 
+    def chunk(self, first: int, length: int) -> dict[str, torch.Tensor]:
+        """Return the steps from one on, ``length`` or what is left: views [L, B, …] of all but the memory."""
+        span = slice(first, first + length)
+        parts = {name: value[span] for name, value in self.groups.items()}
+        parts |= {name: getattr(self, name)[span] for name in ("teacher", "student", "ended")}
+        return parts if self.features is None else {**parts, "features": self.features[span]}
+
     def save(self, path: Path) -> None:
         """Write the rollout to a safetensors file."""
         from safetensors.torch import save_file
@@ -65,12 +72,15 @@ class Recorder:
         self._parts: dict[str, torch.Tensor] = {}
         self._step = 0
 
-    def add(self, **values: torch.Tensor) -> None:
-        """Keep the values of one step."""
+    def put(self, **values: torch.Tensor) -> None:
+        """Keep values of the present step."""
         for name, value in values.items():
             if name not in self._parts:
                 self._parts[name] = torch.empty(self.steps, *value.shape, dtype=value.dtype, device=value.device)
             self._parts[name][self._step].copy_(value)
+
+    def next(self) -> None:
+        """Go on to the next step."""
         self._step += 1
 
     def finish(self, groups: Iterable[str]) -> Rollout:

@@ -28,6 +28,7 @@ from brainbench.files import atomic_path, provenance, read_json, to_plain, write
 from brainbench.models.training.logs import RunLog
 from brainbench.models.training.state import load_state, save_state
 from brainbench.types import Progress
+from robotics_bridge.policies._chunk import ChunkStep
 from robotics_bridge.policies._rollouts import Recorder, Rollout
 from robotics_bridge.policies.distill_config import DistillConfig
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
@@ -69,6 +70,7 @@ def distill(
     env: Any,
     teacher: Teacher,
     stop_after: float | None = None,
+    graphs: bool = True,
     progress: Progress | None = None,
 ) -> DistillResult:
     """Teach a student, or go on with a run that was interrupted.
@@ -79,6 +81,7 @@ def distill(
         env: Environment of :func:`robotics_bridge.tasks.make` with the configuration's observation type.
         teacher: Of :func:`robotics_bridge.policies.teacher.load_teacher`.
         stop_after: Save the state and return after so many seconds.
+        graphs: On CUDA, record a step of learning and replay it.
         progress: Called with (iterations done, iterations in all, what).
 
     Returns:
@@ -91,10 +94,15 @@ def distill(
     devices = [env.device] if torch.device(env.device).type == "cuda" else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(config.seed)
-        run = _Run(config.resolved(env.task.student), Path(out), env, teacher)
+        run = _Run(config.resolved(env.task.student), Path(out), env, teacher, graphs=graphs)
+        # Products as exact as PyTorch's convolutions are by default.
+        before = torch.get_float32_matmul_precision()
+        if devices:
+            torch.set_float32_matmul_precision("high")
         try:
             return run.run(math.inf if stop_after is None else stop_after, progress or (lambda done, total, what: None))
         finally:
+            torch.set_float32_matmul_precision(before)
             run.log.close()
 
 
@@ -117,7 +125,7 @@ class _Learner(nn.Module):
 
 
 class _Run:
-    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Teacher) -> None:
+    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Teacher, *, graphs: bool = True) -> None:
         self.config, self.out, self.env, self.teacher = config, out, env, teacher
         self.device = torch.device(env.device)
         read = [name for name in env.task.groups["student"] if name != TACTILE]
@@ -131,13 +139,17 @@ class _Run:
         self.learner = _Learner(self.student, nn.ModuleDict(heads)).to(self.device)
         weights = [weight for weight in self.learner.parameters() if weight.requires_grad]
         rate = config.learning_rate or 1e-4
-        self.optimizer = torch.optim.Adam(weights, lr=rate)
+        cuda = self.device.type == "cuda"
+        self.optimizer = torch.optim.Adam(weights, lr=rate, fused=cuda, capturable=cuda)
         tactile = self.student.core.tactile
         self.front = tactile.frozen_part if tactile is not None else None
+        self.precision = torch.bfloat16 if config.precision == "bf16" else None
+        self.student.core.precision = self.precision
+        self.step = ChunkStep(self._loss, weights, self.optimizer, clip=config.max_grad_norm, record=cuda and graphs)
         self.observations: dict[str, torch.Tensor] = env.reset()
         # First episodes end at different times, so that no rollout holds only beginnings.
         env.episode_length_buf.copy_(torch.randint_like(env.episode_length_buf, int(env.max_episode_length)))
-        self.memory = self.student.zeros(env.num_envs)
+        self.memory = self.student.zeros(env.num_envs, kept=self.front is not None)
         self.touched = self.front.init_state(env.num_envs) if self.front is not None else self.memory[:, :0]
         self.kept: list[tuple[int, Rollout]] = []
         self.iteration, self.loss = 0, math.nan
@@ -177,26 +189,27 @@ class _Run:
         """Collect a rollout."""
         recorder = Recorder(self.config.steps_per_env, self.memory)
         targets = [head.target for head in self.decoders]
+        kept = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
         self.student.eval()
         for _ in range(self.config.steps_per_env):
             obs = self.observations
-            values = {name: obs[name] for name in (*self.groups, *targets)}
             features = None
-            with self._precision():
-                if self.front is not None:
+            if self.front is not None:
+                with torch.autocast(self.device.type, self.precision, enabled=self.precision is not None):
                     features, self.touched = self.front(obs[TACTILE], self.touched)
-                    features, self.touched = features.float(), self.touched.float()
-                    values.pop(TACTILE)
-                latent, memory = self.student.advance(obs, self.memory, features)
-                own = self.student.action_of(latent).float()
+                features, self.touched = features.float(), self.touched.float()
+                recorder.put(features=features)
+            # The environment may write its next observations over these.
+            recorder.put(**{name: obs[name] for name in kept})
+            now = {name: obs[name][None] for name in self.groups}
+            latent, memory = self.student.unroll(now, self.memory, None, None if features is None else features[None])
+            own = self.student.action_of(latent[0]).float()
             right = self.teacher.act(obs).float()
             taught = torch.rand(len(own), 1, device=self.device) < share
-            if features is not None:
-                values["features"] = features
-            kept = {name: value.clone() for name, value in values.items()}
             self.observations, _, terminated, truncated, _ = self.env.step(torch.where(taught, right, own))
             ended = terminated | truncated
-            recorder.add(**kept, teacher=right, student=own, ended=ended)
+            recorder.put(teacher=right, student=own, ended=ended)
+            recorder.next()
             self.memory = torch.where(ended[:, None], 0.0, memory.float())
             if self.front is not None:
                 self.touched = torch.where(ended[:, None], 0.0, self.touched)
@@ -208,62 +221,48 @@ class _Run:
         self.student.update_normalization(rollout.groups)
         if self.config.aggregate:
             self.kept = [*self.kept, (self.iteration, rollout)][-self.config.aggregate :]
-        losses: dict[str, float] = {}
+        losses: dict[str, torch.Tensor] = {}
         for _ in range(self.config.epochs or 1):
             found = self._pass(rollout)
             losses = losses or found
             older = [item for _, item in self.kept if item is not rollout]
             if older:
                 self._pass(older[int(torch.randint(len(older), ()))])
-        return losses
+        return {name: float(value) for name, value in losses.items()}
 
-    def _pass(self, rollout: Rollout) -> dict[str, float]:
+    def _pass(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Go once through a rollout, a gradient step every ``gradient_length`` steps."""
         length = self.config.gradient_length or 1
         memory = rollout.memory
-        scale = torch.ones((), device=self.device)
+        scale = torch.ones(rollout.teacher.shape[-1], device=self.device)
         if self.config.loss == "inv_var_mse":
             scale = 1 / rollout.teacher.flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
         sums: dict[str, torch.Tensor] = {}
-        pending: list[torch.Tensor] = []
-        for step in range(rollout.steps):
-            obs = {name: value[step] for name, value in rollout.groups.items()}
-            with self._precision():
-                features = None if rollout.features is None else rollout.features[step]
-                latent, memory = self.student.advance(obs, memory, features)
-                parts = {"behaviour": self._behaviour(self.student.action_of(latent), rollout, step, scale)}
-                for head in self.decoders:
-                    aim = obs[head.target].flatten(1) * head.scale
-                    guess = self.learner.decoders[head.target](latent)
-                    parts[head.target] = head.weight * nn.functional.mse_loss(guess.float(), aim)
-            pending.append(torch.stack(list(parts.values())).sum())
-            for name, value in parts.items():
-                sums[name] = sums.get(name, 0) + value.detach() / rollout.steps
-            if len(pending) == length or step + 1 == rollout.steps:
-                self._descend(torch.stack(pending).mean())
-                pending, memory = [], memory.detach()
-            memory = torch.where(rollout.ended[step][:, None], 0.0, memory.float())
-        return {name: float(value) for name, value in sums.items()}
+        for first in range(0, rollout.steps, length):
+            chunk = rollout.chunk(first, length)
+            share = len(chunk["teacher"]) / rollout.steps
+            parts, memory = self.step({**chunk, "memory": memory, "scale": scale})
+            sums = {name: sums.get(name, 0) + share * value for name, value in parts.items()}
+        return sums
 
-    def _behaviour(self, action: torch.Tensor, rollout: Rollout, step: int, scale: torch.Tensor) -> torch.Tensor:
-        right, action = rollout.teacher[step], action.float()
+    def _loss(self, given: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Return the parts of the loss of a chunk and the memory after it."""
+        latent, memory = self.student.unroll(given, given["memory"], given["ended"], given.get("features"))
+        parts = {"behaviour": self._behaviour(self.student.action_of(latent), given)}
+        for head in self.decoders:
+            aim = given[head.target].flatten(2) * head.scale
+            parts[head.target] = head.weight * nn.functional.mse_loss(self.learner.decoders[head.target](latent), aim)
+        return parts, memory
+
+    def _behaviour(self, action: torch.Tensor, given: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        right, scale = given["teacher"], given["scale"]
         error = (action - right).pow(2) * scale
         if self.config.clip is not None:
             # As PPO clips values: what moved further than allowed in this iteration gains nothing more.
-            old = rollout.student[step]
+            old = given["student"]
             near = old + (action - old).clamp(-self.config.clip, self.config.clip)
             error = torch.maximum(error, (near - right).pow(2) * scale)
         return error.mean()
-
-    def _descend(self, loss: torch.Tensor) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        if self.config.max_grad_norm is not None:
-            nn.utils.clip_grad_norm_(self.learner.parameters(), self.config.max_grad_norm)
-        self.optimizer.step()
-
-    def _precision(self) -> Any:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
 
     def _report(self, losses: Mapping[str, float], acting: float, learning: float, rollout: Rollout) -> None:
         steps = rollout.steps * self.env.num_envs
@@ -317,6 +316,11 @@ class _Run:
         self.learner.keep(self._world())
         plain = load_state(self.out / STATE, self.learner, self.optimizer)
         self.iteration, self.loss = int(plain["iteration"]), float(plain["loss"])
+        cuda = self.device.type == "cuda"
+        for group in self.optimizer.param_groups:
+            group |= {"fused": cuda, "capturable": cuda}
+        for entries in self.optimizer.state.values():
+            entries["step"] = entries["step"].to(self.device)
         self.env.load_state_dict(self.learner.kept("env."))
         self.observations = self.env.observations
         own = self.learner.kept("run.")

@@ -62,7 +62,7 @@ class DistillConfig:
     save_interval: int = 100
     seed: int = 0
     precision: str = "float32"
-    """``float32`` or ``bf16`` (autocast of learning and acting)."""
+    """Of the tactile encoder in learning and acting: ``float32`` or ``bf16`` (mixed). The rest is single."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))

@@ -20,6 +20,7 @@ from brainbench.models.registry import list_models
 from brainbench.types import GRID_SHAPE
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.policies._picture_gru import MOST_CELLS, PictureGRU
 from robotics_bridge.policies.calibration import HandCalibration
 from robotics_bridge.policies.front_end import FrontEnd, Learning
 from robotics_bridge.policies.taxel_grid import TaxelGrid
@@ -28,6 +29,8 @@ from robotics_bridge.policies.timing import Time
 AUTO = "auto"
 """The published choice: ``tactile_convrnn`` where every link has a grid of taxels, ``rnn`` elsewhere."""
 _HIDDEN, _CHANNELS, _KERNEL = 64, (16, 32), 3
+_COUNTED = 1 << 24
+"""Values per channel whose squares are added up at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +121,24 @@ class TactileEncoder(nn.Module):
         """Return (embedding [B, F], h_out [B, H])."""
         raise NotImplementedError
 
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embeddings [L, B, F], h_out [B, H]) of L steps, with as few and as large products as there can be.
+
+        Args:
+            taxels: Readings [L, B, S, N, C].
+            h_in: Memory.
+            ended: Where [L, B] the memory is forgotten after a step; None for nowhere.
+        """
+        found = []
+        for step, reading in enumerate(taxels):
+            y, h_in = self(reading, h_in)
+            found.append(y)
+            if ended is not None:
+                h_in = torch.where(ended[step][:, None], 0.0, h_in)
+        return torch.stack(found), h_in
+
     @property
     def frozen_part(self) -> FrontEnd | None:
         """The part without gradients, whose features can be computed once and kept; None if there is none."""
@@ -144,10 +165,11 @@ class RunningScale(nn.Module):
 
     def update(self, x: torch.Tensor) -> None:
         """Count values [..., C]; those that are not finite are left out."""
-        flat = x.detach().reshape(-1, x.shape[-1])
-        used = (flat != 0) & torch.isfinite(flat)
-        self.total += torch.where(used, flat, 0).double().pow(2).sum(0)
-        self.count += used.sum(0)
+        # In parts: in double precision, a rollout of many taxels would fill a GPU.
+        for flat in x.detach().reshape(-1, x.shape[-1]).split(_COUNTED):
+            used = (flat != 0) & torch.isfinite(flat)
+            self.total += torch.where(used, flat, 0).double().pow(2).sum(0)
+            self.count += used.sum(0)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the scaled values."""
@@ -179,6 +201,11 @@ class _Flat(_Learned):
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return self.net(self.scale(taxels).flatten(1)), h_in
+
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return _at_once(self, taxels, h_in)
 
 
 class _Recurrent(_Learned):
@@ -271,6 +298,11 @@ class _Convolution(_Images):
         values = maps if self.canvas else maps.mean((2, 3))
         return self.head(values.reshape(taxels.shape[0], -1)), h_in
 
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return _at_once(self, taxels, h_in)
+
 
 class _ConvolutionCanvas(_Convolution):
     canvas = True
@@ -285,12 +317,36 @@ class _ConvRecurrent(_Images):
         places = self.rows * self.columns if self.canvas else self.images
         self.head = nn.Linear(_CHANNELS[0] * places, self.features)
         self.state_size = self.images * _CHANNELS[0] * self.rows * self.columns
+        small = self.rows * self.columns <= MOST_CELLS
+        self.products: PictureGRU | None = PictureGRU(self.rows, self.columns, _KERNEL) if small else None
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         state = h_in.reshape(-1, _CHANNELS[0], self.rows, self.columns)
         y, state = self.cell(self.pictures(taxels), state)
-        values = y if self.canvas else y.mean((2, 3))
-        return self.head(values.reshape(taxels.shape[0], -1)), state.reshape(h_in.shape)
+        return self._answer(y, taxels.shape[0]), state.reshape(h_in.shape)
+
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        # Processors convolve faster than they multiply.
+        if self.products is None or not taxels.is_cuda:
+            return super().unroll(taxels, h_in, ended)
+        return self.unroll_as_products(taxels, h_in, ended)
+
+    def unroll_as_products(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return what :meth:`unroll` returns, by :class:`~robotics_bridge.policies._picture_gru.PictureGRU`."""
+        assert self.products is not None
+        steps, batch = taxels.shape[:2]
+        pictures = self.pictures(taxels.flatten(0, 1)).flatten(1).unflatten(0, (steps, -1))
+        gone = None if ended is None else ended.repeat_interleave(self.images, 1)
+        y, state = self.products(self.cell, pictures, h_in.reshape(pictures.shape[1], -1), gone)
+        y = y.flatten(0, 1).unflatten(1, (-1, self.rows, self.columns))
+        return self._answer(y, steps * batch).unflatten(0, (steps, batch)), state.reshape(h_in.shape)
+
+    def _answer(self, y: torch.Tensor, batch: int) -> torch.Tensor:
+        return self.head((y if self.canvas else y.mean((2, 3))).reshape(batch, -1))
 
 
 class _ConvRecurrentCanvas(_ConvRecurrent):
@@ -322,6 +378,12 @@ class _Network(TactileEncoder):
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         features, h_out = self.front(taxels, h_in)
         return self.embed(features), h_out
+
+
+def _at_once(encoder: TactileEncoder, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what ``unroll`` returns for an encoder without memory."""
+    y, _ = encoder(taxels.flatten(0, 1), h_in)
+    return y.unflatten(0, taxels.shape[:2]), h_in
 
 
 ARMS: Mapping[str, Callable[[EncoderConfig], TactileEncoder]] = {

@@ -57,6 +57,22 @@ class GroupEncoder(nn.Module):
         hidden, memory = self.cell(x, (hidden, memory))
         return self.net(hidden), torch.cat((hidden, memory), 1)
 
+    def unroll(
+        self, x: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embeddings [L, B, …], h_out) of L steps [L, B, n]; memory is forgotten where ``ended`` [L, B]."""
+        if self.cell is None:
+            return self.net(x), h_in
+        hidden, memory = h_in.chunk(2, 1)
+        found = []
+        for step, each in enumerate(x):
+            hidden, memory = self.cell(each, (hidden, memory))
+            found.append(hidden)
+            if ended is not None:
+                gone = ended[step][:, None]
+                hidden, memory = torch.where(gone, 0.0, hidden), torch.where(gone, 0.0, memory)
+        return self.net(torch.stack(found)), torch.cat((hidden, memory), 1)
+
 
 class PolicyCore(nn.Module):
     """Observations → latent, one step, all memory in one array.
@@ -80,6 +96,47 @@ class PolicyCore(nn.Module):
         """H."""
         self.features: int = sum(int(part.features) for part in self.embedders)  # type: ignore[arg-type]
         self.features += tactile.features if tactile is not None else 0
+        self.precision: torch.dtype | None = None
+        """Of the tactile encoder while :meth:`unroll` runs (mixed); None for that of its weights."""
+
+    @property
+    def kept_size(self) -> int:
+        """Numbers of memory per row where a frozen encoder's features are kept, so that it needs none here."""
+        return sum(self.splits[:-2]) or 1
+
+    def unroll(
+        self,
+        flat: Sequence[torch.Tensor],
+        taxels: torch.Tensor | None,
+        h_in: torch.Tensor,
+        ended: torch.Tensor | None = None,
+        *,
+        kept: bool = False,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (latents [L, B, D], h_out) of L steps; arguments as of :meth:`forward`, with L in front.
+
+        Args:
+            flat: Normalised flat groups [L, B, n].
+            taxels: Readings [L, B, S, N, C], or kept features [L, B, F].
+            h_in: Memory [B, H]; [B, ``kept_size``] with kept features.
+            ended: Where [L, B] the memory is forgotten after a step; None for nowhere.
+            kept: ``taxels`` holds features.
+        """
+        sizes = [*self.splits[:-2], h_in.shape[1] - sum(self.splits[:-2])] if kept else self.splits
+        states = list(h_in.split(sizes, 1))
+        parts = []
+        for index, (embed, x) in enumerate(zip(self.embedders, flat, strict=True)):
+            y, states[index] = embed.unroll(x, states[index], ended)  # type: ignore[operator]
+            parts.append(y)
+        if self.tactile is not None and taxels is not None:
+            mixed = self.precision is not None
+            with torch.autocast(taxels.device.type, self.precision, enabled=mixed, cache_enabled=False):
+                if kept:
+                    y = self.tactile.embed(taxels)
+                else:
+                    y, states[-2] = self.tactile.unroll(taxels, states[-2], ended)
+            parts.append(y.float() if mixed else y)
+        return torch.cat(parts, -1), torch.cat([state.to(h_in.dtype) for state in states], 1)
 
     def forward(
         self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor, *, kept: bool = False
@@ -200,6 +257,26 @@ class TactilePolicy(MLPModel):
             return self.core(flat, features, h_in, kept=True)
         return self.core(flat, obs[TACTILE] if self.touch else None, h_in)
 
+    def unroll(
+        self,
+        obs: Any,
+        h_in: torch.Tensor,
+        ended: torch.Tensor | None = None,
+        features: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (latents [L, B, D], h_out [B, H]) of L steps, faster than L calls of :meth:`advance`.
+
+        Args:
+            obs: Groups [L, B, …].
+            h_in: Memory, as for :meth:`advance`; [B, ``core.kept_size``] with features.
+            ended: Where [L, B] an episode ended after a step, so that memory starts anew; None for nowhere.
+            features: What the frozen encoder gave [L, B, F], instead of its readings.
+        """
+        flat = self._normalised(obs)
+        if features is not None:
+            return self.core.unroll(flat, features, h_in, ended, kept=True)
+        return self.core.unroll(flat, obs[TACTILE] if self.touch else None, h_in, ended)
+
     def _normalised(self, obs: Any) -> list[torch.Tensor]:
         if not self.obs_groups:
             return []
@@ -210,10 +287,11 @@ class TactilePolicy(MLPModel):
         output = self.mlp(latent)
         return output if self.distribution is None else self.distribution.deterministic_output(output)
 
-    def zeros(self, batch: int) -> torch.Tensor:
-        """Return the memory [B, H] before the first step."""
+    def zeros(self, batch: int, *, kept: bool = False) -> torch.Tensor:
+        """Return the memory [B, H] before the first step; that of ``unroll`` with features, if those are kept."""
         like = next(self.parameters())
-        return torch.zeros(batch, self.core.state_size, device=like.device, dtype=like.dtype)
+        size = self.core.kept_size if kept else self.core.state_size
+        return torch.zeros(batch, size, device=like.device, dtype=like.dtype)
 
     def get_latent(self, obs: Any, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
         """Return the latent: of a step (the model remembers), or of padded sequences [T, B, …] when masks are given."""
@@ -255,7 +333,11 @@ class TactilePolicy(MLPModel):
         """Take observations [..., B, …] into account in the normalisers; touch may be left out."""
         if self.obs_normalization and self.obs_groups:
             flat = torch.cat([obs[name].reshape(-1, obs[name].shape[-1]) for name in self.obs_groups], -1)
-            self.obs_normalizer.update(flat)  # type: ignore[operator]
+            normaliser: Any = self.obs_normalizer
+            deviation = normaliser._std
+            normaliser.update(flat)
+            # rsl_rl puts a new tensor there, which a recorded graph would not see.
+            normaliser._std = deviation.copy_(normaliser._std)
         if self.core.tactile is not None and TACTILE in obs.keys():  # noqa: SIM118 - a TensorDict has no other "in"
             self.core.tactile.observe_scale(obs[TACTILE].reshape(-1, 1, *self.core.tactile.shape))
 

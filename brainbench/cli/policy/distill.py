@@ -43,7 +43,7 @@ def distill(
     teacher_share: Annotated[float, typer.Option(help="Share of the teacher's actions at the start (β).")] = 0.0,
     teacher_iterations: Annotated[int, typer.Option(help="Iterations until that share is 0; 0 keeps it.")] = 0,
     aggregate: Annotated[int, typer.Option(help="Earlier rollouts that are learned from again.")] = 0,
-    precision: Annotated[str, typer.Option(help="float32 or bf16.")] = "float32",
+    precision: Annotated[str, typer.Option(help="Of the tactile encoder: float32 or bf16.")] = "float32",
     save_interval: Annotated[int, typer.Option(help="Iterations between saved states.")] = 100,
     seed: SeedOption = 0,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,

@@ -245,3 +245,56 @@ def test_a_network_keeps_the_weights_that_were_scored() -> None:
     with warnings.catch_warnings():
         for name, weight in front.network.named_parameters():
             torch.testing.assert_close(weight, own[name], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", [*ARMS, NETWORK])
+def test_many_steps_at_once_are_those_steps_one_by_one(name) -> None:
+    policy = _make_policy(name, embedder="lstm", tactile={"learning": "finetuned"} if name == NETWORK else {}).eval()
+    obs, ended = _observations(3, 4), torch.zeros(4, 3, dtype=torch.bool)
+    ended[1, 0] = ended[3, 2] = True
+    with torch.no_grad():
+        h, found = torch.randn(3, policy.core.state_size, generator=torch.Generator().manual_seed(1)), []
+        latents, after = policy.unroll(obs, h, ended)
+        for step in range(4):
+            latent, h = policy.advance(obs[step], h)
+            found.append(latent)
+            h = torch.where(ended[step][:, None], 0.0, h)
+    torch.testing.assert_close(latents, torch.stack(found), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(after, h, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["tactile_convrnn", "tactile_canvas_convrnn"])
+def test_convolutions_as_products_give_the_same_answers_and_gradients(name) -> None:
+    encoder = EncoderConfig(name=name, placement="tips", resolution="low").build()
+    with torch.no_grad():
+        for weight in encoder.parameters():
+            weight += 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(2))
+    touch = _observations(6, 3)["tactile"]
+    ended = torch.tensor([[0, 1, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0]], dtype=torch.bool)
+    found = []
+    for unroll in (super(type(encoder), encoder).unroll, encoder.unroll_as_products):  # type: ignore[operator]
+        encoder.zero_grad()
+        h = torch.full((6, encoder.state_size), 0.1, requires_grad=True)
+        y, after = unroll(touch, h, ended)
+        (y.pow(2).mean() + after.pow(3).mean()).backward()
+        found.append([y.detach(), after.detach(), h.grad, *(weight.grad for weight in encoder.parameters())])
+    for slow, fast in zip(*found, strict=True):
+        scale = float(slow.abs().max())
+        torch.testing.assert_close(fast, slow, rtol=1e-3, atol=1e-5 * scale)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        mixed, _ = encoder.unroll_as_products(touch, h.detach(), ended)  # type: ignore[operator]
+    torch.testing.assert_close(mixed.float(), found[0][0], rtol=0, atol=0.05 * float(found[0][0].abs().max()))
+
+
+def test_what_a_frozen_network_gave_needs_no_memory_of_touch() -> None:
+    policy = _make_policy(embedder="lstm").eval()
+    front = policy.core.tactile.frozen_part  # type: ignore[union-attr]
+    obs, own, features = _observations(2, 3), torch.zeros(2, front.state_size), []
+    with torch.no_grad():
+        for step in range(3):
+            given, own = front(obs[step]["tactile"], own)
+            features.append(given)
+        whole, _ = policy.unroll(obs, policy.zeros(2))
+        kept, after = policy.unroll(obs, policy.zeros(2, kept=True), None, torch.stack(features))
+    assert after.shape == (2, policy.core.kept_size)
+    torch.testing.assert_close(kept, whole, atol=1e-5, rtol=1e-4)
