@@ -92,11 +92,16 @@ def careful() -> Task:
     """Return what a teacher goes on with that has learned to turn the block, but throws it.
 
     On the default, throwing pays: a drop costs 2.5, the turn before it earns ten times that. From the beginning, a
-    dearer drop ends in a hand that holds still. Here a drop costs 10, and only slow turns count.
+    dearer drop ends in a hand that holds still. Here a drop costs 10, only slow turns count, and so does coming nearer
+    to the goal in every direction; the goal begins wide.
     """
     task = default()
     rewards = dict(task.rewards)
     rewards["is_dropped"] = Reward(-400.0, terms.ended, {"names": ("obj_dropped",)})
-    rewards["rotation_progress"] = Reward(10.0, terms.rotation_progress, {"clip": 2.5, "penalty_scale": 1.0})
+    rewards["rotation_progress"] = Reward(5.0, terms.rotation_progress, {"clip": 2.5, "penalty_scale": 1.0})
+    rewards["goal_approach"] = Reward(10.0, terms.approach, {"clip": (-1000.0, 2.5), "negative_scale": 1.0})
+    rewards["off_axis_orientation_penalty"] = Reward(-5.0, terms.off_axis)
+    rewards["success_bonus"] = Reward(800.0, terms.goal_reached)
     settings = replace(task.teacher, rnd_weight=0.0, entropy=0.0, learning_rate=3e-4)
-    return replace(task, rewards=rewards, teacher=settings)
+    goal = None if task.goal is None else replace(task.goal, start_threshold=0.4)
+    return replace(task, rewards=rewards, teacher=settings, goal=goal)

@@ -37,12 +37,13 @@ def orientation_inverse(m: Moment, *, rot_eps: float) -> torch.Tensor:
 
 
 def rotation_progress(m: Moment, *, clip: float, penalty_scale: float) -> torch.Tensor:
-    """Return the rate about the commanded axis (rad/s), up to ±clip, while the tilt is within what the goal allows.
+    """Return the rate about the commanded axis (rad/s), at most ``clip``, while the goal allows the tilt.
 
-    Beyond that, the excess tilt (rad) costs ``penalty_scale`` times. Rotation to and fro adds up to nothing.
+    Beyond that, the excess tilt (rad) costs ``penalty_scale`` times. Backward rotation counts in full: were it limited
+    too, slow turns forward and quick ones back would pay.
     """
     excess = (m.off_axis - m.allowed_off_axis).clamp(min=0)
-    return m.axis_rate.clamp(-clip, clip) * (excess <= 0).float() - penalty_scale * excess
+    return m.axis_rate.clamp(max=clip) * (excess <= 0).float() - penalty_scale * excess
 
 
 def approach(m: Moment, *, clip: tuple[float, float], negative_scale: float) -> torch.Tensor:
