@@ -90,10 +90,12 @@ class SweepScenes(Sequence[Scene]):
     def solid(self, name: str) -> Solid:
         """Return one of the objects; neighbouring calls for the same object load it once."""
         # Neighbouring scenes share their object, and loading one may mean decomposing a mesh.
-        if self._last is None or self._last[0] != name:
+        last = self._last
+        if last is None or last[0] != name:
             item = self._objects[name]
-            self._last = (name, item if isinstance(item, Solid) else item())
-        return self._last[1]
+            # Threads may ask for different objects.
+            self._last = last = (name, item if isinstance(item, Solid) else item())
+        return last[1]
 
 
 def counts(scenes: SweepScenes) -> dict[str, Any]:

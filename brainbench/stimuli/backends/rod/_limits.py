@@ -30,8 +30,6 @@ REST = 1e-6
 """Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
 FAR = 3.0
 """How far (mm) a distance query looks; a link further away is looked at again when it may have come nearer."""
-NEAR = 0.2
-"""How much further (mm) than needed a search among triangles looks, so that it need not be made in every step."""
 TRAVEL = 0.25
 """Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
 FINEST = 16
@@ -53,6 +51,10 @@ WARP = 32
 GROUPS = (2, 2), (4, 4)
 """Possible contacts of a whisker up to which a group of threads finds their forces on a GPU, and its threads; whiskers
 of more have groups of eight, or sixteen."""
+LOOKERS = 8
+"""Threads of a GPU that look at one link together: 1, 2, 4 or 8."""
+LOOK_BOUNDS = 128, 6
+"""CUDA launch bounds of that kernel."""
 GRIP_BOUNDS = 128, 4
 """CUDA launch bounds of these kernels."""
 AFTER_LOOK, AFTER_GRIP, ANYHOW = 0, 1, 2

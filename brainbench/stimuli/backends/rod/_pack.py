@@ -10,6 +10,7 @@ import numpy as np
 from brainbench.stimuli.backends._engines import MICRO, MILLI
 from brainbench.stimuli.backends.rod._limits import LIGHT
 from brainbench.stimuli.backends.rod._shapes import BOX, CAPSULE, CYLINDER, MESH, SPHERE
+from brainbench.stimuli.backends.rod._tree import spatial_order, tree_boxes
 from brainbench.stimuli.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
 
 if TYPE_CHECKING:
@@ -47,6 +48,17 @@ class Tracks:
         self.spacing.append(spacing)
         self.knots.append(knots)
         return len(self.first) - 1
+
+    def add_straight(self, knots: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Append bodies [body, 16] that stand or move straight from time 0; return their tracks [body]."""
+        new = np.arange(len(self.first), len(self.first) + len(knots), dtype=np.int32)
+        begin = self.first[-1] + self.count[-1] if self.first else 0
+        self.first.extend(range(begin, begin + len(knots)))
+        self.count.extend([1] * len(knots))
+        self.start.extend([0.0] * len(knots))
+        self.spacing.extend([1.0] * len(knots))
+        self.knots.append(knots)
+        return new
 
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``Tracks`` hold."""
@@ -195,22 +207,48 @@ class Chains:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A triangle surface as the kernels take it: triangles in the order of their search tree."""
+
+    corners: NDArray[np.float64]
+    """[triangle, 3, 3]"""
+    outward: NDArray[np.float64]
+    """[triangle, 7, 3] as :func:`pseudo_normals` returns it."""
+    boxes: NDArray[np.float64]
+    """[box, 2, 3] as :func:`brainbench.stimuli.backends.rod._tree.tree_boxes` returns it."""
+    outline: NDArray[np.float64]
+    """[corner, 2] of the convex hull of its shadow along z: how far it reaches when it is turned about z."""
+    radius: float
+    """Distance of its farthest point from the origin."""
+
+    @classmethod
+    def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> Surface:
+        """Order the triangles of a surface; its unit of length stays."""
+        from scipy.spatial import ConvexHull
+
+        faces = faces[spatial_order(vertices[faces])]
+        corners = vertices[faces]
+        outline = vertices[ConvexHull(vertices[:, :2]).vertices, :2]
+        radius = float(np.linalg.norm(vertices, axis=1).max())
+        return cls(corners, pseudo_normals(vertices, faces), tree_boxes(corners), outline, radius)
+
+
 @dataclass
 class Shapes:
-    """Shapes of all scenes, and the meshes among them."""
+    """Shapes of all scenes, and the surfaces among them."""
 
-    device: Any
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    columns: list[dict[str, Any]] = field(default_factory=list)
+    """What the kernel's ``Bodies`` hold of each shape, some shapes at a time, [shape, …]."""
     first: list[int] = field(default_factory=lambda: [0])
-    meshes: list[Any] = field(default_factory=list)
-    """Warp meshes; they live as long as this object."""
-    corners: list[NDArray[np.float64]] = field(default_factory=list)
-    outwards: list[NDArray[np.float64]] = field(default_factory=list)
+    surfaces: list[Surface] = field(default_factory=list)
     triangles: int = 0
-    _known: dict[int, tuple[int, int]] = field(default_factory=dict)
+    boxes: int = 0
+    _known: dict[int, dict[str, int]] = field(default_factory=dict)
 
     def add_scene(self, obstacles: Sequence[Obstacle], tracks: Tracks, start: float, stop: float) -> int:
         """Append the shapes of one scene and return its index."""
+        count = 0
         for obstacle in obstacles:
             knots, spacing = body_knots(obstacle, start, stop)
             track = tracks.add(knots, start * MILLI, spacing)
@@ -221,13 +259,29 @@ class Shapes:
                 speed = np.linalg.norm(knots[:, 3:6], axis=1) + np.linalg.norm(knots[:, 10:13], axis=1) * reach
                 row |= {"radius": reach, "speed": float(speed.max()), "track": track}
                 row["friction"] = -1.0 if obstacle.friction is None else obstacle.friction
-                self.rows.append(row)
-        self.first.append(len(self.rows))
+                self.columns.append({name: np.array([value]) for name, value in row.items()})
+                count += 1
+        self.first.append(self.first[-1] + count)
         return len(self.first) - 2
+
+    def add_placed(self, surface: Surface, **columns: Any) -> None:
+        """Append scenes of one shape each, all of the same surface.
+
+        Args:
+            surface: the surface.
+            columns: what the kernel's ``Bodies`` hold that differs, [shape, …]; of all ``track``, ``turn``, ``scale``,
+                ``radius`` and ``speed``.
+        """
+        count = len(columns["track"])
+        still = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
+        alike = still | {"kind": MESH, "friction": -1.0} | self.add_mesh(surface)
+        self.columns.append({name: np.tile(value, (count, *[1] * np.ndim(value))) for name, value in alike.items()})
+        self.columns[-1] |= columns
+        self.first.extend(range(self.first[-1] + 1, self.first[-1] + count + 1))
 
     def _row(self, solid: ConvexPart | Sphere | Capsule | Cylinder | Box | TriangleMesh) -> dict[str, Any]:
         row: dict[str, Any] = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
-        row |= {"scale": 1.0, "mesh": 0, "face": 0}
+        row |= {"scale": 1.0, "face": 0, "faces": 0, "box": 0}
         match solid:
             case Sphere():
                 return row | {"kind": SPHERE, "size": np.full(3, solid.radius * MILLI), "place": _mm(solid.centre)}
@@ -242,46 +296,35 @@ class Shapes:
                 turn = _turn_z_to((ends[1] - ends[0]) / (2 * half))
                 return row | {"kind": kind, "size": size, "place": (ends[0] + ends[1]) / 2, "turn": turn}
             case _:
-                mesh, face = self._mesh(solid)
-                return row | {"kind": MESH, "mesh": mesh, "face": face}
+                if id(solid) not in self._known:
+                    mesh = isinstance(solid, TriangleMesh)
+                    vertices, faces = (solid.vertices, solid.faces) if mesh else hull_faces(solid)
+                    self._known[id(solid)] = self.add_mesh(Surface.of(vertices * MILLI, faces))
+                return row | self._known[id(solid)] | {"kind": MESH}
 
-    def _mesh(self, solid: ConvexPart | TriangleMesh) -> tuple[int, int]:
-        if id(solid) in self._known:
-            return self._known[id(solid)]
-        vertices, faces = (solid.vertices, solid.faces) if isinstance(solid, TriangleMesh) else hull_faces(solid)
-        known = self.add_mesh(vertices * MILLI, faces)
-        self._known[id(solid)] = known
-        return known
-
-    def add_mesh(self, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[int, int]:
-        """Build the search tree of a mesh (mm); return its identifier and its first triangle."""
-        import warp as wp
-
-        mesh = wp.Mesh(
-            points=wp.array(vertices.astype(np.float32), dtype=wp.vec3f, device=self.device),
-            indices=wp.array(np.ascontiguousarray(faces.ravel(), dtype=np.int32), dtype=wp.int32, device=self.device),
-        )
-        self.meshes.append(mesh)
-        first = self.triangles
-        self.corners.append(vertices[faces])
-        self.outwards.append(pseudo_normals(vertices, faces))
-        self.triangles += len(faces)
-        return int(mesh.id), first
+    def add_mesh(self, surface: Surface) -> dict[str, int]:
+        """Append a surface; return where its triangles and boxes are."""
+        place = {"face": self.triangles, "faces": len(surface.corners), "box": self.boxes}
+        self.surfaces.append(surface)
+        self.triangles += len(surface.corners)
+        self.boxes += len(surface.boxes)
+        return place
 
     @property
     def needs(self) -> int:
         """What the kernel must be able to touch."""
         from brainbench.stimuli.backends.rod._limits import MESHES, NOTHING, PRIMITIVES
 
-        return MESHES if self.meshes else PRIMITIVES if self.rows else NOTHING
+        return MESHES if self.surfaces else PRIMITIVES if self.columns else NOTHING
 
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``Bodies`` hold."""
 
         def column(name: str, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray:
-            return np.array([row[name] for row in self.rows], dtype=dtype).reshape(-1, *shape)
+            some = [np.asarray(columns[name], dtype=dtype).reshape(-1, *shape) for columns in self.columns]
+            return np.concatenate(some or [np.zeros((0, *shape), dtype=dtype)])
 
-        empty = np.zeros((1, 3, 3)), np.zeros((1, 7, 3))
+        boxes = np.concatenate([one.boxes for one in self.surfaces] or [np.zeros((1, 2, 3))])
         return {
             "first": np.array(self.first, dtype=np.int32),
             "kind": column("kind", np.int32),
@@ -293,10 +336,13 @@ class Shapes:
             "speed": column("speed", float),
             "friction": column("friction", float),
             "track": column("track", np.int32),
-            "mesh": column("mesh", np.uint64),
             "face": column("face", np.int32),
-            "corner": np.concatenate(self.corners) if self.corners else empty[0],
-            "outward": np.concatenate(self.outwards) if self.outwards else empty[1],
+            "faces": column("faces", np.int32),
+            "box": column("box", np.int32),
+            "low": boxes[:, 0],
+            "high": boxes[:, 1],
+            "corner": np.concatenate([one.corners for one in self.surfaces] or [np.zeros((1, 3, 3))]),
+            "outward": np.concatenate([one.outward for one in self.surfaces] or [np.zeros((1, 7, 3))]),
         }
 
 
@@ -313,7 +359,7 @@ def hull_faces(part: ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.int32]
     return part.vertices, faces.astype(np.int32)
 
 
-def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
     """Outward directions [face, 7, 3] of each face, its corners and the edges opposite to them.
 
     Angle-weighted (Baerentzen & Aanaes 2005): their sign tells inside from outside at every closest point.

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 
 from brainbench.stimuli.backends.rod._device import warp
-from brainbench.stimuli.backends.rod._limits import ANYHOW, GRIP_BOUNDS, SPARE, WARP, contacts_for
+from brainbench.stimuli.backends.rod._limits import ANYHOW, GRIP_BOUNDS, LOOK_BOUNDS, SPARE, WARP, contacts_for
 
 BUDGET = 4
 """Steps of a whisker in one slice."""
 ROUNDS = 8
 """Slices (an even number) between two looks of the host at what is left to do."""
 
-LOOKERS = 2**18
-"""Most threads that look at once: as many as a GPU runs side by side."""
+LOOKING = 2**19
+"""Most threads that look at once: a few times as many as a GPU runs side by side."""
 
 
 class Slices:
@@ -54,15 +54,14 @@ class Slices:
         queue[ANYHOW] = np.arange(lanes)
         on.queue = wp.array(queue, device=device)
         on.after, on.grips = (empty(3, lanes, kind=wp.int32) for _ in range(2))
-        size = np.zeros(9, dtype=np.int32)
+        size = np.zeros(7, dtype=np.int32)
         size[ANYHOW] = lanes
         on.size = wp.array(size, device=device)
-        on.tally = wp.zeros(9, dtype=wp.int32, device=device)
+        on.tally = wp.zeros(7, dtype=wp.int32, device=device)
         on.joints, on.ways = empty(capacity, lanes, kind=vec4), empty(capacity, lanes, kind=vec2)
-        on.times = empty(8, lanes)
+        on.times = empty(9, lanes)
         on.counts = wp.zeros((8, lanes), dtype=wp.int32, device=device)
         on.look_lane, on.look_link = (wp.zeros(self.looks, dtype=wp.int32, device=device) for _ in range(2))
-        on.order = empty(2, self.looks, kind=wp.int32)
         on.look_ends = empty(self.looks, 2, kind=vec3)
         on.found = empty(self.looks, 3, kind=vec4)
 
@@ -101,8 +100,9 @@ class Slices:
                 if stream is not None:
                     stream.wait_stream(device.stream)
                 wp.launch(kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=GRIP_BOUNDS[0])
-            looks = min(self.looks, self.capacity * left, LOOKERS)
-            wp.launch(kernels.look_all, looks, [*inputs[:4], on, looks], device=device, block_dim=block)
+            looks = min(self.looks, self.capacity * left) * kernels.lookers
+            looks = min(-(-looks // WARP) * WARP, LOOKING)
+            wp.launch(kernels.look_all, looks, [*inputs[:4], on, looks], device=device, block_dim=LOOK_BOUNDS[0])
             for stream in self.streams:
                 if stream is not None:
                     device.stream.wait_stream(stream)

@@ -24,6 +24,8 @@ from brainbench.stimuli.backends.rod._limits import (
     GRIP_BOUNDS,
     GROUPS,
     LARGEST_BEND,
+    LOOK_BOUNDS,
+    LOOKERS,
     LOST,
     MESHES,
     NOTHING,
@@ -75,7 +77,10 @@ def solver(
     Results, Paused, Grips = kinds.Results, kinds.Paused, kinds.Grips
     sym, sym_pair, sine, cosine = maths.sym, maths.sym_pair, maths.sine, maths.cosine
     first_axis, rotate = maths.first_axis, maths.rotate
-    Touch, far_at, look_at = near_by.Touch, near_by.far_at, near_by.look_at
+    Touch, look_at = near_by.Touch, near_by.look_at
+    # Threads that look at one link together.
+    lookers = LOOKERS if sliced and cuda else 1
+    look_together = looks(real, against, lookers).look_at
     Tracks, pose_at = track.Tracks, track.pose_at
     most_held = contacts_for(capacity)
     most_seen = most_held + SPARE
@@ -117,25 +122,24 @@ def solver(
 
     @wp.kernel(enable_backward=False, module="unique")
     def turn_over(on: Paused):
-        for d in range(9):
+        for d in range(7):
             on.size[d] = on.tally[d]
             on.tally[d] = 0
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique", module_options=options, launch_bounds=LOOK_BOUNDS)
     def look_all(ch: Chains, tr: Tracks, bodies: Bodies, ln: Lanes, on: Paused, threads: int):
         """Answer the looks of all waiting whiskers."""
-        place = wp.tid()
-        near_looks = on.size[7]
-        far_from = ((near_looks + wp.static(WARP - 1)) // wp.static(WARP)) * wp.static(WARP)
-        while place < far_from + on.size[8]:
-            which = int(-1)
-            if place < near_looks:
-                which = on.order[0, place]
-            elif place >= far_from:
-                which = on.order[1, place - far_from]
-            place = place + threads
-            if which < 0:
-                continue
+        thread = wp.tid()
+        part = thread % wp.static(lookers)
+        place = thread // wp.static(lookers)
+        count = wp.min(on.size[6], on.look_lane.shape[0])
+        # All threads of a warp go on, or none.
+        while place - place % wp.static(WARP // lookers) < count:
+            live = int(0)
+            if place < count:
+                live = 1
+            which = wp.min(place, count - 1)
+            place = place + threads // wp.static(lookers)
             lane = on.look_lane[which]
             i = on.look_link[which]
             s = bodies.first[ln.scene[lane]]
@@ -143,17 +147,14 @@ def solver(
             margin = on.times[6, lane]
             start = on.look_ends[which, 0]
             stop = on.look_ends[which, 1]
-            zero = real(0.0)
-            if margin < zero:
-                # A whisker at rest asks how far away everything is.
-                on.found[which, 2] = vec4(zero, far_at(bodies, s, body, start, stop, -margin), zero, zero)
-            else:
-                close = int(on.ways[i, lane][1])
-                touch = look_at(bodies, s, body, start, stop, ch.taper[i, ln.whisker[lane]], margin, close)
+            leaf = int(on.ways[i, lane][1])
+            taper = ch.taper[i, ln.whisker[lane]]
+            touch = look_together(bodies, s, body, start, stop, taper, margin, leaf, part, live)
+            if live == 1 and part == 0:
                 on.found[which, 0] = vec4(touch.normal[0], touch.normal[1], touch.normal[2], touch.gap)
                 on.found[which, 1] = vec4(touch.end_normal[0], touch.end_normal[1], touch.end_normal[2], touch.end_gap)
                 what = real(touch.between + 2 * touch.end)
-                on.found[which, 2] = vec4(touch.share, touch.clear, what, real(touch.close))
+                on.found[which, 2] = vec4(touch.share, touch.clear, what, real(touch.leaf))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=options, launch_bounds=bounds)
     def run(
@@ -214,8 +215,9 @@ def solver(
         push = Links2()
         inverse = Links3()
         clear = Links()
-        close = LinksWhole()
+        leaf = LinksWhole()
         until = Links()
+        swift = Links()
         # Where contact is possible within one step.
         k_link = SeenWhole()
         k_arc = Seen()
@@ -230,6 +232,7 @@ def solver(
 
         near = int(0)
         quickest = zero
+        h_last = zero
         # Counts that the compiler does not know keep it from writing loops out.
         sides = int(2) + wp.min(0, lane)
         object_speed = zero
@@ -268,13 +271,14 @@ def solver(
             idle = on.times[2, lane]
             jump = on.times[3, lane]
             quickest = on.times[4, lane]
+            h_last = on.times[8, lane]
             for i in range(links):
                 both4 = on.joints[i, lane]
                 q[i] = vec2(both4[0], both4[1])
                 qd[i] = vec2(both4[2], both4[3])
                 way2 = on.ways[i, lane]
                 clear[i] = way2[0]
-                close[i] = int(way2[1])
+                leaf[i] = int(way2[1])
         paused = int(0)
         for reading in range(first_reading, readings.shape[0] + 1):
             upto = before + longest
@@ -301,7 +305,6 @@ def solver(
                     if idle_before == zero or before == opt.start:
                         fresh = 1
                     asked = int(1)
-                    far_place = int(0)
                     if wp.static(sliced):
                         if waiting != 4:
                             # Ask for these distances like for all others, and wait.
@@ -315,7 +318,6 @@ def solver(
                             if look_first + nigh_links <= on.look_lane.shape[0]:
                                 asked = int(1)
                                 paused = 4
-                                far_place = wp.atomic_add(on.tally, 8, nigh_links)
                                 on.times[5, lane] = before
                                 on.times[6, lane] = -look
                     place = look_first
@@ -328,21 +330,24 @@ def solver(
                         until[i] = clear[i]
                         if fresh == 1 or clear[i] < upto:
                             if wp.static(sliced) and paused == 4:
-                                on.order[1, far_place] = place
                                 on.look_lane[place] = lane
                                 on.look_link[place] = i
                                 on.look_ends[place, 0] = at
                                 on.look_ends[place, 1] = ahead_at
-                                far_place = far_place + 1
                             else:
                                 slack = real(1e30)
+                                taper = ch.taper[i, who]
                                 if wp.static(sliced):
-                                    slack = on.found[place, 2][1]
+                                    answer4 = on.found[place, 2]
+                                    slack = answer4[1]
+                                    leaf[i] = int(answer4[3])
                                 else:
                                     for s in range(shapes_from, shapes_to):
                                         body = pose_at(tr, bodies.track[s], before)
-                                        slack = wp.min(slack, far_at(bodies, s, body, at, ahead_at, look))
-                                slack = slack - ch.taper[i, who][0] - real(0.05)
+                                        touch = look_at(bodies, s, body, at, ahead_at, taper, -look, leaf[i], 0, 1)
+                                        slack = wp.min(slack, touch.clear)
+                                        leaf[i] = touch.leaf
+                                slack = slack - taper[0] - real(0.05)
                                 until[i] = real(1e30)
                                 if slack <= zero:
                                     until[i] = before
@@ -371,7 +376,6 @@ def solver(
                         clear[i] = until[i]
                 if upto <= idle:
                     for i in range(links):
-                        close[i] = 0
                         q[i] = vec2(zero, zero)
                         qd[i] = vec2(zero, zero)
             if resting == 1 and upto <= idle and rest_of_frame == zero:
@@ -438,7 +442,8 @@ def solver(
                     vw = bw
                     vv = bv
                     at = none
-                    fastest = wp.length_sq(bv)
+                    speed = wp.length_sq(bv)
+                    fastest = speed
                     for i in range(links):
                         b4 = ch.build[i, who]
                         turned = x * b4[1] + y * b4[2]
@@ -459,23 +464,29 @@ def solver(
                         y = y * cb - x * sb
                         x = turned
                         at = at + x * b4[0]
-                        fastest = wp.max(fastest, wp.length_sq(vv + wp.cross(vw, at)))
+                        end_speed = wp.length_sq(vv + wp.cross(vw, at))
+                        swift[i] = wp.sqrt(wp.max(speed, end_speed))
+                        fastest = wp.max(fastest, end_speed)
+                        speed = end_speed
                     node[links] = at
                     was_quickest = quickest
                     quickest = wp.sqrt(fastest)
                     # Contacts that may close within this step.
                     travel = h * (quickest + object_speed)
                     margin = wp.min(real(1.5) * travel + h * jump + real(0.001), real(wp.static(WIDEST)))
+                    # How far links and objects have come since the last step: its rates at the end are those now.
+                    pace = real(1.02) * wp.max(h, h_last)
+                    lurch = object_speed
+                    if opt.quasistatic == 1:
+                        lurch = object_speed + jump
                     was_near = near
                     near = int(0)
                     nigh = int(0)
-                    near_looks = int(0)
                     if wp.static(against > NOTHING):
                         for i in range(links):
-                            if clear[i] - real(1.02) * travel <= margin + ch.taper[i, who][0]:
+                            if clear[i] - pace * (swift[i] + lurch) <= margin + ch.taper[i, who][0]:
                                 near = 1
                                 nigh = nigh + 1
-                                near_looks = near_looks + close[i]
                     if wp.static(sliced):
                         if near == 1 and waiting != 1:
                             # Ask for looks, and wait; when there is no room for more, try again.
@@ -484,21 +495,12 @@ def solver(
                             if look_first + nigh <= on.look_lane.shape[0]:
                                 paused = 1
                                 asked_for = look_first
-                                # Those among triangles and those through the tree, each side by side.
-                                near_place = wp.atomic_add(on.tally, 7, near_looks)
-                                far_place = wp.atomic_add(on.tally, 8, nigh - near_looks)
                                 for i in range(links):
-                                    if clear[i] - real(1.02) * travel <= margin + ch.taper[i, who][0]:
+                                    if clear[i] - pace * (swift[i] + lurch) <= margin + ch.taper[i, who][0]:
                                         on.look_lane[asked_for] = lane
                                         on.look_link[asked_for] = i
                                         on.look_ends[asked_for, 0] = node[i] + origin
                                         on.look_ends[asked_for, 1] = node[i + 1] + origin
-                                        if close[i] == 1:
-                                            on.order[0, near_place] = asked_for
-                                            near_place = near_place + 1
-                                        else:
-                                            on.order[1, far_place] = asked_for
-                                            far_place = far_place + 1
                                         asked_for = asked_for + 1
                                 on.times[5, lane] = now
                                 on.times[6, lane] = margin
@@ -509,7 +511,8 @@ def solver(
                         rest_of_frame = zero
                     if wp.static(against > NOTHING):
                         for i in range(links):
-                            clear[i] = clear[i] - real(1.02) * travel
+                            clear[i] = clear[i] - pace * (swift[i] + lurch)
+                        h_last = h
                     if wp.static(against > NOTHING) and near == 1:
                         answer = look_first
                         cvw = bw
@@ -540,7 +543,7 @@ def solver(
                                         touch.clear = f2_[1]
                                         touch.between = what % 2
                                         touch.end = what // 2
-                                        touch.close = int(f2_[3])
+                                        touch.leaf = int(f2_[3])
                                     else:
                                         touch = look_at(
                                             bodies,
@@ -550,9 +553,11 @@ def solver(
                                             node[i + 1] + origin,
                                             taper,
                                             margin,
-                                            close[i],
+                                            leaf[i],
+                                            0,
+                                            1,
                                         )
-                                    close[i] = touch.close
+                                    leaf[i] = touch.leaf
                                     closest = wp.min(closest, touch.clear)
                                     for which in range(sides):
                                         offered = touch.between
@@ -898,9 +903,10 @@ def solver(
             on.times[2, lane] = idle
             on.times[3, lane] = jump
             on.times[4, lane] = quickest
+            on.times[8, lane] = h_last
             for i in range(links):
                 on.joints[i, lane] = vec4(q[i][0], q[i][1], qd[i][0], qd[i][1])
-                on.ways[i, lane] = vec2(clear[i], real(close[i]))
+                on.ways[i, lane] = vec2(clear[i], real(leaf[i]))
             after = wp.static(AFTER_LOOK)
             if paused == 3:
                 after = wp.static(AFTER_GRIP)
@@ -921,6 +927,7 @@ def solver(
         run=run,
         turn_over=turn_over,
         look_all=look_all,
+        lookers=lookers,
         settle=[(settle_all(rank, *one), one[1]) for rank, one in enumerate(classes)] if sliced else [],
         Paused=Paused,
         Grips=Grips,

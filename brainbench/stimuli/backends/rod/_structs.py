@@ -54,10 +54,16 @@ def structs(real: type) -> SimpleNamespace:
         """[shape] negative for the whisker's own."""
         track: wp.array(dtype=wp.int32)
         """[shape] motion of its body."""
-        mesh: wp.array(dtype=wp.uint64)
-        """[shape] Warp mesh."""
         face: wp.array(dtype=wp.int32)
         """[shape] first of its triangles below."""
+        faces: wp.array(dtype=wp.int32)
+        """[shape] how many it has."""
+        box: wp.array(dtype=wp.int32)
+        """[shape] first of its boxes below."""
+        low: wp.array(dtype=vec3)
+        """[box] lowest corner; boxes as in :mod:`._tree`."""
+        high: wp.array(dtype=vec3)
+        """[box] highest corner."""
         corner: wp.array2d(dtype=vec3)
         """[triangle, 3]"""
         outward: wp.array2d(dtype=vec3)
@@ -140,21 +146,19 @@ def structs(real: type) -> SimpleNamespace:
         grips: wp.array2d(dtype=wp.int32)
         """[3, lane] whiskers whose contact forces are to be found: of few, some and many possible contacts."""
         size: wp.array(dtype=wp.int32)
-        """[9] whiskers in the queues, in the queues of contact forces; looks, those among triangles, others."""
+        """[7] whiskers in the queues, in the queues of contact forces; looks."""
         tally: wp.array(dtype=wp.int32)
-        """[9] the same for the next slice."""
+        """[7] the same for the next slice."""
         joints: wp.array2d(dtype=vec4)
         """[link, lane] angles and rates."""
         ways: wp.array2d(dtype=vec2)
-        """[link, lane] lower bound of the distance, and whether triangles were near."""
+        """[link, lane] lower bound of the distance, and at which leaf of the search tree the last look ended (+ 1)."""
         times: wp.array2d(dtype=real)
-        """[8, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look (how
-        far to look, negative, at rest), and quickest in the step whose forces are awaited."""
+        """[9, lane] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look (how
+        far to look, negative, at rest), quickest in the step whose forces are awaited, and the last step."""
         counts: wp.array2d(dtype=wp.int32)
         """[8, lane] reading, reading to write, held contacts, near, resting, waiting, first look, and near in the step
         whose forces are awaited."""
-        order: wp.array2d(dtype=wp.int32)
-        """[2, look] looks of links that were near triangles, and others."""
         look_lane: wp.array(dtype=wp.int32)
         """[look]"""
         look_link: wp.array(dtype=wp.int32)
@@ -162,7 +166,7 @@ def structs(real: type) -> SimpleNamespace:
         look_ends: wp.array2d(dtype=vec3)
         """[look, 2]"""
         found: wp.array2d(dtype=vec4)
-        """[look, 3] direction and gap between the ends; at the far end; share, bound, and what there was."""
+        """[look, 3] direction and gap between the ends; at the far end; share, bound, what there was, leaf."""
 
     @wp.struct
     class Grips:

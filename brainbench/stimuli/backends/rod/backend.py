@@ -125,7 +125,7 @@ class _Batch:
     _scenes: dict[Any, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.shapes = Shapes(self.device)
+        self.shapes = Shapes()
 
     def add(self, job: Job, reach: Reach) -> Chain:
         """Append one job as a lane; return its chain."""

@@ -5,6 +5,7 @@ The object's surface is uploaded once and scaled, turned and moved inside the ke
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,8 +20,15 @@ from brainbench.errors import UsageError
 from brainbench.stimuli.backends._engines import MILLI
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, MESHES
-from brainbench.stimuli.backends.rod._pack import Chains, Shapes, Tracks, capacity_for, quaternions, still_knots
-from brainbench.stimuli.backends.rod._shapes import MESH
+from brainbench.stimuli.backends.rod._pack import (
+    Chains,
+    Shapes,
+    Surface,
+    Tracks,
+    capacity_for,
+    quaternions,
+    still_knots,
+)
 from brainbench.stimuli.backends.rod._slices import Slices, make_grips
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.objects import euler_matrix
@@ -30,7 +38,7 @@ if TYPE_CHECKING:
 
     from brainbench.stimuli.fidelity import Fidelity
     from brainbench.stimuli.generation.engine import SweepBatch
-    from brainbench.stimuli.objects import Solid
+    from brainbench.stimuli.obstacle import TriangleMesh
     from brainbench.stimuli.sweep_grid import SweepGrid
     from brainbench.stimuli.sweeps import SweepScenes
 
@@ -119,6 +127,8 @@ class SweepLauncher:
         )
         self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in chains])
         self.readings = grid.frames.readings * MILLI
+        self._objects: dict[str, tuple[float, Surface]] = {}
+        self._turns: dict[float, NDArray[np.float64]] = {}
         self._bases = [_base_knot(mount, grid) for mount in mounts]
         spans = np.diff(self.readings, prepend=0.0)
         self.steps_each = np.array([int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in self.steps])
@@ -137,9 +147,11 @@ class SweepLauncher:
         clock = [time.perf_counter()]
         tracks = Tracks()
         bases = [tracks.add(knot, 0.0, 1.0) for knot in self._bases]
-        shapes = Shapes(device)
+        shapes = Shapes()
+        prepared = self._prepare([name for name, _ in objects])
         for name, sweeps in objects:
-            self._add(shapes, tracks, self.scenes.solid(name), sweeps)
+            if len(sweeps):
+                self._add(shapes, tracks, *prepared[name], sweeps)
         clock.append(time.perf_counter())
         count, whiskers = len(shapes.first) - 1, len(self._bases)
         # Neighbouring threads take the same whisker past the same object.
@@ -279,44 +291,68 @@ class SweepLauncher:
             retried=len(rows),
         )
 
-    def _add(self, shapes: Shapes, tracks: Tracks, solid: Solid, sweeps: Sequence[Any]) -> None:
-        """Append the scenes of one object's sweeps, expressed in the frame of the array."""
+    def _prepare(self, names: Sequence[str]) -> dict[str, tuple[float, Surface]]:
+        """Return the diagonal (m) and the surface (mm) of objects.
+
+        Those of the last launch are kept: whiskers are simulated again, and large objects come in several launches.
+        """
+        # Launches may run side by side.
+        known, new = self._objects, []
+        for name in dict.fromkeys(names):
+            if name not in known:
+                solid = self.scenes.solid(name)
+                if solid.surface is None:
+                    raise UsageError(
+                        f"The object {solid.name!r} has no exact surface to sweep over; use the mujoco backend."
+                    )
+                new.append((name, solid.diagonal, solid.surface))
+
+        def order(surface: TriangleMesh) -> Surface:
+            return Surface.of(surface.vertices * MILLI, surface.faces)
+
+        # Sorting leaves Python's lock alone. On a processor several launches are made side by side as it is.
+        with ThreadPoolExecutor(min(8, os.cpu_count() or 1) if self.device.is_cuda else 1) as pool:
+            ordered = pool.map(order, [surface for *_, surface in new])
+            made = {name: (diagonal, some) for (name, diagonal, _), some in zip(new, ordered, strict=True)}
+        self._objects = {name: made[name] if name in made else known[name] for name in names}
+        return {**known, **made}
+
+    def _add(self, shapes: Shapes, tracks: Tracks, diagonal: float, surface: Surface, sweeps: Sequence[Any]) -> None:
+        """Append the scenes of one object's sweeps, expressed in the frame of the array.
+
+        Numbers are the same whatever sweeps come together: sums of products are written out, term by term.
+        """
         grid, head = self.grid, self._head
-        surface = solid.surface
-        if surface is None:
-            raise UsageError(f"The object {solid.name!r} has no exact surface to sweep over; use the mujoco backend.")
-        diagonal = solid.diagonal
-        mesh, face = shapes.add_mesh(surface.vertices * MILLI, surface.faces)
-        radius = float(np.linalg.norm(surface.vertices, axis=1).max()) * MILLI
         rotations = sorted({sweep.rotation for sweep in sweeps})
-        turns = np.array([euler_matrix((0.0, 0.0, rotation)) for rotation in rotations])
+        turns = np.array([self._turn(rotation) for rotation in rotations])
         # Turned about z: how far it then reaches along x and y.
-        flat = surface.vertices[:, :2] @ turns[:, :2, :2].reshape(-1, 2).T
-        lows = dict(zip(rotations, flat.min(axis=0).reshape(-1, 2), strict=True))
-        turned = dict(zip(rotations, quaternions(head.T @ turns), strict=True))
-        for sweep in sweeps:
-            scale = sweep.size / diagonal
-            low, quaternion = lows[sweep.rotation] * scale, turned[sweep.rotation]
-            y = grid.start - low[1] if grid.placing == "clear" else grid.start + low[1]
-            place = head.T @ (np.array([sweep.distance - low[0], y, sweep.height]) - self._origin)
-            knot = still_knots(place, quaternion)
-            knot[0, 3:6] = head.T @ np.array([0.0, -sweep.speed, 0.0])
-            shapes.rows.append(
-                {
-                    "kind": MESH,
-                    "size": np.ones(3),
-                    "place": np.zeros(3),
-                    "turn": np.array([1.0, 0.0, 0.0, 0.0]),
-                    "scale": scale,
-                    "mesh": mesh,
-                    "face": face,
-                    "radius": radius * scale,
-                    "speed": sweep.speed,
-                    "friction": -1.0,
-                    "track": tracks.add(knot, 0.0, 1.0),
-                }
-            )
-            shapes.first.append(len(shapes.rows))
+        x, y = surface.outline.T
+        low = np.stack([(turns[:, k, 0, None] * x + turns[:, k, 1, None] * y).min(axis=1) for k in (0, 1)], axis=1)
+        quaternion = quaternions(head.T @ turns)
+        which = np.searchsorted(rotations, [sweep.rotation for sweep in sweeps])
+        speed, height, distance, size = (
+            np.array([getattr(sweep, name) for sweep in sweeps]) for name in ("speed", "height", "distance", "size")
+        )
+        scale = size / diagonal
+        reach = low[which] * (scale / MILLI)[:, None]
+        side = grid.start - reach[:, 1] if grid.placing == "clear" else grid.start + reach[:, 1]
+        place = np.stack([distance - reach[:, 0], side, height], axis=1) - self._origin
+        knots = np.zeros((len(sweeps), 16))
+        for k in range(3):
+            knots[:, k] = (place[:, 0] * head[0, k] + place[:, 1] * head[1, k] + place[:, 2] * head[2, k]) * MILLI
+            knots[:, 3 + k] = -speed * head[1, k]
+        knots[:, 6:10] = quaternion[which]
+        still = np.tile([1.0, 0.0, 0.0, 0.0], (len(sweeps), 1))
+        radius = surface.radius * scale
+        shapes.add_placed(
+            surface, track=tracks.add_straight(knots), turn=still, scale=scale, radius=radius, speed=speed
+        )
+
+    def _turn(self, rotation: float) -> NDArray[np.float64]:
+        """Return the matrix of a rotation about z; grids have few."""
+        if rotation not in self._turns:
+            self._turns[rotation] = euler_matrix((0.0, 0.0, rotation))
+        return self._turns[rotation]
 
 
 BLOCK = 64
