@@ -155,7 +155,7 @@ class Conv2d(nn.Conv2d):
         return self._convolve(input, self.weight, self.bias)
 
     def join(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Convolve inputs [B, C, H, W] of one grid as if their channels lay side by side, in the first one's precision."""
+        """Convolve inputs [B, C, H, W] as if their channels lay side by side, in the first one's precision."""
         if self.tape is not None:
             return self.tape.convolve(inputs)
         if self.joins(*inputs):

@@ -60,9 +60,7 @@ class StreamingStep(nn.Module):
         sizes = [math.prod(shape) for shape in self.shapes]
         # What works fastest on CUDA, and no part of the contract of an exported file.
         innermost = h_in.is_cuda and not torch.compiler.is_exporting()
-        parts = [
-            _part(part, shape, innermost) for part, shape in zip(h_in.split(sizes, 1), self.shapes, strict=True)
-        ]
+        parts = [_part(part, shape, innermost) for part, shape in zip(h_in.split(sizes, 1), self.shapes, strict=True)]
         count = len(self.encoder.shapes)
         features, before = self.encoder(self.model.normaliser(obs), parts[:count])
         features, after = self.attender(features, parts[count:])

@@ -35,7 +35,7 @@ class Geometry:
     """Places of the result."""
 
     @classmethod
-    def of(cls, conv: Conv2d, grid: tuple[int, int]) -> Geometry:
+    def of(cls, conv: Conv2d, grid: Sequence[int]) -> Geometry:
         """Return that of a convolution on a grid (H, W)."""
         left, right, top, bottom = conv.around
         rows, columns = conv.kernel_size
@@ -54,8 +54,8 @@ class Geometry:
 
 def unfolded(inputs: Sequence[torch.Tensor], geometry: Geometry, out: torch.Tensor | None = None) -> torch.Tensor:
     """Return the windows [R, taps · ΣC] of inputs [B, C, H, W] in half precision, in ``out`` if given."""
-    from brainbench.models._gpu.intersection import by_places
-    from brainbench.models._gpu.unfold import unfold_into
+    from brainbench.models._gpu._intersection_kernels import by_places
+    from brainbench.models._gpu._unfold_kernels import unfold_into
 
     rows = len(inputs[0]) * math.prod(geometry.out)
     if out is None:
@@ -96,7 +96,7 @@ class Tape:
         stimuli: Inputs [1, ΣC, H, W] of the whole pass, at most.
     """
 
-    def __init__(self, conv: Conv2d, grid: tuple[int, int], stimuli: int) -> None:
+    def __init__(self, conv: Conv2d, grid: Sequence[int], stimuli: int) -> None:
         self.geometry = Geometry.of(conv, grid)
         self.places = math.prod(self.geometry.out)
         outputs, width = len(conv.weight), conv.weight[0].numel()

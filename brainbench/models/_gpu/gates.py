@@ -22,7 +22,7 @@ class GateTape:
     """What the gradients of a cell's norms add up to over the steps of a pass."""
 
     def __init__(self, norms: list[ChannelNorm]) -> None:
-        from brainbench.models._gpu.intersection import PROGRAMS
+        from brainbench.models._gpu._intersection_kernels import PROGRAMS
 
         self.sums: torch.Tensor | None = None
         self.norms: torch.Tensor | None = None
@@ -60,13 +60,13 @@ def settle(
     state = state.to(kind)
     if cell.tape is not None:
         return _Settled.apply(cell.tape, cell.conv.tape, cell.tape.norms, kind, fused, x, state)  # type: ignore[return-value]
-    from brainbench.models._gpu import intersection
+    from brainbench.models._gpu import _intersection_kernels as kernels
 
     norms = None
     if cell.norms:
         chosen = [cell.norm(name) for name in cell.gates]
-        norms = torch.stack([norm.weight for norm in chosen] + [norm.bias for norm in chosen])
-    return intersection.settle(_rows(fused), x, state, norms, kind)
+        norms = torch.stack((*(norm.weight for norm in chosen), *(norm.bias for norm in chosen)))
+    return kernels.settle(_rows(fused), x, state, norms, kind)
 
 
 def _rows(maps: torch.Tensor) -> torch.Tensor:
@@ -85,23 +85,23 @@ class _Settled(torch.autograd.Function):
         x: torch.Tensor,
         state: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        from brainbench.models._gpu import intersection
+        from brainbench.models._gpu import _intersection_kernels as kernels
 
         rows = _rows(fused)
         ctx.tape, ctx.conv, ctx.span, ctx.shape = tape, conv, conv.span, fused.shape
         ctx.save_for_backward(rows, x, state, *(() if norms is None else (norms,)))
-        return intersection.settle(rows, x, state, norms, kind)
+        return kernels.settle(rows, x, state, norms, kind)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_y: torch.Tensor, d_after: torch.Tensor) -> Any:
-        from brainbench.models._gpu import intersection
+        from brainbench.models._gpu import _intersection_kernels as kernels
 
         rows, x, state, *norms = ctx.saved_tensors
         # Straight to where the gradient of the convolution's weights will look for it.
         place = ctx.conv.gradient(ctx.span)
         d_fused = torch.empty_like(rows, dtype=HALF) if place is None else place
-        d_x, d_state = intersection.settle_backward(
+        d_x, d_state = kernels.settle_backward(
             rows, x, state, norms[0] if norms else None, d_y, d_after, d_fused, ctx.tape.sums
         )
         batch, channels, height, width = ctx.shape

@@ -145,7 +145,9 @@ def test_no_tape_is_left_behind_by_a_pass_that_fails(single: torch.device, monke
     assert all(part.tape is None for part in graph.modules() if isinstance(part, Conv2d))
 
 
-@pytest.mark.parametrize(("kernel", "padding"), [((2, 2), "same"), ((2, 2), "valid"), ((3, 2), "same"), ((3, 3), (1, 1))])
+@pytest.mark.parametrize(
+    ("kernel", "padding"), [((2, 2), "same"), ((2, 2), "valid"), ((3, 2), "same"), ((3, 3), (1, 1))]
+)
 def test_windows_are_those_of_pytorch(kernel: tuple[int, int], padding: Any, single: torch.device) -> None:
     conv = Conv2d(7, 5, kernel_size=kernel, padding=padding).to(single)
     inputs = [torch.randn(3, 4, 4, 6, device=single).to(memory_format=torch.channels_last)]

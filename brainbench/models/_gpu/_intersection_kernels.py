@@ -1,4 +1,4 @@
-"""All that an IntersectionRNN does after its convolution (Collins et al. 2017), forward and backward, as one kernel each.
+"""All that an IntersectionRNN does after its convolution (Collins et al. 2017): a kernel forward, a kernel backward.
 
 With p, m, q, n the four gates' pre-activations, normalised over channels if asked (Ba et al. 2016):
 s' = σ(p + 1) s + (1 − σ(p + 1)) tanh(m) and y = σ(q + 1) x + (1 − σ(q + 1)) relu(n). Letters: R rows (stimulus, then
@@ -11,12 +11,15 @@ import triton.language as tl
 
 GATES = 4
 EPS = 1e-5
+WARPS = 8
 PROGRAMS = 264
 """Programs of a backward pass: each sums the gradients of the norms over its own rows, always in the same order."""
 
 
 @triton.jit
-def _normalised(fused, norms, rows, c, inside, GATE: tl.constexpr, C: tl.constexpr, NORM: tl.constexpr, EPS: tl.constexpr):
+def _normalised(
+    fused, norms, rows, c, inside, GATE: tl.constexpr, C: tl.constexpr, NORM: tl.constexpr, EPS: tl.constexpr
+):
     """Return (what the gate sees, its normalised form before scale and shift, the inverse deviation)."""
     value = tl.load(fused + (rows.to(tl.int64) * (4 * C))[:, None] + (GATE * C + c)[None, :], mask=inside, other=0.0)
     value = value.to(tl.float32)
@@ -84,7 +87,9 @@ def settle_kernel(
 
 
 @triton.jit
-def _store_gate(d_fused, norms, gradient, hat, inverse, rows, c, inside, GATE: tl.constexpr, C: tl.constexpr, NORM: tl.constexpr):
+def _store_gate(
+    d_fused, norms, gradient, hat, inverse, rows, c, inside, GATE: tl.constexpr, C: tl.constexpr, NORM: tl.constexpr
+):
     """Write the gradient of a gate's pre-activation from that of its normalised form."""
     if NORM:
         weight = tl.load(norms + GATE * C + c, mask=c < C, other=0.0).to(tl.float32)
@@ -227,6 +232,7 @@ def settle(
         EPS,
         tall,
         wide,
+        num_warps=WARPS,
     )
     return y, after
 
@@ -277,6 +283,7 @@ def settle_backward(
         EPS,
         tall,
         wide,
+        num_warps=WARPS,
     )
     return d_x, d_state
 
