@@ -31,6 +31,8 @@ _log = logging.getLogger("train_zoo")
 ROOT = Path(__file__).resolve().parent.parent
 LEAVING = 12.0
 """Seconds before the end when all that still runs is ended."""
+OVERHEAD = 20.0
+"""Seconds of a job beside its training: preparing, the probe, evaluating."""
 MOST_FAULTS = 12
 """Workers that are replaced when they fail."""
 TAR_BYTES, TARS = 15 * 2**20, 4
@@ -49,12 +51,13 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--shard", type=int, help="sweeps per shard")
     told.add_argument("--links", type=int, default=12)
     told.add_argument("--step", type=float, default=1e-3)
+    told.add_argument("--retry", type=int, default=5, help="as of brainbench stimuli; 1 leaves doubtful sweeps out")
     told.add_argument("--minutes", type=float, default=9.4, help="from start to end, packing included")
     told.add_argument("--end", type=float, help="the same as seconds since 1970: $(($(date +%%s) + 570)) of the shell")
     told.add_argument("--last", action="store_true", help="no later call will go on: end every schedule in this one")
     told.add_argument("--small-seconds", type=float, default=130.0, help="training time of a small job of weight 1")
     told.add_argument("--full-seconds", type=float, default=200.0, help="training time of a full-size job of weight 1")
-    told.add_argument("--places", type=int, default=3, help="processes on a GPU, or on the processor")
+    told.add_argument("--places", "--together", type=int, default=3, help="processes on a GPU, or on the processor")
     told.add_argument("--learning-rate", type=float, help="instead of the jobs' own")
     told.add_argument("--batch", type=int, default=256, help="sweeps per step")
     told.add_argument("--precision", default="auto", help="bf16, float32, or what is safe and fast on the device")
@@ -100,6 +103,7 @@ def campaign(args: argparse.Namespace) -> None:
     (args.work / "claims").mkdir()
     if args.resume:
         unpack(args.resume, args.work)
+    project(args, max(1, gpus))
     scorers = Scorers(args)
     scorers.start(args.work / "warm-up")
     if args.data is None:
@@ -133,6 +137,16 @@ def campaign(args: argparse.Namespace) -> None:
     for result in pack(args.work, args.out):
         print(row(result))
     _log.info("everything after %.0f s", time.time() - started)
+
+
+def project(args: argparse.Namespace, gpus: int) -> None:
+    """Say which jobs are still to be trained and how long they may take together."""
+    open_jobs = [job for job in chosen_jobs(args) if not (args.work / "jobs" / job.name / "result.json").is_file()]
+    seconds = 0.0
+    for job in open_jobs:
+        most = job.weight * (args.full_seconds if job.full else args.small_seconds)
+        seconds += OVERHEAD + (0.0 if job.objective == "untrained" else most)
+        _log.info("%6.0f s after the data, at most: %s", seconds / (gpus * args.places), job.name)
 
 
 def start_worker(args: argparse.Namespace, place: int, gpu: int | None) -> subprocess.Popen[bytes]:
@@ -219,6 +233,7 @@ def make_plan(args: argparse.Namespace, gpus: int) -> Any:
         device="cuda" if gpus else "cpu",
         limit=args.limit,
         sample=args.sample,
+        retry=args.retry,
         shard_size=args.shard or (3120 if gpus else None),
     )
     return GenerationPlan(args.recipe, GRIDS[args.recipe], resolve_objects([args.objects], surfaces=True), settings)

@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from results import table, write_section
 
+from brainbench.models._gpu import plain
 from brainbench.models.export import export_model, read_onnx
 from brainbench.models.extract import evaluating
 from brainbench.models.packing import packed
@@ -193,7 +194,7 @@ def time_one(options: argparse.Namespace, device: torch.device) -> tuple[float, 
     if device.type == "cuda":
         torch.backends.cudnn.benchmark = True
     model = load_model(options.model).to(device).train()
-    recorded = how in ("captured", "graphs") and device.type == "cuda" and peer == "ours"
+    recorded = how in ("captured", "plain", "graphs") and device.type == "cuda" and peer == "ours"
     if device.type == "cuda" and peer == "ours":
         model = model.to(memory_format=torch.channels_last)
     fuse(model, how in ("fused", "graphs"))
@@ -334,7 +335,7 @@ def main() -> None:
         "--who",
         default="loop:float32:off,loop:bf16:off,ours:float32:off,ours:bf16:off",
         help="comma-separated PEER:PRECISION:COMPILED with loop|ours, float32|bf16, off|parts|default|graphs, for ours "
-        "also captured (recorded) and fused (cells compiled); graphs is both",
+        "also captured (recorded), plain (recorded, without our kernels) and fused (cells compiled); graphs is both",
     )
     parser.add_argument("--limit", type=float, default=240.0, help="seconds that one row may take")
     parser.add_argument("--one", help=argparse.SUPPRESS)
@@ -342,7 +343,10 @@ def main() -> None:
     options = parser.parse_args()
     device = torch.device(options.device)
     if options.one:
-        print(json.dumps(time_one(options, device)))
+        peer, _, how = options.one.split(":")
+        # A peer is what anybody would write with PyTorch.
+        with plain() if peer == "loop" or how == "plain" else nullcontext():
+            print(json.dumps(time_one(options, device)))
         return
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} threads"
     body = f"{name}. " + PARTS[options.part](options, device)

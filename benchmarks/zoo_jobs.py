@@ -128,18 +128,20 @@ def _jobs() -> Iterator[Job]:
             yield Job(model, objective, ship=True)
     for model in SMALL:
         yield Job(model, "untrained")
-    for model, objective in FULL[:3]:
-        yield Job(model, objective, epochs=FULL_EPOCHS)
-        yield Job(model, "untrained")
-    for model in VARIED:
-        for objective in ("simclr", "supervised"):
-            for augmentation in ("none", "thesis", "image"):
-                yield Job(model, objective, augmentation=augmentation)
-            yield Job(model, objective, masking=0.75)
+    yield from _varied(VARIED[0])
     for seed in range(1, SEEDS):
         for model in SMALL:
             for objective in ("supervised", "simclr", "untrained"):
                 yield Job(model, objective, seed=seed)
-    for model, objective in FULL[3:]:
+    for model, objective in FULL:
         yield Job(model, objective, epochs=FULL_EPOCHS)
         yield Job(model, "untrained")
+    for model in VARIED[1:]:
+        yield from _varied(model)
+
+
+def _varied(model: str) -> Iterator[Job]:
+    for objective in ("supervised", "simclr"):
+        for augmentation in ("none", "thesis", "image"):
+            yield Job(model, objective, augmentation=augmentation)
+        yield Job(model, objective, masking=0.75)

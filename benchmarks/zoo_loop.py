@@ -136,7 +136,8 @@ class Trainer:
         self.trained = [parameter for parameter in self.learner.parameters() if parameter.requires_grad]
         self.augmentation = Augmentation(self.config.augmentation, self.config.masking)
         self.generator = torch.Generator(device).manual_seed(job.seed)
-        self._checked = min(EVALUATED, len(data.validation))
+        # A contrastive loss depends on how many sweeps are compared, and of which classes they are.
+        self._checked = min(EVALUATED if self.learner.supervised else batch, len(data.validation))
         whole = max(1, len(data.train) // batch)
         self.steps, self.checks = min(steps or whole, whole), math.ceil(len(data.validation) / self._checked)
         options: dict[str, Any] = {"device": device}
@@ -146,7 +147,8 @@ class Trainer:
         self.losses = torch.zeros(self.steps, **options)
         self.checked = torch.zeros(1, dtype=torch.long, **options)
         rows = torch.arange(self.checks * self._checked, **options).view(self.checks, -1)
-        self.check_rows, self.check_weights = rows % len(data.validation), (rows < len(data.validation)).float()
+        mixed = torch.randperm(len(data.validation), generator=torch.Generator().manual_seed(job.seed)).to(device)
+        self.check_rows, self.check_weights = mixed[rows % len(mixed)], (rows < len(mixed)).float()
         self.found = torch.zeros((), **options)
         self.epoch, self.best, self.best_epoch = 0, math.inf, None
         self.kept: dict[str, torch.Tensor] = {}

@@ -79,6 +79,22 @@ def accuracy_table(results: list[dict[str, Any]]) -> str:
     return table(head, rows)
 
 
+def data_text(results: list[dict[str, Any]]) -> str:
+    """Return which data the networks were trained on; where there are several sets, which networks on which."""
+    groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for result in results:
+        groups[result["data"]["hash"]].append(result)
+    told = []
+    for name, found in groups.items():
+        data = found[0]["data"]
+        told.append(
+            f"Data {name}: {data['train']:,} sweeps to train, {data['validation']:,} to validate, {data['test']:,} of "
+            f"other objects to test; {data['left_out']:,} unstable ones left out"
+            + (f" ({', '.join(sorted(result['name'] for result in found))})." if len(groups) > 1 else ".")
+        )
+    return " ".join(told)
+
+
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
     """Draw loss and validation of the networks of seed 0 with the usual augmentation."""
     import matplotlib as mpl
@@ -118,11 +134,10 @@ def main() -> None:
     parser.add_argument("--note", default="", help="a sentence for the section: the machine, how long")
     args = parser.parse_args()
     results, curves = read(args.folders, "results.jsonl"), read(args.folders, "curves.jsonl")
-    data = results[0]["data"]
+    classes = results[0]["data"]["classes"]
     text = (
-        f"{data['classes']} classes (chance {100 / data['classes']:.1f} %), data {data['hash']}: {data['train']:,} "
-        f"sweeps to train, {data['validation']:,} to validate, {data['test']:,} of other objects to test; "
-        f"{data['left_out']:,} unstable ones left out. {args.note}\n\n{accuracy_table(results)}\n\nSupervised "
+        f"{classes} classes (chance {100 / classes:.1f} %). {data_text(results)} {args.note}\n\n"
+        f"{accuracy_table(results)}\n\nSupervised "
         "networks answer by their own decoder, others and twins through a linear probe. Intervals: accuracy Wilson "
         "95 %, score over the animals of the (synthetic) demo recordings.\n\n"
     )

@@ -9,14 +9,18 @@ draw than normal ones, which is felt at 38 M parameters.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import nn
 from torch.nn import functional
 
 from brainbench.errors import UsageError, unknown_name
+from brainbench.models import _gpu
+
+if TYPE_CHECKING:
+    from brainbench.models._gpu.convolution import Tape
 
 RECTIFIER_GAIN = math.sqrt(2.0)
 
@@ -130,6 +134,8 @@ class Conv2d(nn.Conv2d):
         self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
         self._extra: tuple[int, int, int, int] | None = None
         self._packed: Packed | None = None
+        self.tape: Tape | None = None
+        """Where the steps of a pass leave what the gradient of the weights needs; None outside of such a pass."""
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":
             left, right, top, bottom = same_padding(kernel_size)
@@ -147,6 +153,35 @@ class Conv2d(nn.Conv2d):
         if self._packed is not None and len(input) == 1:
             return self._convolve_packed(input, self._packed)
         return self._convolve(input, self.weight, self.bias)
+
+    def join(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Convolve inputs [B, C, H, W] as if their channels lay side by side, in the first one's precision."""
+        if self.tape is not None:
+            return self.tape.convolve(inputs)
+        if self.joins(*inputs):
+            from brainbench.models._gpu.convolution import convolve
+
+            return convolve(self, inputs)
+        first = inputs[0]
+        # In mixed precision a memory is single and the convolution half: what it reads is rounded here, once.
+        return self(first if len(inputs) == 1 else torch.cat([first, *(x.to(first.dtype) for x in inputs[1:])], 1))
+
+    def joins(self, *inputs: torch.Tensor) -> bool:
+        """Return whether kernels of our own compute :meth:`join` here: on a tape, or where there is no gradient."""
+        if self.tape is not None:
+            return True
+        learns = torch.is_grad_enabled() and any(item.requires_grad for item in (self.weight, *inputs))
+        return not learns and self.fits(inputs[0])
+
+    def fits(self, x: torch.Tensor) -> bool:
+        """Return whether kernels of our own know this layer and apply to ``x``."""
+        return _two(self.stride) == (1, 1) and _gpu.usable(x)
+
+    @property
+    def around(self) -> tuple[int, int, int, int]:
+        """(left, right, top, bottom) zeros around the input."""
+        top, left = _two(self.padding)
+        return self._extra or (left, left, top, top)
 
     def pack(self, dtype: torch.dtype) -> None:
         """Keep a copy of the weights in the order in which one stimulus is multiplied with them fastest, on the CPU."""

@@ -33,6 +33,9 @@ class NodeModule(nn.Module):
 
     def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
         """Return what the memory sees [B, ...]."""
+        if isinstance(self.operation, Conv2d) and not (self.training and self.dropout.p):
+            fitted = [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
+            return self.before(self.operation.join(fitted))
         x = self.dropout(self.gather(inputs))
         if isinstance(self.operation, Linear):
             x = x.flatten(1)

@@ -15,7 +15,7 @@ Schmidhuber 1997, Gers et al. 2000. Order and names of the gates follow PyTorchT
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import torch
 from torch import nn
@@ -23,6 +23,9 @@ from torch import nn
 from brainbench.errors import UsageError
 from brainbench.models._layers import Conv2d, pair
 from brainbench.models._tnn_state import load_named
+
+if TYPE_CHECKING:
+    from brainbench.models._gpu.gates import GateTape
 
 FORGET_BIAS = 1.0
 
@@ -163,7 +166,12 @@ class GatedCell(Cell):
         return Conv2d(self.in_channels + self.out_channels, gates * self.out_channels, kernel_size=size, gain=1.0)
 
     def project(self, x: torch.Tensor) -> Projected:
-        """Return the input's share of the fused convolution, biases included, for inputs [N, C, H, W]."""
+        """Return the input's share of the fused convolution, biases included, for inputs [N, C, H, W].
+
+        Nothing where kernels of our own join input and memory without a copy of either (:mod:`brainbench.models._gpu`).
+        """
+        if self.conv.joins(x):
+            return ()
         return (self.conv.share(x, 0, use_bias=True),)
 
     def forward(
@@ -190,8 +198,7 @@ class GatedCell(Cell):
     def _fused(self, conv: Conv2d, x: torch.Tensor, memory: torch.Tensor, projected: Projected) -> torch.Tensor:
         if projected:
             return projected[0] + conv.share(memory, self.in_channels, use_bias=False)
-        # In mixed precision the memory is single and the convolution half: what it reads is rounded here, once.
-        return conv(torch.cat((x, memory.to(x.dtype)), 1))
+        return conv.join((x, memory))
 
     def _normalised(self, fused: torch.Tensor, names: tuple[str, ...]) -> list[torch.Tensor]:
         parts = fused.chunk(len(names), 1)
@@ -233,6 +240,25 @@ class IntersectionRNN(GatedCell):
             )
         super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
 
+        self.tape: GateTape | None = None
+        """Where the steps of a pass leave the gradients of the norms; None outside of such a pass."""
+
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W]."""
+        state = self._check(x, state)
+        fused = self._fused(self.conv, x, state, projected[:1])
+        if self.tape is not None or (not projected and self.conv.joins(x)):
+            from brainbench.models._gpu.gates import settle
+
+            return settle(self, fused, x, state)
+        return self.settle(fused, x, state)
+
+    def norm(self, gate: str) -> ChannelNorm:
+        """Return the norm of a gate."""
+        return cast(ChannelNorm, self.norms[gate])
+
     def settle(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
         keep, candidate, through, output = self._normalised(fused, self.gates)
@@ -268,7 +294,9 @@ class GRU(GatedCell):
             self.norms["c"] = ChannelNorm(out_channels)
 
     def project(self, x: torch.Tensor) -> Projected:
-        """Return the input's shares of both convolutions, biases included, for inputs [N, C, H, W]."""
+        """Return the input's shares of both convolutions, biases included, for inputs [N, C, H, W]; or nothing."""
+        if self.conv.joins(x):
+            return ()
         return self.conv.share(x, 0, use_bias=True), self.candidate.share(x, 0, use_bias=True)
 
     def forward(

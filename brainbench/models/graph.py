@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -20,11 +20,13 @@ import torch
 from torch import nn
 
 from brainbench.errors import UsageError, unknown_name
+from brainbench.models import _gpu
 from brainbench.models._layers import Conv2d, Linear
 from brainbench.models._node import NodeModule
 from brainbench.models._tnn_config import read_graph
 from brainbench.models._tnn_state import check_named, copy_named
 from brainbench.models._unrolling import delays, needed_steps
+from brainbench.models.cells import GatedCell, IntersectionRNN
 from brainbench.models.graph_spec import GraphSpec, Shape, Unroll, check_unroll
 
 _log = logging.getLogger(__name__)
@@ -330,6 +332,34 @@ class _Pass:
 
     def run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
         """Compute every group of nodes in turn; drop what no later one reads."""
+        if torch.is_grad_enabled() and _gpu.usable(self.x):
+            from brainbench.models._gpu.gates import recorded
+
+            with recorded(self._tapes()):
+                return self._run(wanted)
+        return self._run(wanted)
+
+    def _tapes(self) -> Iterator[tuple[nn.Module, Any]]:
+        """Yield what convolutions and gates write down for their gradients."""
+        from brainbench.models._gpu.convolution import Tape
+        from brainbench.models._gpu.gates import GateTape
+
+        for name, node in self.graph._items():
+            first, stop = self.steps[name]
+            operation, memory = node.operation, node.memory
+            if stop == first:
+                continue
+            stimuli = self.batch * (stop - first)
+            if isinstance(operation, Conv2d) and operation.fits(self.x):
+                yield operation, Tape(operation, node.grid, stimuli)
+            if isinstance(memory, GatedCell):
+                grid = self.graph._memory_grid(name)
+                for conv in [part for part in memory.modules() if isinstance(part, Conv2d)]:
+                    yield conv, Tape(conv, grid, stimuli)
+            if isinstance(memory, IntersectionRNN):
+                yield memory, GateTape([memory.norm(gate) for gate in memory.gates] if memory.norms else [])
+
+    def _run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
         groups = self.graph._groups
         for position, group in enumerate(groups):
             later = {name for other in groups[position + 1 :] for name in other}

@@ -1,7 +1,8 @@
 """A causal network as one function of a step and a flat state, for control loops and exported files.
 
 (obs [B, C, H, W] in SI, h_in [B, S]) → (features [B, F], h_out [B, S]). A state of zeros is the state before the first
-step, and rows are independent: an environment is reset by zeroing its row. Letters: B batch, S numbers of state.
+step, and rows are independent: an environment is reset by zeroing its row. In which order a row's numbers lie is not
+told, and differs between CUDA and the processor. Letters: B batch, S numbers of state.
 """
 
 from __future__ import annotations
@@ -57,12 +58,26 @@ class StreamingStep(nn.Module):
     def forward(self, obs: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (features [B, F], h_out [B, S])."""
         sizes = [math.prod(shape) for shape in self.shapes]
-        parts = [part.reshape(-1, *shape) for part, shape in zip(h_in.split(sizes, 1), self.shapes, strict=True)]
+        # What works fastest on CUDA, and no part of the contract of an exported file.
+        innermost = h_in.is_cuda and not torch.compiler.is_exporting()
+        parts = [_part(part, shape, innermost) for part, shape in zip(h_in.split(sizes, 1), self.shapes, strict=True)]
         count = len(self.encoder.shapes)
         features, before = self.encoder(self.model.normaliser(obs), parts[:count])
         features, after = self.attender(features, parts[count:])
         kept = [*before, *after] or parts
-        return features, torch.cat([part.flatten(1) for part in kept], 1)
+        return features, torch.cat([_flat(part, innermost) for part in kept], 1)
+
+
+def _part(flat: torch.Tensor, shape: tuple[int, ...], innermost: bool) -> torch.Tensor:
+    """Return a part of the state [B, *shape] of its numbers [B, N]; of maps, channels may lie innermost among them."""
+    if innermost and len(shape) == 3:
+        channels, rows, columns = shape
+        return flat.unflatten(1, (rows, columns, channels)).permute(0, 3, 1, 2)
+    return flat.reshape(-1, *shape)
+
+
+def _flat(part: torch.Tensor, innermost: bool) -> torch.Tensor:
+    return (part.permute(0, 2, 3, 1) if innermost and part.ndim == 4 else part).flatten(1)
 
 
 class _Stateless(nn.Module):

@@ -38,6 +38,7 @@ from brainbench.models.training.batches import Batches, Data
 from brainbench.models.training.captured import Gradients, fuse
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.doubts import doubts
 from brainbench.models.training.logs import RunLog
 from brainbench.models.training.probe import fit_probe
 from brainbench.models.training.processes import Processes, processes
@@ -148,6 +149,8 @@ class _Run:
         if (out / STATE).is_file():
             self._restore()
         self.log = RunLog(out, step=self.step, active=where.first)
+        for doubt in doubts(config, self.model) if where.first else ():
+            _log.warning("%s", doubt)
 
     def run(self, allowed: float) -> TrainingResult:
         steps = len(self.batches)
@@ -220,7 +223,9 @@ class _Run:
 
     def _validate(self, loss: float) -> float:
         """Return what the best model has least of: 1 − accuracy, or the self-supervised loss."""
-        batches = self._batches("validation", shuffle=False, part=self.config.objective != "supervised")
+        # The other sweeps of a batch are what SimCLR compares with: in stored order, all would be of one class.
+        contrast = self.config.objective != "supervised"
+        batches = self._batches("validation", shuffle=contrast, part=contrast)
         if batches is None:
             return loss
         if self.config.objective == "supervised":
