@@ -34,8 +34,8 @@ ARMS: dict[str, dict[str, Any]] = {
     "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
 }
 _TAR = 15 << 20
-_PER_EVALUATION = 45.0
-"""Seconds kept for the evaluation of a student."""
+_PER_EVALUATION = 60.0
+"""Seconds kept for making the environments of a student and for its evaluation."""
 
 
 def put(out: Path, row: dict[str, Any]) -> None:
@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=300, help="after which each student stops")
     parser.add_argument("--episodes", type=int, default=512, help="per evaluation seed, at least")
     parser.add_argument("--end", type=float, help="second since 1970 by which all is done")
-    parser.add_argument("--reserve", type=float, default=_PER_EVALUATION, help="seconds of it kept for an evaluation")
+    parser.add_argument("--reserve", type=float, default=_PER_EVALUATION, help="of it, for start and evaluation")
     parser.add_argument("--every", type=int, default=25, help="iterations between rows")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("policy-students"))
