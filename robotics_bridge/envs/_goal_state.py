@@ -35,6 +35,8 @@ class GoalState:
         self.angle, self.angle_before, self.left = zeros(), zeros(), zeros()
         self.reached, self.missed = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.count, self.rate, self.off_axis, self.turned = zeros(), zeros(), zeros(), zeros()
+        self.turned_held = zeros()
+        """Rotation [B] about the commanded axis of this episode while anything touched the object (rad)."""
         self.allowed_off_axis = float(getattr(task.goal, "allowed_off_axis", float("inf")))
         self._axis = None
         if self.goal is not None and self.goal.axis is not None:
@@ -51,7 +53,7 @@ class GoalState:
         import torch
 
         self.previous.copy_(torch.where(mask.unsqueeze(1), quat, self.previous))
-        for name in ("count", "rate", "off_axis", "turned"):
+        for name in ("count", "rate", "off_axis", "turned", "turned_held"):
             getattr(self, name).masked_fill_(mask, 0.0)
         for name in ("reached", "missed"):
             getattr(self, name).masked_fill_(mask, value=False)
@@ -59,13 +61,14 @@ class GoalState:
         if self.goal is not None:
             self._set(mask, self.goal.first(quat, draw(2, 0.0, 1.0)), quat, draw)
 
-    def update(self, quat: torch.Tensor) -> None:
-        """Judge the orientations [B, 4] after a control step."""
+    def update(self, quat: torch.Tensor, held: torch.Tensor) -> None:
+        """Judge the orientations [B, 4] after a control step, in which objects [B] bool were touched or not."""
         step = multiply(quat, conjugate(self.previous))
         self.previous.copy_(quat)
         if self._turn is not None:
             twist, _ = twist_and_swing(step, rotate(quat, self._turn))
             self.turned += twist
+            self.turned_held += twist * held
             place = self._step % self._ring.shape[0]
             self.turned_before.copy_(self._ring.index_select(0, place)[0])
             self._ring.index_copy_(0, place, self.turned.unsqueeze(0))
@@ -78,6 +81,7 @@ class GoalState:
         if self._axis is not None:
             twist, _ = twist_and_swing(step, self._axis)
             self.rate.copy_(twist / self._dt)
+            self.turned_held += twist * held
             _, swing = twist_and_swing(error, self._axis)
             self.off_axis.copy_(swing)
         self.left -= self._dt
@@ -137,10 +141,11 @@ class GoalState:
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned."""
         for name, value in self._memory().items():
-            value.copy_(values[name])
+            # States of before this was counted lack it.
+            value.copy_(values[name] if name != "turned_held" else values.get(name, value))
         self._step.copy_(values["step"])
 
     def _memory(self) -> dict[str, torch.Tensor]:
         names = ("quat", "previous", "angle", "angle_before", "left", "reached", "missed", "count", "rate", "off_axis")
-        own = {name: getattr(self, name) for name in (*names, "turned")}
+        own = {name: getattr(self, name) for name in (*names, "turned", "turned_held")}
         return {**own, "ring": self._ring, **self.curriculum()}

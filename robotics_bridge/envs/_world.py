@@ -46,6 +46,10 @@ class World:
             raise UsageError("C MuJoCo runs on the processor: use device='cpu', or engine='warp'.")
         self.model = models[0]
         self.num_envs = num_envs
+        free = int(mujoco_module().mjtJoint.mjJNT_FREE)
+        starts = zip(self.model.jnt_bodyid, self.model.jnt_type, self.model.jnt_dofadr, strict=True)
+        # A body whose centre of mass is not its origin is not simple: its inertia depends on how it lies.
+        self._free = {int(b): int(d) for b, kind, d in starts if kind == free and self.model.body_simple[b]}
         order = np.arange(num_envs) % len(models)
         self.shape_of = order
         """Number [B] of the shape that each environment has."""
@@ -126,7 +130,7 @@ class World:
             data = self.engine.data[env]
             mujoco.mj_resetData(self.engine.model_of(env), data)
             data.qpos[:] = self.qpos[env].numpy()
-            self.engine.set_fields(env, {name: value[env].numpy() for name, value in self.fields.items()})
+            self._write_fields(env)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return everything that the next step depends on."""
@@ -152,9 +156,20 @@ class World:
             self._time.copy_(values["time"])
         else:
             for env in range(self.num_envs):
-                self.engine.set_fields(env, {name: value[env].numpy() for name, value in self.fields.items()})
+                self._write_fields(env)
             self.engine.set_integration_state(values["integration"].numpy())
         self.refresh()
+
+    def _write_fields(self, env: int) -> None:
+        values = {name: value[env].numpy() for name, value in self.fields.items()}
+        # C MuJoCo takes the inertia of free bodies from here, not from their masses.
+        inertia = np.array(self.engine.model_of(env).dof_M0)
+        for body, first in self._free.items():
+            inertia[first : first + 3], inertia[first + 3 : first + 6] = (
+                values["body_mass"][body],
+                values["body_inertia"][body],
+            )
+        self.engine.set_fields(env, {**values, "dof_M0": inertia})
 
     def _pull(self) -> None:
         qpos, qvel = self.qpos.numpy(), self.qvel.numpy()

@@ -235,7 +235,8 @@ class Env:
         Returns:
             Observations by group (the next step overwrites ``tactile``), reward [B], terminated [B] and truncated [B]
             (bool), and a dictionary with ``time_outs`` (truncated), ``diverged`` [B], of ended episodes ``metric``,
-            ``return`` and ``steps`` [B], and ``final_observations`` if asked for.
+            ``return``, ``steps``, ``goals`` reached and ``turned`` [B] (rotation about the commanded axis while
+            anything touched the object, rad), and ``final_observations`` if asked for.
 
         Raises:
             UsageError: the action has another shape.
@@ -375,6 +376,7 @@ class Env:
         truncated = (self.episode_length_buf >= self.max_episode_length) & ~terminated
         done = terminated | truncated
         info = {"time_outs": truncated, "diverged": diverged, "log": self._account(parts, done, diverged)}
+        info |= {"goals": self.goals.count.clone(), "turned": self.goals.turned_held.clone()}
         info |= {"metric": self.metric.clone(), "return": self._return.clone(), "steps": self._steps.clone()}
         self.goals.account(done)
         self.goals.advance(self._object_quat(), self._draw)
@@ -399,7 +401,8 @@ class Env:
 
     def _moment(self) -> Moment:
         quat = self._object_quat()
-        self.goals.update(quat)
+        force = self.contacts.on_object(self.rows, self.target)
+        self.goals.update(quat, force > 0)
         goals, world = self.goals, self.world
         pose, rows = self.object_pose, self.rows
         speed = world.qvel[:, self._object_speeds].unflatten(1, (-1, 6))[rows, self.target]
@@ -409,7 +412,7 @@ class Env:
             start_joints=self._start_joints, power=self.drives.power.sum(dim=1), action=self.action,
             last_action=self.last_action, object_position=pose[rows, self.target, :3], object_quat=quat,
             object_velocity=speed[:, :3], object_spin=rotate(quat, speed[:, 3:]), start_position=self._start_position,
-            object_force=self.contacts.on_object(rows, self.target), tip_force=self.tip_force,
+            object_force=force, tip_force=self.tip_force,
             surface_distance=self.surface_distance, step_count=self._steps, goal_angle=goals.angle,
             previous_goal_angle=goals.angle_before, reached=goals.reached, missed=goals.missed,
             goals_reached=goals.count, axis_rate=goals.rate, off_axis=goals.off_axis,

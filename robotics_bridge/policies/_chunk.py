@@ -80,6 +80,7 @@ class ChunkStep:
     def _try(self) -> bool:
         graph = torch.cuda.CUDAGraph()
         torch.cuda.synchronize()
+        self._optimizer.zero_grad(set_to_none=True)
         try:
             with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 self._result = self._step(self._inputs)

@@ -52,7 +52,7 @@ class DistillResult:
     """How a run ended."""
 
     status: Literal["finished", "stopped", "diverged"]
-    """``stopped``: the time allowed was over; start it again to go on."""
+    """``stopped``: the time or the iterations allowed were over; start it again to go on."""
     reason: str
     folder: Path
     iterations: int
@@ -70,6 +70,7 @@ def distill(
     env: Any,
     teacher: Teacher,
     stop_after: float | None = None,
+    stop_at: int | None = None,
     graphs: bool = True,
     progress: Progress | None = None,
 ) -> DistillResult:
@@ -81,6 +82,7 @@ def distill(
         env: Environment of :func:`robotics_bridge.tasks.make` with the configuration's observation type.
         teacher: Of :func:`robotics_bridge.policies.teacher.load_teacher`.
         stop_after: Save the state and return after so many seconds.
+        stop_at: Save the state and return after so many iterations in all.
         graphs: On CUDA, record a step of learning and replay it.
         progress: Called with (iterations done, iterations in all, what).
 
@@ -100,7 +102,8 @@ def distill(
         if devices:
             torch.set_float32_matmul_precision("high")
         try:
-            return run.run(math.inf if stop_after is None else stop_after, progress or (lambda done, total, what: None))
+            allowed = math.inf if stop_after is None else stop_after
+            return run.run(allowed, stop_at, progress or (lambda done, total, what: None))
         finally:
             torch.set_float32_matmul_precision(before)
             run.log.close()
@@ -158,7 +161,7 @@ class _Run:
             self._restore()
         self.log = RunLog(out, step=self.iteration)
 
-    def run(self, allowed: float, progress: Progress) -> DistillResult:
+    def run(self, allowed: float, stop_at: int | None, progress: Progress) -> DistillResult:
         started, total = time.monotonic(), self.config.iterations or 0
         status: Literal["finished", "stopped", "diverged"] = "finished"
         reason = ""
@@ -176,10 +179,12 @@ class _Run:
             progress(self.iteration, total, "distilling")
             last = self.iteration == total
             late = time.monotonic() - started > allowed and not last
-            if last or late or self.iteration % self.config.save_interval == 0:
+            enough = stop_at is not None and self.iteration >= stop_at and not last
+            if last or late or enough or self.iteration % self.config.save_interval == 0:
                 self._save()
-            if late:
-                status, reason = "stopped", f"{allowed:g} seconds were over."
+            if late or enough:
+                why = f"{allowed:g} seconds were over." if late else f"{stop_at} iterations were asked for."
+                status, reason = "stopped", why
                 break
         seconds = time.monotonic() - started
         return DistillResult(status, reason, self.out, self.iteration, self.loss, seconds)

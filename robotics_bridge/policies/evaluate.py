@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from robotics_bridge.envs.env import Env
 
+QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
+"""What is known of each episode beside its success."""
 AGENTS = ("zero", "random")
 """Agents that every trained one is held against."""
 _Z = 1.959964
@@ -39,6 +41,14 @@ class Evaluation:
     """Episodes that ended because the physics diverged."""
     per_seed: tuple[float, ...]
     """Success rate of each seed."""
+    goals: tuple[float, ...] = ()
+    """Goals reached in each episode."""
+    turn_rate: tuple[float, ...] = ()
+    """Mean rate of each episode about the commanded axis (rad/s), counted while anything touched the object."""
+    seconds: tuple[float, ...] = ()
+    """Duration of each episode: until the object was dropped, or the longest there is."""
+    dropped: tuple[bool, ...] = ()
+    """Whether an ending of the task (not time, divergence or the last goal) ended the episode."""
 
     @property
     def success_rate(self) -> float:
@@ -53,13 +63,13 @@ class Evaluation:
         return max(middle - half, 0.0), min(middle + half, 1.0)
 
     def mean(self, name: str) -> tuple[float, float]:
-        """Return mean and half width of its 95 % interval of ``metric``, ``returns`` or ``lengths`` over episodes.
+        """Return mean and half width of its 95 % interval over episodes of one of :data:`QUANTITIES`.
 
         Raises:
             UsageError: there is no such quantity.
         """
-        if name not in ("metric", "returns", "lengths"):
-            raise unknown_name("quantity of an episode", name, ("metric", "returns", "lengths"))
+        if name not in QUANTITIES:
+            raise unknown_name("quantity of an episode", name, QUANTITIES)
         values = [float(value) for value in getattr(self, name)]
         mean = sum(values) / len(values)
         spread = sum((value - mean) ** 2 for value in values) / max(len(values) - 1, 1)
@@ -71,7 +81,7 @@ class Evaluation:
         facts: dict[str, Any] = {"agent": self.agent, "task": self.task, "episodes": len(self.success)}
         facts |= {"seeds": list(self.seeds), "success_rate": self.success_rate, "success_interval": [low, high]}
         facts |= {"success_per_seed": list(self.per_seed), "diverged": self.diverged}
-        for name in ("metric", "returns", "lengths"):
+        for name in (name for name in QUANTITIES if getattr(self, name)):
             facts[name], facts[f"{name}_half_width"] = self.mean(name)
         return facts
 
@@ -127,6 +137,7 @@ def evaluate(
         raise UsageError(f"An evaluation needs at least one episode and one seed; received {episodes} and {seeds}.")
     each = math.ceil(episodes / env.num_envs)
     forget = getattr(policy, "reset", None)
+    limit = None if env.task.goal is None else env.task.goal.limit
     rows: list[list[Any]] = []
     rates = []
     for index, number in enumerate(seeds):
@@ -142,9 +153,10 @@ def evaluate(
             done = terminated | truncated
             if forget is not None:
                 forget(done)
-            table = torch.stack(
-                (info["metric"], info["return"], info["steps"].float(), info["diverged"].float()), dim=1
-            )
+            columns = [info[name].float() for name in ("metric", "return", "steps", "diverged", "goals", "turned")]
+            full = info["goals"] >= (limit or math.inf)
+            dropped = terminated & ~info["diverged"] & ~full
+            table = torch.stack((*columns, dropped.float()), dim=1)
             found += table[done & (left > 0)].tolist()
             left -= done.long()
         threshold = env.task.success.threshold
@@ -152,9 +164,11 @@ def evaluate(
         rows += found
         if progress:
             progress(index + 1, len(seeds), f"evaluating {name}")
-    metric, returns, lengths, diverged = zip(*rows, strict=True)
+    metric, returns, lengths, diverged, goals, turned, dropped = zip(*rows, strict=True)
+    seconds = tuple(n * env.step_dt for n in lengths)
     return Evaluation(
         agent=name, task=env.task.name, seeds=seeds, success=tuple(m >= env.task.success.threshold for m in metric),
         metric=metric, returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
-        per_seed=tuple(rates),
+        per_seed=tuple(rates), goals=goals, seconds=seconds, dropped=tuple(map(bool, dropped)),
+        turn_rate=tuple(angle / time for angle, time in zip(turned, seconds, strict=True)),
     )  # fmt: skip

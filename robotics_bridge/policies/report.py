@@ -1,15 +1,17 @@
 """Compare distilled students: success with intervals over seeds, per task, observation type and encoder.
 
-A student's folder holds ``evaluation.json``: a list of evaluations, one per evaluation seed, each with ``seed``,
-``success`` and ``metric`` (one number per episode). Students that differ only in their training seed belong together.
+A student's folder holds ``evaluation.json``: a list of evaluations, one per evaluation seed, each with ``seed`` and, as
+one number per episode, ``success``, ``metric`` and, where hardly any episode succeeds, more telling: ``goals`` reached,
+``turn_rate`` about the commanded axis (rad/s), ``seconds`` until the object dropped, ``returns``. Students that differ
+only in their training seed belong together.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,11 @@ from brainbench.files import content_hash, provenance, read_json
 from brainbench.types import Interval, ModelCard, ResultRecord, Score, SubjectScore
 from robotics_bridge.policies.distill_config import DistillConfig
 
-EVALUATION = "evaluation.json"
+EVALUATION, AGENTS = "evaluation.json", "agents.json"
+"""Of a student; of the teacher and the agents that do nothing and anything, as ``policy evaluate --out`` writes it."""
+GRADED = ("metric", "goals", "turn_rate", "seconds", "returns", "dropped")
+"""Quantities of an episode beside its success."""
+_Z = 1.959964
 FEWEST_SEEDS = 3
 """Training seeds below which an interval says little about a new student."""
 
@@ -45,6 +51,10 @@ class StudentResult:
     """What the interval does not cover; empty if nothing."""
     difference: Interval | None = None
     """Of the success beyond that of ``none``, over training seeds in common."""
+    graded: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Quantity of :data:`GRADED` → mean over all episodes and half width of its 95 % interval over episodes."""
+    iterations: int | None = None
+    """Fewest that any of the students learned."""
 
     @property
     def value(self) -> float:
@@ -91,7 +101,7 @@ def _result(members: Sequence[tuple[DistillConfig, list[dict[str, Any]]]]) -> St
     members = sorted(members, key=lambda member: member[0].seed)
     shares = [float(np.mean([np.mean(item["success"]) for item in found])) for _, found in members]
     every = [item for _, found in members for item in found]
-    metrics = np.concatenate([np.asarray(item.get("metric") or [math.nan], dtype=float) for item in every])
+    graded = {name: found for name in GRADED if (found := _mean(every, name)) is not None}
     episodes = sum(len(item["success"]) for item in every)
     interval = t_interval(shares, f"t over {len(members)} training seeds")
     note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
@@ -101,9 +111,23 @@ def _result(members: Sequence[tuple[DistillConfig, list[dict[str, Any]]]]) -> St
         # Equal shares, such as no success at all, tell nothing of their spread.
         interval = wilson_interval(float(np.mean(shares)), episodes)
     seeds = tuple(config.seed for config, _ in members)
-    finite = metrics[np.isfinite(metrics)]
-    metric = float(finite.mean()) if len(finite) else math.nan
-    return StudentResult(members[0][0], seeds, tuple(shares), episodes, metric, interval, note)
+    metric = graded.get("metric", (math.nan, math.nan))[0]
+    learned = min((item["iterations"] for item in every if item.get("iterations")), default=None)
+    wanted = members[0][0].iterations
+    if learned is not None and wanted is not None and learned < wanted:
+        note = "; ".join(filter(None, (note, f"stopped after {learned} of {wanted} iterations")))
+    return StudentResult(
+        members[0][0], seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=learned
+    )
+
+
+def _mean(every: Sequence[Mapping[str, Any]], name: str) -> tuple[float, float] | None:
+    values = np.concatenate([np.asarray(item.get(name) or [], dtype=float) for item in every])
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+    return float(values.mean()), _Z * spread / math.sqrt(len(values))
 
 
 def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult:
@@ -134,7 +158,10 @@ def wilson_interval(share: float, count: int) -> Interval:
     return Interval(max(low, 0.0), min(high, 1.0), 0.95, f"Wilson over {count} episodes")
 
 
-COLUMNS = ("task", "hand", "touch", "placement", "resolution", "noise", "encoder", "seeds", "success", "over none")
+COLUMNS = (
+    "task", "hand", "touch", "placement", "resolution", "noise", "encoder", "iterations", "seeds", "success",
+    "over none", "goals", "rad/s", "s", "return",
+)  # fmt: skip
 
 
 def rows(results: Sequence[StudentResult]) -> list[list[str]]:
@@ -149,12 +176,52 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
             where = [config.placement, config.resolution, "noisy" if config.noisy else "clean", tactile.arm + learning]
         found.append(
             [
-                config.task, config.hand, config.observe, *where, str(len(result.seeds)),
+                config.task, config.hand, config.observe, *where,
+                "–" if result.iterations is None else str(result.iterations), str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
                 "–" if gain is None else f"{(gain.low + gain.high) / 2:+.3f}{_span(gain)}",
+                *(_pm(result.graded.get(name)) for name in ("goals", "turn_rate", "seconds", "returns")),
             ]
         )  # fmt: skip
     return found
+
+
+def _pm(value: tuple[float, float] | None) -> str:
+    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.1g}"
+
+
+def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
+    """Return what stands in the files :data:`AGENTS` below some folders: one summary per agent and task.
+
+    Raises:
+        DataError: a file is damaged.
+    """
+    found = []
+    for root in folders:
+        for path in sorted(Path(root).rglob(AGENTS)):
+            summaries = read_json(path)
+            if not isinstance(summaries, list) or not all(
+                isinstance(item, dict) and {"agent", "task", "success_rate", "success_interval"} <= set(item)
+                for item in summaries
+            ):
+                raise DataError(
+                    f"{str(path)!r} is no list of evaluated agents; brainbench policy evaluate --out writes one."
+                )
+            found += summaries
+    return found
+
+
+def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the table of agents that are no students as text, in the order of :data:`COLUMNS`."""
+    names = ("goals", "turn_rate", "seconds", "returns")
+    return [
+        [
+            item["task"], "–", Path(item["agent"]).name, *["–"] * 6,
+            "{:.3f} [{:.3f}, {:.3f}]".format(item["success_rate"], *item["success_interval"]), "–",
+            *(_pm((item[name], item[f"{name}_half_width"]) if name in item else None) for name in names),
+        ]
+        for item in agents
+    ]  # fmt: skip
 
 
 def _span(interval: Interval | None) -> str:
@@ -188,7 +255,13 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             provenance={
                 **provenance(),
                 "recordings": {"source": source, "content_hash": content_hash(protocol)},
-                "settings": {"episodes": result.episodes, "metric": result.metric, **config.plain()},
+                "settings": {
+                    "episodes": result.episodes,
+                    "metric": result.metric,
+                    "iterations_learned": result.iterations,
+                    **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
+                    **config.plain(),
+                },
                 "command": f"brainbench policy distill {config.task} --observe {config.observe}",
             },
         )
@@ -200,8 +273,8 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
     return found
 
 
-def draw(results: Sequence[StudentResult], path: str | Path) -> Path:
-    """Draw success with intervals, one panel per task and hand."""
+def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence[Mapping[str, Any]] = ()) -> Path:
+    """Draw success and rotation with intervals, two panels per task and hand; agents that are no students as lines."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -211,21 +284,35 @@ def draw(results: Sequence[StudentResult], path: str | Path) -> Path:
     for result in results:
         panels[result.config.task, result.config.hand].append(result)
     longest = max(len(found) for found in panels.values())
+    turning = any("turn_rate" in result.graded for result in results)
     figure, axes = plt.subplots(
-        1, len(panels), figsize=(1.2 + 4.6 * len(panels), 1.2 + 0.32 * longest), squeeze=False, layout="constrained"
-    )
-    for axis, ((task, hand), found) in zip(axes[0], panels.items(), strict=True):
+        len(panels), 1 + turning, figsize=(4.6 + 3.2 * turning, (1.3 + 0.34 * longest) * len(panels)), squeeze=False,
+        layout="constrained", sharey="row",
+    )  # fmt: skip
+    for row, ((task, hand), found) in zip(axes, panels.items(), strict=True):
+        others = [item for item in agents if item["task"] == task]
         for height, result in enumerate(reversed(found)):
-            low, high = (result.value,) * 2 if result.interval is None else (result.interval.low, result.interval.high)
+            interval = result.interval
+            low, high = (result.value,) * 2 if interval is None else (interval.low, interval.high)
             color = "0.55" if result.config.observe == "none" else "tab:blue"
-            axis.plot([low, high], [height, height], color=color, lw=1.5)
-            axis.plot(result.success, [height] * len(result.success), ".", color="0.75", ms=4)
-            axis.plot(result.value, height, "o", color=color, ms=5)
-        labels = [_label(result) for result in reversed(found)]
-        axis.set_yticks(range(len(found)), labels, fontsize=7)
-        axis.set_xlabel("share of successful episodes")
-        axis.set_title(f"{task}, {hand}", fontsize=9)
-        axis.spines[["top", "right"]].set_visible(False)
+            row[0].plot([low, high], [height, height], color=color, lw=1.5)
+            row[0].plot(result.success, [height] * len(result.success), ".", color="0.75", ms=4)
+            row[0].plot(result.value, height, "o", color=color, ms=5)
+            if "turn_rate" in result.graded:
+                mean, half = result.graded["turn_rate"]
+                row[1].plot([mean - half, mean + half], [height, height], color=color, lw=1.5)
+                row[1].plot(mean, height, "o", color=color, ms=5)
+        for axis, name in zip(row, ("success_rate", "turn_rate"), strict=False):
+            for number, item in enumerate(item for item in others if name in item):
+                label = Path(item["agent"]).name
+                axis.axvline(item[name], color=f"C{number + 1}", lw=1, ls=(0, (4, 2)), label=label)
+            axis.spines[["top", "right"]].set_visible(False)
+        row[0].set_yticks(range(len(found)), [_label(result) for result in reversed(found)], fontsize=7)
+        row[0].set_xlabel("share of successful episodes")
+        row[0].set_title(f"{task}, {hand}", fontsize=9)
+        row[-1].set_xlabel("share of successful episodes" if not turning else "rotation about the axis (rad/s)")
+        if others:
+            row[-1].legend(fontsize=7, frameon=False)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)

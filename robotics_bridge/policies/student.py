@@ -298,9 +298,9 @@ class TactilePolicy(MLPModel):
         if masks is None:
             if self._state is None:
                 self._state = self.zeros(len(obs[next(iter(self.shapes))]))[None]
-            latent, state = self.advance(obs, self._state[0])
+            latents, state = self.unroll({name: obs[name][None] for name in self.shapes}, self._state[0])
             self._state = state[None]
-            return latent
+            return latents[0]
         if hidden_state is None:
             raise UsageError("Sequences need the hidden state in which they begin.")
         state, found = hidden_state[0], []

@@ -17,7 +17,7 @@ from robotics_bridge.policies.calibration import HandCalibration
 from robotics_bridge.policies.distill import CONFIG, DistillResult, StudentPolicy, distill, load_student
 from robotics_bridge.policies.distill_config import DistillConfig
 from robotics_bridge.policies.encoders import ARMS
-from robotics_bridge.policies.report import EVALUATION
+from robotics_bridge.policies.report import EVALUATION, GRADED
 from robotics_bridge.policies.taxel_grid import TaxelGrid
 
 _log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class Student:
     folder: Path
     result: DistillResult
     evaluations: tuple[dict[str, Any], ...]
-    """One per evaluation seed; empty when the run is not finished."""
+    """One per evaluation seed; empty when none was asked for, or the run diverged."""
 
 
 def train_student(
@@ -46,17 +46,19 @@ def train_student(
     episodes: int = 100,
     seeds: Sequence[int] = SEEDS,
     stop_after: float | None = None,
+    stop_at: int | None = None,
     progress: Progress | None = None,
 ) -> Student:
-    """Distil a student, or go on with an interrupted one, and evaluate it when it is finished.
+    """Distil a student, or go on with an interrupted one, and evaluate it, also when its time is over.
 
     Args:
         config: What is distilled; ``teacher`` names a folder.
         out: The run's folder; a finished and evaluated run is left as it is.
         device: ``cpu``, or ``cuda`` for MuJoCo Warp.
-        episodes: Per evaluation seed; 0 evaluates nothing.
+        episodes: Per evaluation seed; 0 evaluates nothing. An evaluation says how many iterations the student had.
         seeds: Of the evaluation.
-        stop_after: Seconds after which the state is saved.
+        stop_after: Seconds after which the state is saved and learning stops.
+        stop_at: Iterations after which it does.
         progress: Called with (done, in all, what).
 
     Raises:
@@ -76,10 +78,15 @@ def train_student(
     )  # fmt: skip
     teacher = load_teacher(config.teacher, env)
     config = calibrated(config, env, teacher, out)
-    result = distill(config, out, env=env, teacher=teacher, stop_after=stop_after, progress=progress)
-    if result.status != "finished" or not episodes:
+    result = distill(
+        config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress
+    )  # fmt: skip
+    if result.status == "diverged" or not episodes:
         return Student(out, result, ())
-    return Student(out, result, evaluate_student(out, env, episodes=episodes, seeds=seeds, progress=progress))
+    found = evaluate_student(
+        out, env, episodes=episodes, seeds=seeds, iterations=result.iterations, progress=progress
+    )  # fmt: skip
+    return Student(out, result, found)
 
 
 def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:
@@ -114,9 +121,19 @@ def _measure(config: DistillConfig, env: Any, teacher: Any) -> HandCalibration:
 
 
 def evaluate_student(
-    folder: str | Path, env: Any, *, episodes: int = 100, seeds: Sequence[int] = SEEDS, progress: Progress | None = None
+    folder: str | Path,
+    env: Any,
+    *,
+    episodes: int = 100,
+    seeds: Sequence[int] = SEEDS,
+    iterations: int | None = None,
+    progress: Progress | None = None,
 ) -> tuple[dict[str, Any], ...]:
-    """Run whole episodes with a student and write ``evaluation.json``, one entry per seed."""
+    """Run whole episodes with a student and write ``evaluation.json``, one entry per seed.
+
+    An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
+    ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
+    """
     from robotics_bridge.policies.evaluate import evaluate
 
     student, _ = load_student(folder, device=str(env.device))
@@ -125,8 +142,9 @@ def evaluate_student(
         result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
         found.append(
             {
-                "seed": seed, "success": [float(item) for item in result.success], "metric": list(result.metric),
-                "returns": list(result.returns), "diverged": result.diverged,
+                "seed": seed, "success": [float(item) for item in result.success], "diverged": result.diverged,
+                "iterations": iterations,
+                **{name: [float(item) for item in getattr(result, name)] for name in GRADED},
             }
         )  # fmt: skip
         if progress is not None:

@@ -48,7 +48,8 @@ def distill(
     seed: SeedOption = 0,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,
     device: DeviceOption = "cpu",
-    stop_after: Annotated[float | None, typer.Option(help="Save and stop after so many seconds.")] = None,
+    stop_after: Annotated[float | None, typer.Option(help="Save, stop and evaluate after so many seconds.")] = None,
+    stop_at: Annotated[int | None, typer.Option(help="Likewise after so many iterations in all.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
@@ -70,7 +71,7 @@ def distill(
     folder = out or Path("students") / config.name
     with progress_bar() as progress:
         student = train_student(
-            config, folder, device=device, episodes=episodes, stop_after=stop_after, progress=progress
+            config, folder, device=device, episodes=episodes, stop_after=stop_after, stop_at=stop_at, progress=progress
         )
     facts = describe(student)
     lines = [f"{key}: {value}" for key, value in facts.items() if value not in ("", None)]

@@ -37,7 +37,12 @@ def evaluate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the result as JSON here too.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare agents over whole episodes: success rate with its 95 % interval, metric, return and length."""
+    """Compare agents over whole episodes: success rate with its 95 % interval, and what it does not tell.
+
+    Beside success stand the task's metric, the return, the rate of rotation about the commanded axis while anything
+    touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
+    task) ended.
+    """
     from brainbench.errors import UsageError
     from brainbench.files import write_json
     from robotics_bridge.policies.evaluate import evaluate as run
@@ -60,9 +65,12 @@ def evaluate(
         [
             r["agent"], str(r["episodes"]), f"{r['success_rate']:.3f}",
             "{:.3f}–{:.3f}".format(*r["success_interval"]), f"{r['metric']:.3g} ± {r['metric_half_width']:.2g}",
-            f"{r['returns']:.4g} ± {r['returns_half_width']:.2g}", f"{r['lengths']:.0f}", str(r["diverged"]),
+            f"{r['returns']:.4g} ± {r['returns_half_width']:.2g}",
+            f"{r['turn_rate']:.3g} ± {r['turn_rate_half_width']:.2g}", f"{r['seconds']:.3g}", f"{r['dropped']:.3f}",
+            str(r["diverged"]),
         ]
         for r in found
     ]  # fmt: skip
-    columns = ["agent", "episodes", "success", "95 %", env.task.success.metric, "return", "steps", "diverged"]
-    emit(found, table(env.task.text, columns, rows, right=tuple(range(1, 8))), as_json=as_json)
+    columns = ["agent", "episodes", "success", "95 %", env.task.success.metric, "return", "rad/s", "s", "dropped"]
+    text = table(env.task.text, [*columns, "diverged"], rows, right=tuple(range(1, 10)))
+    emit(found, text, as_json=as_json)

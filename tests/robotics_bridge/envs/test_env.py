@@ -165,14 +165,25 @@ def test_changed_masses_are_what_mujoco_derives_itself() -> None:
     env = _make(3, _calm(object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1))))
     for number in range(3):
         model = env.world.engine.model_of(number)
-        derived = {name: getattr(model, name).copy() for name in ("body_subtreemass", "body_invweight0")}
+        derived = {name: getattr(model, name).copy() for name in ("body_subtreemass", "body_invweight0", "dof_M0")}
         body = model.body("object").id
         assert model.body_mass[body] == pytest.approx(float(env.mass[number]), rel=1e-6)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         for name, value in derived.items():
-            np.testing.assert_allclose(value[body], getattr(model, name)[body], rtol=2e-5)
+            place = slice(model.body_dofadr[body], None) if name == "dof_M0" else body
+            np.testing.assert_allclose(value[place], getattr(model, name)[place], rtol=2e-5)
         friction = model.geom_friction[model.geom("object_0").id, 0]
         assert friction == pytest.approx(float(env.friction[number]), rel=1e-6)
+
+
+def test_heavy_and_light_objects_fall_alike() -> None:
+    aside = replace(tasks.load("in_palm_rotate").placement, height=1.0, x=(0.5, 0.5), y=(0.5, 0.5))
+    env = _make(4, _calm(placement=aside, object_changes=ObjectRandomisation(mass_offset=(0.0, 0.1))))
+    start = env.object_pose[:, 0, 2].clone()
+    for _ in range(8):
+        env.step(torch.zeros(4, env.num_actions))
+    # Implicit steps of 5 ms: g t (t + dt) / 2.
+    np.testing.assert_allclose(start - env.object_pose[:, 0, 2], 9.81 * 0.2 * 0.205 / 2, rtol=1e-3)
 
 
 def test_objects_of_different_kinds_share_one_batch() -> None:

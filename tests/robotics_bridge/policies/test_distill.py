@@ -76,6 +76,13 @@ def test_a_killed_run_goes_on_exactly(tmp_path, changes) -> None:
     assert _losses(tmp_path / "a") == _losses(tmp_path / "b")
 
 
+def test_a_run_that_stops_after_some_iterations_goes_on_exactly(tmp_path) -> None:
+    whole = _run(tmp_path / "a", iterations=4)
+    first = distill(_config(iterations=4), tmp_path / "b", env=TouchWorld(16), teacher=Follower(), stop_at=3)
+    assert (first.status, first.iterations, first.reason) == ("stopped", 3, "3 iterations were asked for.")
+    assert _run(tmp_path / "b", iterations=4).loss == whole.loss
+
+
 def test_a_loaded_student_acts_as_the_one_that_was_saved_and_forgets_on_reset(tmp_path) -> None:
     _run(tmp_path, iterations=2, encoder="zhuang-small")
     student, described = load_student(tmp_path)

@@ -11,6 +11,7 @@ from brainbench.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import Evaluation, agent, evaluate
+from robotics_bridge.tasks.rotations import about, multiply
 
 
 def _env() -> Env:
@@ -30,6 +31,32 @@ def test_every_environment_contributes_equally_many_episodes_of_every_seed() -> 
     assert found.success_rate == 0.0
     assert len(found.per_seed) == 3
     assert found.summary()["episodes"] == 18
+
+
+def test_what_success_does_not_tell_is_graded() -> None:
+    env = _env()
+    found = evaluate(env, agent("zero", env), episodes=3, seed=0)
+    assert found.seconds == pytest.approx((0.1,) * 3)
+    assert found.dropped == (False,) * 3
+    assert found.goals == (0.0,) * 3
+    summary = found.summary()
+    assert summary["seconds"] == pytest.approx(0.1)
+    assert {"turn_rate", "goals_half_width", "dropped"} <= set(summary)
+    # Beside the hand the block falls: nothing touches it, so nothing turns it.
+    falls = replace(tasks.load("in_palm_rotate"), placement=tasks.Placement(height=1.0, x=(0.5, 0.5), y=(0.5, 0.5)))
+    env = tasks.make(falls, num_envs=2, threads=1)
+    fallen = evaluate(env, agent("zero", env), episodes=2, seed=0)
+    assert fallen.dropped == (True, True)
+    assert fallen.turn_rate == (0.0, 0.0)
+    # From 1 m to 0.45 m it takes √(2 · 0.55 / 9.81) s; the block's origin starts some centimetres higher.
+    assert fallen.seconds[0] == pytest.approx(0.34, abs=0.05)
+
+
+def test_rotation_counts_while_something_touches() -> None:
+    goals = tasks.make("in_palm_rotate", num_envs=2, threads=1).goals
+    turn = about(torch.tensor([[-1.0, 0.0, 0.0]]).expand(2, 3), torch.tensor([0.05, 0.05]))
+    goals.update(multiply(turn, goals.previous.clone()), torch.tensor([True, False]))
+    assert goals.turned_held.tolist() == pytest.approx([0.05, 0.0], abs=1e-5)
 
 
 def test_the_same_seed_gives_the_same_episodes() -> None:

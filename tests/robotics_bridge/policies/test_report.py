@@ -10,7 +10,7 @@ from brainbench.errors import DataError
 from brainbench.files import write_json
 from leaderboards import rank, read_record, write_record
 from robotics_bridge.policies.distill_config import DistillConfig
-from robotics_bridge.policies.report import COLUMNS, draw, read_results, records, rows
+from robotics_bridge.policies.report import COLUMNS, agent_rows, draw, read_agents, read_results, records, rows
 
 
 def _write(folder, shares, *, seed=0, **changes) -> None:
@@ -44,7 +44,7 @@ def test_success_and_gain_have_t_intervals_over_training_seeds(tmp_path) -> None
     assert not felt.note
     table = rows([felt, bare])
     assert len(table[0]) == len(COLUMNS)
-    assert table[0][-1].startswith("+0.300")
+    assert table[0][COLUMNS.index("over none")].startswith("+0.300")
 
 
 def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
@@ -56,6 +56,37 @@ def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
     expected = stats.binomtest(36, 60).proportion_ci(method="wilson")
     assert (only.interval.low, only.interval.high) == pytest.approx((expected.low, expected.high), abs=1e-6)
     assert records([only])[0].score.status == "unreliable"
+
+
+def test_what_happened_beside_success_stands_in_the_table_and_in_records(tmp_path) -> None:
+    config = DistillConfig(task="in_palm_rotate", observe="none", iterations=100)
+    rng = np.random.default_rng(0)
+    rates = [rng.normal(0.4, 0.1, 50).tolist() for _ in range(3)]
+    found = [
+        {"seed": seed, "success": [0.0] * 50, "turn_rate": rate, "goals": [0.0] * 50, "iterations": 40}
+        for seed, rate in enumerate(rates)
+    ]
+    write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+    write_json(tmp_path / config.name / "evaluation.json", found)
+    agent = {"agent": "runs/teacher", "task": "in_palm_rotate", "success_rate": 0.1, "success_interval": [0.05, 0.2]}
+    write_json(tmp_path / "agents.json", [agent | {"turn_rate": 0.5, "turn_rate_half_width": 0.01}])
+    (only,) = read_results([tmp_path])
+    reference = stats.norm.interval(0.95, np.mean(rates), stats.sem(np.ravel(rates)))
+    mean, half = only.graded["turn_rate"]
+    assert (mean - half, mean + half) == pytest.approx(tuple(reference), rel=1e-6)
+    assert "stopped after 40 of 100 iterations" in only.note
+    score = records([only])[0].score
+    assert score.status == "unreliable"
+    assert score.provenance["settings"]["mean_turn_rate"] == pytest.approx(mean)
+    line = dict(zip(COLUMNS, rows([only])[0], strict=True))
+    assert (line["iterations"], line["goals"], line["s"]) == ("40", "0 ± 0", "–")
+    agents = read_agents([tmp_path])
+    line = dict(zip(COLUMNS, agent_rows(agents)[0], strict=True))
+    assert (line["touch"], line["success"], line["rad/s"]) == ("teacher", "0.100 [0.050, 0.200]", "0.5 ± 0.01")
+    assert draw([only], tmp_path / "a.png", agents=agents).stat().st_size > 1000
+    (tmp_path / "agents.json").write_text('[{"agent": "x"}]')
+    with pytest.raises(DataError, match="no list of evaluated agents"):
+        read_agents([tmp_path])
 
 
 def test_records_make_a_board_of_the_leaderboard(tmp_path) -> None:

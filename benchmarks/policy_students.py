@@ -1,0 +1,181 @@
+"""Students of one teacher that differ in what they feel, trained for the same number of control steps and compared.
+
+    python benchmarks/policy_students.py --teacher RUN --device cuda --iterations 300 --together 2 --out STUDENTS
+        [--gpus 2] [--end EPOCH_SECOND] [--arms none ft_hand …] [--tar $OUT]
+    brainbench policy report STUDENTS --picture report.png --records leaderboards/results
+
+Each student is a process of its own; ``--together`` of them share a GPU. Rows are printed as they come and kept in
+``STUDENTS/students.jsonl``. By ``--end`` all have stopped, were evaluated as far as they got (their evaluation says how
+far), and lie in ``$OUT/results.tar.gz`` (all but weights) and ``$OUT/models-<n>.tar`` of at most 15 MiB each, renewed
+whenever one is done. Run again with the same folder, students that were stopped go on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+from typing import Any
+
+NETWORK = "zhuang-intersection-ln-small"
+ARMS: dict[str, dict[str, Any]] = {
+    "none": {"observe": "none"},
+    "ft_hand": {"observe": "force_torque", "placement": "hand"},
+    "ft_tips": {"observe": "force_torque", "placement": "tips"},
+    "bool_hand": {"observe": "agg_bool", "placement": "hand"},
+    "bool_tips": {"observe": "agg_bool", "placement": "tips"},
+    "ead_simclr": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.simclr"},
+    "ead_supervised": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.supervised"},
+    "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
+}
+_TAR = 15 << 20
+_PER_EVALUATION = 60.0
+"""Seconds kept for making the environments of a student and for its evaluation."""
+
+
+def put(out: Path, row: dict[str, Any]) -> None:
+    """Print a row and keep it; processes append whole lines."""
+    line = json.dumps(row)
+    print(line, flush=True)
+    with (out / "students.jsonl").open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
+
+
+def train(options: argparse.Namespace) -> None:
+    """Train and evaluate one student in this process."""
+    from robotics_bridge.policies.distill_config import DistillConfig
+    from robotics_bridge.policies.students import train_student
+
+    settings = dict(ARMS[options.arm])
+    if "encoder" in settings:
+        settings["encoder_settings"] = {"learning": "frozen"}
+    precision = "bf16" if options.device != "cpu" and settings["observe"] != "none" else "float32"
+    config = DistillConfig(
+        task=options.task, variant=options.config, teacher=str(options.teacher), num_envs=options.envs,
+        precision=precision, seed=options.seed, save_interval=1_000_000, **settings,
+    )  # fmt: skip
+    began = time.time()
+    left = None if options.end is None else max(options.end - began - options.reserve, 1.0)
+    folder = options.out / options.arm / f"seed{options.seed}"
+
+    def tell(done: int, total: int, what: str) -> None:
+        if what == "evaluating" or done == 1 or done % options.every == 0:
+            put(options.out, {"arm": options.arm, "what": what, "done": done, "s": round(time.time() - began, 1)})
+
+    student = train_student(
+        config, folder, device=options.device, episodes=options.episodes, stop_after=left, stop_at=options.iterations,
+        progress=tell,
+    )  # fmt: skip
+    logged = [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+    last = {kind: next((row for row in reversed(logged) if row["kind"] == kind), {}) for kind in ("loss", "time")}
+    row: dict[str, Any] = {"arm": options.arm, "status": student.result.status, "iterations": student.result.iterations}
+    row |= {"control_steps": student.result.iterations * config.steps_per_env * config.num_envs}
+    row |= {"learning_s": round(student.result.seconds, 1), "s": round(time.time() - began, 1)}
+    row |= {"loss": last["loss"].get("behaviour"), "acting": last["time"].get("acting")}
+    row |= {"learning": last["time"].get("learning")}
+    for name in ("success", "goals", "turn_rate", "seconds", "returns", "dropped"):
+        values = [value for item in student.evaluations for value in item.get(name, [])]
+        row[name] = sum(values) / len(values) if values else None
+    put(options.out, row)
+
+
+def others(options: argparse.Namespace) -> None:
+    """Evaluate the teacher, zero and random over the students' evaluation seeds."""
+    from brainbench.files import write_json
+    from robotics_bridge import tasks
+    from robotics_bridge.policies.evaluate import agent, evaluate
+    from robotics_bridge.policies.students import SEEDS
+    from robotics_bridge.policies.teacher import load_teacher
+
+    env = tasks.make(options.task, config=options.config, num_envs=options.envs, device=options.device, seed=1)
+    found = []
+    for name in ("teacher", "zero", "random"):
+        act = load_teacher(options.teacher, env) if name == "teacher" else agent(name, env)
+        found.append(evaluate(env, act, episodes=options.episodes, seed=SEEDS, name=name).summary())
+        put(options.out, {"arm": name, **found[-1]})
+    write_json(options.out / "agents.json", found)
+
+
+def together(options: argparse.Namespace) -> None:
+    """Run all arms, some at once per GPU, and pack what they leave."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    words = sys.argv[1:]
+    waiting = ["agents", *options.arms]
+    running: dict[subprocess.Popen[bytes], tuple[str, int]] = {}
+    places = [gpu for _ in range(options.together) for gpu in range(options.gpus)]
+    while waiting or running:
+        while waiting and places:
+            name = waiting.pop(0)
+            if options.end is not None and time.time() > options.end - options.reserve - 20:
+                put(options.out, {"arm": name, "status": "no time"})
+                continue
+            gpu = places.pop(0)
+            environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "2")}
+            if options.device != "cpu":
+                environment["CUDA_VISIBLE_DEVICES"] = str(gpu)
+            process = subprocess.Popen([sys.executable, __file__, *words, "--arm", name], env=environment)
+            running[process] = name, gpu
+        time.sleep(0.2)
+        for process in [process for process in running if process.poll() is not None]:
+            name, gpu = running.pop(process)
+            places.append(gpu)
+            if process.returncode:
+                put(options.out, {"arm": name, "status": "failed", "code": process.returncode})
+            pack(options.out, options.tar or options.out)
+
+
+def pack(out: Path, to: Path) -> None:
+    """Put everything but weights into one file, and weights into as many small ones as they need."""
+    to.mkdir(parents=True, exist_ok=True)
+    kept = [path for path in out.rglob("*") if path.suffix in (".json", ".jsonl")]
+    with tarfile.open(to / "results.tar.gz", "w:gz") as file:
+        for path in kept:
+            file.add(path, path.relative_to(out))
+    number, size, file = 0, 0, None
+    for path in sorted(out.rglob("model.safetensors")):
+        if file is None or size + path.stat().st_size > _TAR:
+            if file is not None:
+                file.close()
+            number, size = number + 1, 0
+            file = tarfile.open(to / f"models-{number}.tar", "w")  # noqa: SIM115 - closed before the next is opened
+        file.add(path, path.relative_to(out))
+        size += path.stat().st_size
+    if file is not None:
+        file.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--teacher", type=Path, required=True, help="folder of a run, or one of its models")
+    parser.add_argument("--task", default="in_palm_rotate")
+    parser.add_argument("--config", default="default", help="configuration of the task; that of the teacher")
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--gpus", type=int, default=1)
+    parser.add_argument("--together", type=int, default=1, help="processes per GPU")
+    parser.add_argument("--envs", type=int, default=4096)
+    parser.add_argument("--iterations", type=int, default=300, help="after which each student stops")
+    parser.add_argument("--episodes", type=int, default=512, help="per evaluation seed, at least")
+    parser.add_argument("--end", type=float, help="second since 1970 by which all is done")
+    parser.add_argument("--reserve", type=float, default=_PER_EVALUATION, help="of it, for start and evaluation")
+    parser.add_argument("--every", type=int, default=25, help="iterations between rows")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("policy-students"))
+    parser.add_argument("--tar", type=Path, help="folder for what is kept; by default --out")
+    parser.add_argument("--arm", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.arm is None:
+        together(options)
+    elif options.arm == "agents":
+        others(options)
+    else:
+        train(options)
+
+
+if __name__ == "__main__":
+    main()
