@@ -126,7 +126,8 @@ def looks(real: type, against: int, lanes: int = 1) -> SimpleNamespace:
                     touch.normal = vec3(out[0], out[1], out[2])
                     touch.clear = real(0.0)
                 return touch
-        if got.face >= 0:
+        # Further away a search need not have found the nearest.
+        if got.face >= 0 and got.side <= within * within:
             face = first + got.face
             out_here = outward_of(bodies, face, got.v, got.w)
             # On a flat or hollow edge the ends of the link are nearer, or as near.
@@ -139,7 +140,7 @@ def looks(real: type, against: int, lanes: int = 1) -> SimpleNamespace:
                 touch.share = got.share
                 touch.gap = out[3] - radius
                 touch.normal = vec3(out[0], out[1], out[2])
-        if got.end_face >= 0:
+        if got.end_face >= 0 and got.end <= within * within:
             face = first + got.end_face
             away = b - corner_point(bodies, face, got.end_v, got.end_w)
             out = direction(away, wp.sqrt(got.end), outward_of(bodies, face, got.end_v, got.end_w), rb)
