@@ -140,6 +140,79 @@ def test_only_what_is_nearest_of_all_is_sought_beyond_what_matters_and_that_take
     np.testing.assert_allclose(np.sqrt(short.min(axis=1)), np.minimum(np.sqrt(full.min(axis=1)), 0.02 * size))
 
 
+def _inside(surface, points):
+    """Whether points lie in a closed surface: its triangles fill the whole sphere around them."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] - points[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=-1) for x in (a, b, c))
+    triple = np.einsum("...k,...k", a, np.cross(b, c))
+    dots = (np.einsum("...k,...k", x, y) for x, y in ((a, b), (b, c), (c, a)))
+    ab, bc, ca = dots
+    half = np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return half.sum(axis=1) > np.pi
+
+
+def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begins():
+    from brainbench.stimuli.backends.rod._device import to_struct
+    from brainbench.stimuli.backends.rod._limits import MESHES
+    from brainbench.stimuli.backends.rod._looks import looks
+    from brainbench.stimuli.backends.rod._structs import structs
+    from brainbench.stimuli.backends.rod._tracks import tracks
+
+    wp.init()
+    look_at, bodies, pose = looks(wp.float64, MESHES).look_at, structs(wp.float64).Bodies, tracks(wp.float64).Pose
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def ask(
+        bodies: bodies,
+        a: wp.array(dtype=wp.vec3d),
+        b: wp.array(dtype=wp.vec3d),
+        margin: wp.float64,
+        leaf: wp.array(dtype=wp.int32),
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        k = wp.tid()
+        body = pose()
+        body.turn = wp.vec4d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
+        thin = wp.vec4d(wp.float64(1e-3), wp.float64(1e-3), wp.float64(0.0), wp.float64(1.0))
+        touch = look_at(bodies, 0, body, a[k], b[k], thin, margin, leaf[k], 0, 1)
+        out[k, 0] = wp.where(touch.between == 1, touch.gap, wp.float64(1e30))
+        out[k, 1] = wp.where(touch.end == 1, touch.end_gap, wp.float64(1e30))
+
+    # So small that every triangle is within sight.
+    surface = _surface()
+    surface = TriangleMesh(surface.vertices * (3.0 / np.ptp(surface.vertices, axis=0).max()), surface.faces)
+    # Links that stand on a face, most of each further away than what is looked for on its own.
+    rng = np.random.default_rng(0)
+    corners = surface.vertices[surface.faces[rng.integers(len(surface.faces), size=400)]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
+    starts = corners.mean(axis=1) + 0.02 * normal
+    stops = starts + 0.3 * (normal + 0.5 * rng.normal(size=normal.shape))
+    share = np.linspace(0, 1, 21)[:, None, None]
+    points = starts + share * (stops - starts)
+    outside = ~np.array([_inside(surface, some) for some in points]).any(axis=0)
+    away = np.array([_distances(surface, some) for some in points]).min(axis=0)
+    outside &= away > 0.01
+    starts, stops = starts[outside], stops[outside]
+    assert len(starts) > 50
+    leaf = np.random.default_rng(1).integers(1, -(-len(surface.faces) // WIDE), size=len(starts))
+    out = wp.zeros((len(starts), 2), dtype=wp.float64)
+    inputs = [
+        to_struct(bodies, _bodies(surface), "cpu"),
+        wp.array(starts, dtype=wp.vec3d),
+        wp.array(stops, dtype=wp.vec3d),
+    ]
+    margin = 0.02 * np.ptp(surface.vertices, axis=0).max()
+    wp.launch(ask, len(starts), [*inputs, margin, wp.array(leaf, dtype=wp.int32), out], device="cpu")
+    gaps = out.numpy()
+    assert (gaps > 0).all()
+    # What is within the margin is told, at its true distance.
+    ends = _distances(surface, stops) - 1e-3
+    close = ends < margin
+    assert close.any()
+    np.testing.assert_allclose(gaps[close, 1], ends[close], atol=1e-9)
+
+
 @pytest.mark.parametrize("lanes", [2, 4, 8])
 def test_threads_that_search_together_find_what_one_finds(lanes):
     surface = _surface()
