@@ -1,6 +1,10 @@
 """What only the ``rod`` backend promises: exact surfaces, large steps, one result whatever the batch and the device."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,6 +119,23 @@ def test_jobs_give_the_same_bytes_alone_together_and_on_two_threads():
     alone = [_run(job)[0].wrench.tobytes() for job in jobs]
     assert [trace.wrench.tobytes() for trace in _run(jobs, workers=1)] == alone
     assert [trace.wrench.tobytes() for trace in _run(jobs, workers=2)] == alone
+
+
+@pytest.mark.slow
+def test_threads_that_start_side_by_side_on_a_fresh_machine_make_kernels_once(tmp_path):
+    """A process of its own, with nothing compiled, whose threads take turns as often as they can."""
+    code = (
+        "import sys; sys.setswitchinterval(1e-6)\n"
+        "from brainbench.stimuli.backends.rod import RodBackend\n"
+        "from tests.stimuli.backends import test_rod as t\n"
+        "job = t.Job(t.C2, t.StillFollicle(), (), t.np.array([2e-3]), gravity=(0.0, 0.0, -9.81))\n"
+        "RodBackend().run([job] * 6, t.COARSE, workers=6)\n"
+    )
+    root = Path(__file__).parents[3]
+    environment = {**os.environ, "PYTHONPATH": str(root), "WARP_CACHE_PATH": str(tmp_path)}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert len(list(tmp_path.rglob("*.o"))) == 1
 
 
 @pytest.mark.slow

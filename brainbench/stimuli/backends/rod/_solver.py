@@ -8,6 +8,7 @@ pass applies them. A contact takes part before it closes (g + h vₙ ≥ 0, gap 
 anything within a step. Everything is O(links). Units: mg, mm, ms, mN, µN·m.
 """
 
+import threading
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -41,6 +42,9 @@ from brainbench.stimuli.backends.rod._looks import looks
 from brainbench.stimuli.backends.rod._shapes import distances
 from brainbench.stimuli.backends.rod._structs import structs
 from brainbench.stimuli.backends.rod._tracks import tracks
+
+MAKING = threading.Lock()
+"""To be held while kernels are made and compiled: two threads at once would make their structures twice."""
 
 
 @cache

@@ -155,7 +155,7 @@ def _simulate(
     jobs: Sequence[Job], indices: Sequence[int], fidelity: Fidelity, device: Any, capacity: int, record_shape: bool
 ) -> list[tuple[int, Trace]]:
     """Run jobs that share their readings in one launch."""
-    from brainbench.stimuli.backends.rod._solver import solver
+    from brainbench.stimuli.backends.rod._solver import MAKING, solver
 
     started = time.thread_time()
     wp = warp()
@@ -177,8 +177,9 @@ def _simulate(
     real = wp.float32 if fidelity.precision == "single" else wp.float64
     # Compiling is once; it is no cost of a whisker.
     paused = time.thread_time()
-    kernels = solver(real, capacity, batch.shapes.needs, cuda=device.is_cuda)
-    kernels.run.module.load(device, block_dim=1 if device.is_cpu else None)
+    with MAKING:
+        kernels = solver(real, capacity, batch.shapes.needs, cuda=device.is_cuda)
+        kernels.run.module.load(device, block_dim=1 if device.is_cpu else None)
     started += time.thread_time() - paused
     readings = first.times * MILLI
     count, frames = len(lanes), len(readings)

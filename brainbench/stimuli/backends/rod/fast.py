@@ -91,7 +91,7 @@ class SweepLauncher:
         bounds: tuple[int, int] | None = None,
         sliced: bool | None = None,
     ) -> None:
-        from brainbench.stimuli.backends.rod._solver import solver
+        from brainbench.stimuli.backends.rod._solver import MAKING, solver
 
         against = MESHES if against is None else against
 
@@ -114,14 +114,15 @@ class SweepLauncher:
         chains = [build_chain(m.whisker, fidelity.link_count(m.whisker.arc_length)) for m in mounts]
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.real = wp.float32 if fidelity.precision == "single" else wp.float64
-        self.kernels = solver(
-            self.real,
-            self.capacity,
-            against,
-            bounds or (SLICED_BOUNDS if self.sliced else BOUNDS),
-            sliced=self.sliced,
-            cuda=self.device.is_cuda,
-        )
+        with MAKING:
+            self.kernels = solver(
+                self.real,
+                self.capacity,
+                against,
+                bounds or (SLICED_BOUNDS if self.sliced else BOUNDS),
+                sliced=self.sliced,
+                cuda=self.device.is_cuda,
+            )
         self._chains = to_struct(
             self.kernels.Chains, Chains(self.capacity, chains, self.quasistatic).arrays(), self.device
         )
