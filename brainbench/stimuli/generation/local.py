@@ -46,8 +46,9 @@ def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done
             _run_pool(tasks, folder, count, done)
     except BrokenProcessPool as error:
         raise DataError(
-            "A process of the pool ended unexpectedly, perhaps for want of memory; the finished shards are kept: run "
-            "the same command again, with fewer workers if this recurs."
+            "A process of the pool ended unexpectedly, perhaps for want of memory, or because the script that started "
+            "it works outside of: if __name__ == '__main__':. The finished shards are kept: run the same again, with "
+            "fewer workers if this recurs."
         ) from error
 
 

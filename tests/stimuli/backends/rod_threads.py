@@ -7,6 +7,7 @@ threads of the warp reach together is an error.
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 import threading
 from contextlib import contextmanager
@@ -101,6 +102,11 @@ def _language() -> ModuleType:
     def bits(value, _kind):
         return int(np.float32(value).view(np.int32))
 
+    def native(code):
+        # Native code is where the processor's minimum and maximum are other than Warp's.
+        found = re.search(r"#else\nreturn a ([<>]) b \? a : b;", code)
+        return lambda _function: min if found[1] == "<" else max
+
     def zeroed(kind):
         for name in kind.__annotations__:
             setattr(kind, name, 0)
@@ -109,7 +115,7 @@ def _language() -> ModuleType:
     made = {
         "float32": np.float64, "float64": np.float64, "int32": int, "uint64": int,
         "types": SimpleNamespace(vector=vector, matrix=lambda shape, _kind: lambda *_: Memory(np.zeros(shape))),
-        "static": lambda value: value, "func": lambda function: function, "struct": zeroed,
+        "static": lambda value: value, "func": lambda function: function, "struct": zeroed, "func_native": native,
         **dict.fromkeys(["array", "array2d", "array3d", "array4d"], lambda **_: None),
         "min": min, "max": lambda a, b: max(b, a), "abs": abs, "sqrt": np.sqrt, "sin": np.sin, "cos": np.cos,
         "clamp": lambda x, low, high: min(max(x, low), high), "where": lambda yes, a, b: a if yes else b,

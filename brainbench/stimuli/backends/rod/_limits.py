@@ -53,7 +53,7 @@ GROUPS = (2, 2), (4, 4)
 of more have groups of eight, or sixteen."""
 LOOKERS = 8
 """Threads of a GPU that look at one link together: 1, 2, 4 or 8."""
-LOOK_BOUNDS = 128, 6
+LOOK_BOUNDS = 128, 4
 """CUDA launch bounds of that kernel."""
 GRIP_BOUNDS = 128, 4
 """CUDA launch bounds of these kernels."""

@@ -9,6 +9,7 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+from brainbench.stimuli.backends.rod._algebra import algebra
 from brainbench.stimuli.backends.rod._groups import groups
 from brainbench.stimuli.backends.rod._shapes import distances
 from brainbench.stimuli.backends.rod._structs import structs
@@ -32,7 +33,8 @@ def searches(real: type, lanes: int) -> SimpleNamespace:
 
     vec3: Any = wp.types.vector(3, real)
     Bodies = structs(real).Bodies
-    shape, group = distances(real), groups(real, lanes)
+    shape, group, maths = distances(real), groups(real, lanes), algebra(real)
+    lower, higher = maths.lower, maths.higher
     segment_triangle, point_triangle = shape.segment_triangle, shape.point_triangle
     give, least, first, most = group.give, group.least, group.first, group.most
     own = WIDE // lanes
@@ -98,7 +100,7 @@ def searches(real: type, lanes: int) -> SimpleNamespace:
 
         along = b - a
         length = wp.length(along)
-        axis = along / wp.max(length, real(1e-20))
+        axis = along / higher(length, real(1e-20))
         half = real(0.5) * along
         middle = a + half
         reach = vec3(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
@@ -137,13 +139,13 @@ def searches(real: type, lanes: int) -> SimpleNamespace:
                         beside_q = q - a - axis * tq
                         beside_r = r - a - axis * tr
                         way = beside_p + beside_q + beside_r
-                        beside = wp.min(wp.dot(beside_p, way), wp.min(wp.dot(beside_q, way), wp.dot(beside_r, way)))
-                        beside = wp.max(beside, zero)
-                        beside = beside * beside / wp.max(wp.length_sq(way), real(1e-20))
-                        low = wp.min(tp, wp.min(tq, tr))
-                        high = wp.max(tp, wp.max(tq, tr))
-                        apart = wp.max(zero, wp.max(low - length, -high))
-                        if sure * (beside + apart * apart) < wp.min(side_most, got.side):
+                        beside = lower(wp.dot(beside_p, way), lower(wp.dot(beside_q, way), wp.dot(beside_r, way)))
+                        beside = higher(beside, zero)
+                        beside = beside * beside / higher(wp.length_sq(way), real(1e-20))
+                        low = lower(tp, lower(tq, tr))
+                        high = higher(tp, higher(tq, tr))
+                        apart = higher(zero, higher(low - length, -high))
+                        if sure * (beside + apart * apart) < lower(side_most, got.side):
                             at = segment_triangle(a, b, p, q, r)
                             if at[0] < got.side:
                                 got.side = at[0]
@@ -151,8 +153,8 @@ def searches(real: type, lanes: int) -> SimpleNamespace:
                                 got.v = at[2]
                                 got.w = at[3]
                                 got.face = place
-                        apart = wp.max(zero, wp.max(low - length, length - high))
-                        if sure * (beside + apart * apart) < wp.min(end_most, got.end):
+                        apart = higher(zero, higher(low - length, length - high))
+                        if sure * (beside + apart * apart) < lower(end_most, got.end):
                             spot = point_triangle(b, p, q, r)
                             square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
                             if square < got.end:
@@ -160,8 +162,8 @@ def searches(real: type, lanes: int) -> SimpleNamespace:
                                 got.end_v = spot[0]
                                 got.end_w = spot[1]
                                 got.end_face = place
-                        apart = wp.max(zero, wp.max(low, -high))
-                        if sure * (beside + apart * apart) < wp.min(all_of, got.start):
+                        apart = higher(zero, higher(low, -high))
+                        if sure * (beside + apart * apart) < lower(all_of, got.start):
                             spot = point_triangle(a, p, q, r)
                             square = wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1])
                             if square < got.start:
@@ -171,9 +173,9 @@ def searches(real: type, lanes: int) -> SimpleNamespace:
                                 got.start_face = place
             side = least(got.side)
             end = least(got.end)
-            all_of = wp.min(wp.min(side, end), least(got.start))
-            side_most = wp.min(side, wp.max(all_of, own_only))
-            end_most = wp.min(end, wp.max(all_of, own_only))
+            all_of = lower(lower(side, end), least(got.start))
+            side_most = lower(side, higher(all_of, own_only))
+            end_most = lower(end, higher(all_of, own_only))
             if busy == 1 and measure == 1:
                 # How near the children of the node can be: beside the segment, and from its end.
                 for k in range(each):
@@ -187,27 +189,27 @@ def searches(real: type, lanes: int) -> SimpleNamespace:
                         centre = low3 + wide
                         off = centre - middle
                         gap = vec3(
-                            wp.max(wp.abs(off[0]) - wide[0] - reach[0], zero),
-                            wp.max(wp.abs(off[1]) - wide[1] - reach[1], zero),
-                            wp.max(wp.abs(off[2]) - wide[2] - reach[2], zero),
+                            higher(wp.abs(off[0]) - wide[0] - reach[0], zero),
+                            higher(wp.abs(off[1]) - wide[1] - reach[1], zero),
+                            higher(wp.abs(off[2]) - wide[2] - reach[2], zero),
                         )
                         bound = wp.length_sq(gap)
-                        if sure * bound < wp.max(side_most, end_most):
+                        if sure * bound < higher(side_most, end_most):
                             # All of the segment lies behind the plane through its point nearest to the centre.
-                            t = wp.clamp(wp.dot(centre - a, axis), zero, length)
+                            t = lower(higher(wp.dot(centre - a, axis), zero), length)
                             off = centre - a - axis * t
                             square = wp.length_sq(off)
                             over = (
                                 square - wp.abs(off[0]) * wide[0] - wp.abs(off[1]) * wide[1] - wp.abs(off[2]) * wide[2]
                             )
                             if over > zero:
-                                bound = wp.max(bound, over * over / square)
+                                bound = higher(bound, over * over / square)
                             side_kept[level, k] = bound
                             off = centre - b
                             gap = vec3(
-                                wp.max(wp.abs(off[0]) - wide[0], zero),
-                                wp.max(wp.abs(off[1]) - wide[1], zero),
-                                wp.max(wp.abs(off[2]) - wide[2], zero),
+                                higher(wp.abs(off[0]) - wide[0], zero),
+                                higher(wp.abs(off[1]) - wide[1], zero),
+                                higher(wp.abs(off[2]) - wide[2], zero),
                             )
                             end_kept[level, k] = wp.length_sq(gap)
             measure = 0

@@ -7,6 +7,8 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+from brainbench.stimuli.backends.rod._algebra import algebra
+
 SPHERE, CAPSULE, CYLINDER, BOX, MESH = range(5)
 """Kinds of shapes: sizes are (radius, –, –), (radius, half length, –) twice, half edge lengths, and nothing."""
 
@@ -30,6 +32,7 @@ def distances(real: type) -> SimpleNamespace:
     vec3: Any = wp.types.vector(3, real)
     vec4: Any = wp.types.vector(4, real)
     vec5: Any = wp.types.vector(5, real)
+    lower, higher = algebra(real).lower, algebra(real).higher
     halvings = 20 if real is wp.float32 else 44
     tiny = 1e-12 if real is wp.float32 else 1e-24
 
@@ -156,14 +159,14 @@ def distances(real: type) -> SimpleNamespace:
         determinant = aa * ee - b * b
         s = real(0.5)
         if determinant > real(1e-6) * aa * ee:
-            s = wp.clamp((b * f - c * ee) / determinant, zero, one)
-        t = (b * s + f) / wp.max(ee, real(tiny))
+            s = lower(higher((b * f - c * ee) / determinant, zero), one)
+        t = (b * s + f) / higher(ee, real(tiny))
         if t < zero:
             t = zero
-            s = wp.clamp(-c / aa, zero, one)
+            s = lower(higher(-c / aa, zero), one)
         elif t > one:
             t = one
-            s = wp.clamp((b - c) / aa, zero, one)
+            s = lower(higher((b - c) / aa, zero), one)
         return vec2(s, t)
 
     @wp.func
