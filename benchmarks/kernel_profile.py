@@ -162,9 +162,7 @@ PARTS = {"check": check, "train": train, "stream": stream, "front": front}
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument(
-        "--parts", nargs="+", default=["check", "train", "stream"], choices=["check", "train", "stream"]
-    )
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--model", default="zhuang-intersection-ln+gpt")
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--rows", type=int, default=25)
