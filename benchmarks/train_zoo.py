@@ -314,8 +314,9 @@ class Worker:
 
     def _needed(self, job: Job) -> float:
         """Return the seconds without which a job is not worth beginning."""
-        whole = self.args.last and not self.args.short and job.trained and not job.timeless
-        return 0.6 * self._budget(job) if whole else 25.0
+        if not (self.args.last and job.trained) or self.args.short:
+            return 25.0
+        return 60.0 if job.timeless else 0.6 * self._budget(job)
 
     def _budget(self, job: Job) -> float:
         if job.timeless:

@@ -141,11 +141,12 @@ def all_jobs(ablation: int | None = None) -> list[Job]:
     if ablation is None:
         return list(dict.fromkeys(_jobs()))
     # The published size takes longest and may go on beside all others.
-    first = [Job(*FULL[0], epochs=FULL_EPOCHS, timeless=True), *_compared(VARIED[0], ablation)]
-    first += [Job(VARIED[0], "untrained")]
-    first += [Job(f"{model}.{objective}", objective) for model in SMALL for objective in ("supervised", "simclr")]
-    names = {job.name for job in first}
-    return first + [job for job in _further() if job.name not in names]
+    jobs = [Job(*FULL[0], epochs=FULL_EPOCHS, timeless=True), *_compared(VARIED[0], ablation)]
+    jobs += [Job(VARIED[0], "untrained")]
+    jobs += [Job(f"{model}.{objective}", objective) for model in SMALL for objective in ("supervised", "simclr")]
+    for job in _further():
+        jobs.append(dataclasses.replace(job, epochs=ablation, timeless=True) if job.trained and not job.full else job)
+    return list({job.name: job for job in reversed(jobs)}.values())[::-1]
 
 
 def _jobs() -> Iterator[Job]:
@@ -155,7 +156,8 @@ def _jobs() -> Iterator[Job]:
     for model in SMALL:
         yield Job(model, "untrained")
     yield from _varied(VARIED[0])
-    yield from _seeds(range(1, SEEDS))
+    for seed in range(1, SEEDS):
+        yield from _seeds(SMALL, (seed,))
     for model, objective in FULL:
         yield Job(model, objective, epochs=FULL_EPOCHS)
         yield Job(model, "untrained")
@@ -164,20 +166,23 @@ def _jobs() -> Iterator[Job]:
 
 
 def _further() -> Iterator[Job]:
-    """What is trained after a comparison: further seeds of networks that are shipped, then what is cheap."""
-    yield from _seeds(range(1, SEEDS))
+    """What is trained after a comparison: further seeds of the networks that are shipped, the cheapest first."""
+    yield from _seeds(SMALL[:1], range(1, SEEDS))
+    cheap = sorted(SMALL[1:], key=WEIGHTS.__getitem__)
+    yield from _seeds(cheap[:3], range(SEEDS))
     for model, objective in FULL[3:]:
         yield Job(model, objective, epochs=FULL_EPOCHS)
         yield Job(model, "untrained")
     yield Job(FULL[0][0], "untrained")
-    yield from _seeds(range(1))
+    yield from _seeds(cheap[3:], range(SEEDS))
 
 
-def _seeds(seeds: Iterable[int]) -> Iterator[Job]:
-    for seed in seeds:
-        for model in SMALL:
-            for objective in ("supervised", "simclr", "untrained"):
-                yield Job(model, objective, seed=seed)
+def _seeds(models: Iterable[str], seeds: Iterable[int]) -> Iterator[Job]:
+    for model in models:
+        for seed in seeds:
+            for objective in ("supervised", "simclr"):
+                yield Job(model, objective, seed=seed, ship=seed == 0)
+            yield Job(model, "untrained", seed=seed)
 
 
 def _compared(model: str, epochs: int) -> list[Job]:

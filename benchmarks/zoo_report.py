@@ -18,16 +18,29 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "training-curves.png"
 
 
-def read(folders: list[Path], name: str) -> list[dict[str, Any]]:
-    """Read the lines of a file of every folder; later folders replace jobs of earlier ones on the same data."""
-    lines: dict[Any, dict[str, Any]] = {}
+def read(folder: Path, name: str) -> list[dict[str, Any]]:
+    """Read the lines of a file that came back."""
+    path = folder / name if (folder / name).is_file() else folder / "unpacked" / name
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
+
+
+def read_results(folders: list[Path]) -> list[dict[str, Any]]:
+    """Read all results; later folders replace jobs of earlier ones on the same data."""
+    found = {(line["name"], line["data"]["hash"]): line for folder in folders for line in read(folder, "results.jsonl")}
+    return list(found.values())
+
+
+def read_curves(folders: list[Path]) -> list[dict[str, Any]]:
+    """Read the curves of all jobs; of a job that was trained several times, the longest."""
+    longest: dict[str, list[dict[str, Any]]] = {}
     for folder in folders:
-        path = folder / name if (folder / name).is_file() else folder / "unpacked" / name
-        for text in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
-            line = json.loads(text)
-            key = (line["name"], line["data"]["hash"]) if "name" in line else (line["job"], line["epoch"], line["kind"])
-            lines[key] = line
-    return list(lines.values())
+        jobs: dict[str, dict[Any, dict[str, Any]]] = defaultdict(dict)
+        for line in read(folder, "curves.jsonl"):
+            jobs[line["job"]][line["epoch"], line["kind"]] = line
+        for name, lines in jobs.items():
+            if len(lines) >= len(longest.get(name, ())):
+                longest[name] = list(lines.values())
+    return [line for lines in longest.values() for line in lines]
 
 
 def share(value: float) -> str:
@@ -136,7 +149,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=PICTURE)
     parser.add_argument("--note", default="", help="a sentence for the section: the machine, how long")
     args = parser.parse_args()
-    results, curves = read(args.folders, "results.jsonl"), read(args.folders, "curves.jsonl")
+    results, curves = read_results(args.folders), read_curves(args.folders)
     classes = results[0]["data"]["classes"]
     text = (
         f"{classes} classes (chance {100 / classes:.1f} %). {data_text(results)} {args.note}\n\n"
