@@ -142,18 +142,18 @@ def ablation(
     held: Callable[[Entry], str],
     what: str,
 ) -> Figure:
-    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed."""
-    groups: dict[tuple[str, str, str], dict[str, Entry]] = {}
+    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed, and on the same data."""
+    groups: dict[tuple[str, ...], dict[str, Entry]] = {}
     for entry in entries:
         if entry.trained and level(entry) and math.isfinite(entry.value):
-            model = (entry.architecture, entry.card.objective or "", held(entry))
+            model = (entry.architecture, entry.card.objective or "", held(entry), entry.card.accuracy_data or "")
             groups.setdefault(model, {}).setdefault(level(entry), entry)
     groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
     if not groups:
         return Figure(key, title, "", None, f"no model was trained with more than one {what}")
     twin = twins(entries)
     rows = [
-        (", ".join(part for part in model if part) if i == 0 else "", label, entry)
+        (", ".join(part for part in model[:-1] if part) if i == 0 else "", label, entry)
         for model, levels in groups.items()
         for i, (label, entry) in enumerate(sorted(levels.items()))
     ]
@@ -163,7 +163,7 @@ def ablation(
     draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
     for index, (name, label, entry) in enumerate(rows):
         y = 44.0 + 20 * index
-        drawing.text(6, y + 4, cut(name, 38), "title small")
+        drawing.text(6, y + 4, cut(name, 41), "title small")
         drawing.text(322, y + 4, cut(label, 22), "end")
         draw_interval(drawing, scale, entry.interval, y, colour[label])
         other = twin.get(entry.architecture)

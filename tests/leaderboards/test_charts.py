@@ -168,3 +168,14 @@ def test_an_ablation_changes_one_thing_at_a_time(make_record):
     assert {text.split(":")[0] for text in shown} == {"net.b, physical", "net.c, image"}
     shown = [text for text in _texts(figures["masking"].drawing) if text.startswith("net.")]
     assert {text.split(":")[0] for text in shown} == {"net.a, 75% masked", "net.b, 0% masked"}
+
+
+def test_an_ablation_compares_what_was_tested_on_the_same_sweeps(make_record):
+    records = [
+        _trained(make_record("net.a", 0.9), "simclr", "physical", accuracy_data="old"),
+        _trained(make_record("net.b", 0.5), "simclr", "physical", accuracy_data="new"),
+        _trained(make_record("net.c", 0.4), "simclr", "image", accuracy_data="new"),
+        _trained(make_record("net.d", 0.3), "simclr", "none", accuracy_data="older"),
+    ]
+    shown = [text for text in _texts(_figures(*records)["augmentation"].drawing) if text.startswith("net.")]
+    assert {text.split(":")[0] for text in shown} == {"net.b, physical", "net.c, image"}

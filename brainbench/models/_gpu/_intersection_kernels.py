@@ -256,7 +256,9 @@ def settle_backward(
     d_x = torch.empty(batch, height, width, channels, dtype=x.dtype, device=x.device).permute(0, 3, 1, 2)
     d_state = torch.empty(batch, height, width, channels, dtype=state.dtype, device=x.device).permute(0, 3, 1, 2)
     d_y, d_after = by_places(d_y), by_places(d_after)
-    tall, wide = _tile(channels, 1024)
+    # Rows of many channels are read in longer pieces by fewer threads (77 instead of 89 µs of 384 on an H200).
+    size, warps = (2048, 4) if channels >= 256 else (1024, WARPS)
+    tall, wide = _tile(channels, size)
     settle_backward_kernel[(min(PROGRAMS, triton.cdiv(len(fused), tall)),)](
         fused,
         x,
@@ -283,7 +285,7 @@ def settle_backward(
         EPS,
         tall,
         wide,
-        num_warps=WARPS,
+        num_warps=warps,
     )
     return d_x, d_state
 
