@@ -21,7 +21,7 @@ from brainbench.cli.policy._options import (
 
 def distill(
     task: TaskArgument,
-    teacher: Annotated[Path, typer.Option(help="Folder of a run of brainbench policy train.")],
+    teacher: Annotated[Path, typer.Option(help="A shipped teacher, or a folder of brainbench policy train.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the run; by default students/<what it is>.")] = None,
     observe: Annotated[str, typer.Option(help="Tactile observation type (table 4.3), or none.")] = "force_torque",
     placement: PlacementOption = "hand",
