@@ -79,6 +79,7 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--shards", help=argparse.SUPPRESS)
     told.add_argument("--until", type=float, help=argparse.SUPPRESS)
     told.add_argument("--install", type=Path, help="unpack tar files and put trained models into the package")
+    told.add_argument("--records", action="store_true", help="with --install: the package's weights stay as they are")
     return told
 
 
@@ -86,7 +87,7 @@ def main() -> None:
     args = parser().parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if args.install:
-        install(args.install)
+        install(args.install, weights=not args.records)
     elif args.score:
         score(args.score)
     elif args.shards:
@@ -478,11 +479,11 @@ def unpack(folder: Path, work: Path) -> None:
             file.extractall(work, filter="data")
 
 
-def install(folder: Path) -> None:
+def install(folder: Path, *, weights: bool = True) -> None:
     """Put the trained networks that are to be shipped into the package, each with its untrained twin in its card.
 
-    Where the one that is there was evaluated on the same sweeps, the better one in validation stays. Records of a
-    comparison of augmentations (``--ablation``) go to the leaderboard.
+    Where the one that is there was evaluated on the same sweeps, the better one in validation stays. Records of all
+    other trained networks go to the leaderboard.
     """
     from brainbench.files import read_json, write_json, write_text
     from brainbench.models.training.card import model_card
@@ -495,7 +496,7 @@ def install(folder: Path) -> None:
     target, installed = ROOT / "brainbench" / "models" / "weights", set()
     for job in all_jobs():
         ended = work / "jobs" / job.name
-        if not (job.ship and (ended / "result.json").is_file()):
+        if not (weights and job.ship and (ended / "result.json").is_file()):
             continue
         if read_json(ended / "result.json")["status"] != "finished":
             _log.warning("%s diverged and is not installed", job.name)
@@ -520,7 +521,7 @@ def install(folder: Path) -> None:
         _log.info("%s: %.2f MB", place.relative_to(ROOT), size / 1e6)
     for path in sorted((work / "jobs").glob("*/record.json")):
         job = Job(**read_json(path.parent / "result.json")["job"])
-        if job.timeless and not job.full and job.name not in installed:
+        if job.trained and job.name not in installed:
             record = ResultRecord.from_json(path.read_text(encoding="utf-8"))
             _log.info("%s", write_record(record, ROOT / "leaderboards" / "results"))
 

@@ -157,14 +157,14 @@ def ablation(
         for model, levels in groups.items()
         for i, (label, entry) in enumerate(sorted(levels.items()))
     ]
-    scale = score_scale([e.value for *_, e in rows], [e.interval for *_, e in rows], 330, WIDTH - 20)
+    scale = score_scale([e.value for *_, e in rows], [e.interval for *_, e in rows], 400, WIDTH - 20)
     colour = colours(label for _, label, _ in rows)
     drawing = Drawing(WIDTH, 44 + 20 * len(rows), f"{title}: {len(groups)} models")
     draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
     for index, (name, label, entry) in enumerate(rows):
         y = 44.0 + 20 * index
-        drawing.text(6, y + 4, cut(name, 41), "title small")
-        drawing.text(322, y + 4, cut(label, 22), "end")
+        drawing.text(6, y + 4, cut(name, 50), "title small")
+        drawing.text(392, y + 4, cut(label, 22), "end")
         draw_interval(drawing, scale, entry.interval, y, colour[label])
         other = twin.get(entry.architecture)
         if other is not None and math.isfinite(other.value):
