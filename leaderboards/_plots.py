@@ -256,3 +256,15 @@ def cut(text: str, length: int) -> str:
     """Shorten a label; of a path the last part stays."""
     text = text.rpartition("/")[2] or text
     return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def cut_name(name: str, length: int) -> str:
+    """Shorten a model's name in its middle: its end says how it was trained. ``./`` marks one of a local folder.
+
+    >>> cut_name("local-dir:zhuang-intersection-ln-small.simclr.masked75", 30)
+    './zhuang-inter…simclr.masked75'
+    """
+    folder, mark, inside = name.partition("local-dir:")
+    text = f"./{inside}" if mark and not folder and "/" not in inside else name.rpartition("/")[2] or name
+    head = (length - 1) // 2
+    return text if len(text) <= length else f"{text[:head]}…{text[head + 1 - length :]}"

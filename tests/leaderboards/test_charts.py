@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.types import GraphEdge, GraphNode, Interval, ModelGraph
-from leaderboards import _svg
+from leaderboards import _plots, _svg
 from leaderboards._diagram import diagram
 from leaderboards._plots import regression
 from leaderboards._svg import STYLE, Drawing, Scale, scale_of, standalone
@@ -154,7 +154,10 @@ def test_an_interval_off_the_axis_is_held_at_its_end(make_record):
 
 
 def test_the_examples_hold():
-    assert doctest.testmod(_svg).failed == 0
+    for module in (_svg, _plots):
+        found = doctest.testmod(module)
+        assert found.attempted
+        assert found.failed == 0
 
 
 def test_an_ablation_changes_one_thing_at_a_time(make_record):
