@@ -57,7 +57,9 @@ def train(options: argparse.Namespace) -> None:
     precision = "bf16" if options.device != "cpu" and settings["observe"] != "none" else "float32"
     config = DistillConfig(
         task=options.task, variant=options.config, teacher=str(options.teacher), num_envs=options.envs,
-        precision=precision, seed=options.seed, save_interval=1_000_000, **settings,
+        precision=precision, seed=options.seed, save_interval=1_000_000, learning_rate=options.learning_rate,
+        epochs=options.epochs, teacher_share=options.teacher_share,
+        teacher_iterations=options.teacher_iterations, **settings,
     )  # fmt: skip
     began = time.time()
     left = None if options.end is None else max(options.end - began - options.reserve, 1.0)
@@ -126,18 +128,20 @@ def together(options: argparse.Namespace) -> None:
             places.append(gpu)
             if process.returncode:
                 put(options.out, {"arm": name, "status": "failed", "code": process.returncode})
-            pack(options.out, options.tar or options.out)
+            pack(options.out, options.tar or options.out, options.arms, options.tars)
 
 
-def pack(out: Path, to: Path) -> None:
-    """Put everything but weights into one file, and weights into as many small ones as they need."""
+def pack(out: Path, to: Path, arms: list[str], most: int) -> None:
+    """Put everything but weights into one file, and weights into small ones, those of the first arms first."""
     to.mkdir(parents=True, exist_ok=True)
     kept = [path for path in out.rglob("*") if path.suffix in (".json", ".jsonl")]
     with tarfile.open(to / "results.tar.gz", "w:gz") as file:
         for path in kept:
             file.add(path, path.relative_to(out))
     number, size, file = 0, 0, None
-    for path in sorted(out.rglob("model.safetensors")):
+    for path in (path for arm in arms for path in sorted((out / arm).rglob("model.safetensors"))):
+        if number == most and size + path.stat().st_size > _TAR:
+            break
         if file is None or size + path.stat().st_size > _TAR:
             if file is not None:
                 file.close()
@@ -160,6 +164,10 @@ def main() -> None:
     parser.add_argument("--together", type=int, default=1, help="processes per GPU")
     parser.add_argument("--envs", type=int, default=4096)
     parser.add_argument("--iterations", type=int, default=300, help="after which each student stops")
+    parser.add_argument("--learning-rate", type=float, help="by default the task's own (published)")
+    parser.add_argument("--epochs", type=int, help="over each iteration's steps; by default the task's own (published)")
+    parser.add_argument("--teacher-share", type=float, default=0.0, help="of the first iteration's actions")
+    parser.add_argument("--teacher-iterations", type=int, default=0, help="over which that share falls to 0")
     parser.add_argument("--episodes", type=int, default=512, help="per evaluation seed, at least")
     parser.add_argument("--end", type=float, help="second since 1970 by which all is done")
     parser.add_argument("--reserve", type=float, default=_PER_EVALUATION, help="of it, for start and evaluation")
@@ -167,6 +175,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("policy-students"))
     parser.add_argument("--tar", type=Path, help="folder for what is kept; by default --out")
+    parser.add_argument("--tars", type=int, default=5, help="files of weights at most; later arms keep none")
     parser.add_argument("--arm", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.arm is None:

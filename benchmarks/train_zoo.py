@@ -5,9 +5,9 @@
 
 A few processes per GPU, each with all sweeps in the GPU's memory, each doing one job after the other with whole
 training steps as CUDA graphs (``zoo_loop.py``). Jobs are in ``zoo_jobs.py``, the most valuable first; each is claimed
-by one process. At the deadline unfinished jobs save their state. Results come back as soon as there are any:
-``results.jsonl``, ``curves.jsonl`` and up to four tar files with checkpoints of small networks, result records and
-states, replaced in one move each; given with ``--resume`` they are gone on with.
+by one process. At the deadline unfinished jobs save their state. Results come back as soon as there are any: up to four
+tar files with ``results.jsonl``, ``curves.jsonl``, result records, checkpoints of small networks and states, each
+replaced in one move; given with ``--resume`` they are gone on with.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import os
 import shutil
 import subprocess
@@ -35,8 +36,8 @@ OVERHEAD = 20.0
 """Seconds of a job beside its training: preparing, the probe, evaluating."""
 MOST_FAULTS = 12
 """Workers that are replaced when they fail."""
-TAR_BYTES, TARS = 15 * 2**20, 4
-"""What may come back: files of at most 16 MiB, 64 MiB in all."""
+TAR_BYTES = 15 * 2**20
+"""Files of at most 16 MiB may come back."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -64,6 +65,10 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--epochs", type=int, help="epochs at most, whatever the job says")
     told.add_argument("--short", type=float, help="short trainings on a processor: times the steps of zoo_jobs.SHORT")
     told.add_argument("--closing", type=float, default=75.0, help="seconds before the end when training stops")
+    told.add_argument(
+        "--ablation", type=int, help="epochs of the jobs that compare augmentations; they come first then"
+    )
+    told.add_argument("--tars", type=int, default=4, help="files that may come back")
     told.add_argument("--only", help="substring of the names of jobs to train")
     told.add_argument("--jobs", type=int, help="only so many jobs")
     told.add_argument("--resume", type=Path, help="folder with the tar files of an earlier call")
@@ -74,6 +79,7 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--shards", help=argparse.SUPPRESS)
     told.add_argument("--until", type=float, help=argparse.SUPPRESS)
     told.add_argument("--install", type=Path, help="unpack tar files and put trained models into the package")
+    told.add_argument("--records", action="store_true", help="with --install: the package's weights stay as they are")
     return told
 
 
@@ -81,7 +87,7 @@ def main() -> None:
     args = parser().parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if args.install:
-        install(args.install)
+        install(args.install, weights=not args.records)
     elif args.score:
         score(args.score)
     elif args.shards:
@@ -125,7 +131,7 @@ def campaign(args: argparse.Namespace) -> None:
         # What is done is packed at once: a cut then costs what was running alone.
         if (found := written(args.work)) != seen:
             seen = found
-            pack(args.work, args.out)
+            pack(args)
         if all(worker is not None and worker.poll() is not None for worker in workers) and scorers.idle:
             break
         time.sleep(2.0)
@@ -134,7 +140,7 @@ def campaign(args: argparse.Namespace) -> None:
             _log.warning("a worker is not done at the end and is ended")
             worker.kill()
     scorers.kill()
-    for result in pack(args.work, args.out):
+    for result in pack(args):
         print(row(result))
     _log.info("everything after %.0f s", time.time() - started)
 
@@ -144,8 +150,8 @@ def project(args: argparse.Namespace, gpus: int) -> None:
     open_jobs = [job for job in chosen_jobs(args) if not (args.work / "jobs" / job.name / "result.json").is_file()]
     seconds = 0.0
     for job in open_jobs:
-        most = job.weight * (args.full_seconds if job.full else args.small_seconds)
-        seconds += OVERHEAD + (0.0 if job.objective == "untrained" else most)
+        most = 0.0 if job.timeless else job.weight * (args.full_seconds if job.full else args.small_seconds)
+        seconds += OVERHEAD + (most if job.trained else 0.0)
         _log.info("%6.0f s after the data, at most: %s", seconds / (gpus * args.places), job.name)
 
 
@@ -175,7 +181,8 @@ class Scorers:
             # The first one makes the stimuli that all others read.
             if len(self.running) >= self.most or (self.running and len(self.given) == 1):
                 return
-            if path.parent not in self.given and not (path.parent / "record.json").is_file():
+            known = ".shipped." in path.parent.name or (path.parent / "record.json").is_file()
+            if path.parent not in self.given and not known:
                 self.start(path.parent)
 
     @property
@@ -308,10 +315,13 @@ class Worker:
 
     def _needed(self, job: Job) -> float:
         """Return the seconds without which a job is not worth beginning."""
-        whole = self.args.last and not self.args.short and job.objective != "untrained"
-        return 0.6 * self._budget(job) if whole else 25.0
+        if not (self.args.last and job.trained) or self.args.short:
+            return 25.0
+        return 60.0 if job.timeless else 0.6 * self._budget(job)
 
     def _budget(self, job: Job) -> float:
+        if job.timeless:
+            return math.inf
         return job.weight * (self.args.full_seconds if job.full else self.args.small_seconds)
 
     def _precision(self, job: Job) -> str:
@@ -327,7 +337,7 @@ class Worker:
 
         if self.args.epochs:
             job = dataclasses.replace(job, epochs=min(job.epochs, self.args.epochs))
-        if self.args.short and job.objective != "untrained":
+        if self.args.short and job.trained:
             job = job.short(self.args.short)
         if self.args.learning_rate:
             job = dataclasses.replace(job, learning_rate=self.args.learning_rate)
@@ -363,7 +373,7 @@ def _end_with(parent: int) -> None:
 
 def chosen_jobs(args: argparse.Namespace) -> list[Job]:
     """Return the jobs of this call."""
-    return [job for job in all_jobs() if not args.only or args.only in job.name][: args.jobs]
+    return [job for job in all_jobs(args.ablation) if not args.only or args.only in job.name][: args.jobs]
 
 
 def score(folder: Path) -> None:
@@ -376,19 +386,29 @@ def score(folder: Path) -> None:
     if not (folder / "result.json").is_file():
         score_record("zhuang-small")
         return
-    job = read_json(folder / "result.json")["job"]
-    trained = job["objective"] != "untrained"
-    record = score_record(f"local-dir:{folder / 'best'}" if trained else job["model"], seed=job["seed"])
+    job = Job(**read_json(folder / "result.json")["job"])
+    if job.objective == "untrained":
+        record = score_record(job.model, weights_seed=job.seed)
+    else:
+        # Named alike in all seeds, and wherever the folders lie.
+        link = folder.parent.parent / f"seed{job.seed}" / job.title
+        link.parent.mkdir(exist_ok=True)
+        link.unlink(missing_ok=True)
+        link.symlink_to(folder / "best")
+        os.chdir(link.parent)
+        name = f"local-dir:{job.title}"
+        record = score_record(name, command=f"brainbench score {name}")
     write_text(folder / "record.json", record.to_json() + "\n")
 
 
-def pack(work: Path, out: Path) -> list[dict[str, Any]]:
+def pack(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Write what comes back, the most valuable first; return the results."""
     from brainbench.files import read_json, write_text
 
-    out.mkdir(parents=True, exist_ok=True)
+    work = args.work
+    args.out.mkdir(parents=True, exist_ok=True)
     results, curves = [], []
-    order = {job.name: index for index, job in enumerate(all_jobs())}
+    order = {job.name: index for index, job in enumerate(all_jobs(args.ablation))}
     folders = sorted((work / "jobs").glob("*"), key=lambda path: order.get(path.name, len(order)))
     for folder in folders:
         if (folder / "log.jsonl").is_file():
@@ -398,15 +418,16 @@ def pack(work: Path, out: Path) -> list[dict[str, Any]]:
             if (folder / "record.json").is_file():
                 result["score"] = read_json(folder / "record.json")["score"]
             results.append(result)
-    write_text(out / "results.jsonl", "".join(json.dumps(result) + "\n" for result in results))
-    write_text(out / "curves.jsonl", "".join(curves))
-    ship = {job.name for job in all_jobs() if job.ship}
+    write_text(work / "results.jsonl", "".join(json.dumps(result) + "\n" for result in results))
+    write_text(work / "curves.jsonl", "".join(curves))
+    told = [work / "results.jsonl", work / "curves.jsonl"]
+    ship = {job.name for job in all_jobs(args.ablation) if job.ship}
     ended = [folder for folder in folders if (folder / "result.json").is_file()]
     shipped = [path for folder in ended if folder.name in ship for path in sorted((folder / "best").glob("*"))]
     records = [path for folder in folders for path in (folder / "record.json", folder / "result.json")]
     states = [folder / "state.safetensors" for folder in folders]
     others = [path for folder in ended if folder.name not in ship for path in sorted((folder / "best").glob("*"))]
-    fill(out, work, [path for path in (*shipped, *records, *states, *others) if path.is_file()])
+    fill(args, [path for path in (*told, *records, *shipped, *states, *others) if path.is_file()])
     return results
 
 
@@ -425,11 +446,12 @@ def row(result: dict[str, Any]) -> str:
     return " ".join(part for part in parts if part)
 
 
-def fill(out: Path, work: Path, paths: list[Path]) -> None:
+def fill(args: argparse.Namespace, paths: list[Path]) -> None:
     """Put files into tar files of limited size, as many as fit, in order."""
     from brainbench.files import atomic_path
 
-    room = [TAR_BYTES] * TARS
+    out, work = args.out, args.work
+    room = [TAR_BYTES] * args.tars
     inside: list[list[Path]] = [[] for _ in room]
     left = 0
     for path in paths:
@@ -457,22 +479,34 @@ def unpack(folder: Path, work: Path) -> None:
             file.extractall(work, filter="data")
 
 
-def install(folder: Path) -> None:
-    """Put the trained networks that are to be shipped into the package, each with its untrained twin in its card."""
+def install(folder: Path, *, weights: bool = True) -> None:
+    """Put the trained networks that are to be shipped into the package, each with its untrained twin in its card.
+
+    Where the one that is there was evaluated on the same sweeps, the better one in validation stays. Records of all
+    other trained networks go to the leaderboard.
+    """
     from brainbench.files import read_json, write_json, write_text
     from brainbench.models.training.card import model_card
     from brainbench.models.training.config import TrainingConfig
+    from brainbench.types import ResultRecord
+    from leaderboards.store import write_record
 
     work = folder / "unpacked"
     unpack(folder, work)
-    target = ROOT / "brainbench" / "models" / "weights"
+    target, installed = ROOT / "brainbench" / "models" / "weights", set()
     for job in all_jobs():
         ended = work / "jobs" / job.name
-        if not (job.ship and (ended / "result.json").is_file()):
+        if not (weights and job.ship and (ended / "result.json").is_file()):
             continue
         if read_json(ended / "result.json")["status"] != "finished":
             _log.warning("%s diverged and is not installed", job.name)
             continue
+        before = work / "jobs" / f"{job.model}.{job.objective}.shipped.seed0" / "result.json"
+        if before.is_file():
+            old, new = read_json(before)["validation"], read_json(ended / "result.json")["validation"]
+            _log.info("%s: validation %.3f, of the one that is there %.3f", job.name, new, old)
+            if new <= old:
+                continue
         place = target / f"{job.model}.{job.objective}"
         shutil.rmtree(place, ignore_errors=True)
         shutil.copytree(ended / "best", place)
@@ -482,8 +516,14 @@ def install(folder: Path) -> None:
             info["twin_evaluation"] = read_json(twin)["evaluation"]
         write_json(place / "config.json", info)
         write_text(place / "README.md", model_card(TrainingConfig.from_mapping(info["training"]), info))
+        installed.add(job.name)
         size = sum(path.stat().st_size for path in place.iterdir())
         _log.info("%s: %.2f MB", place.relative_to(ROOT), size / 1e6)
+    for path in sorted((work / "jobs").glob("*/record.json")):
+        job = Job(**read_json(path.parent / "result.json")["job"])
+        if job.trained and job.name not in installed:
+            record = ResultRecord.from_json(path.read_text(encoding="utf-8"))
+            _log.info("%s", write_record(record, ROOT / "leaderboards" / "results"))
 
 
 if __name__ == "__main__":

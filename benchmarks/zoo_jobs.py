@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from brainbench.models.training.config import TrainingConfig
@@ -52,7 +52,8 @@ FULL_EPOCHS = 20
 
 @dataclass(frozen=True)
 class Job:
-    """One network to train, or an untrained twin to evaluate (``objective`` = ``untrained``)."""
+    """One network to train, or to evaluate as it is: untrained (``objective`` = ``untrained``) or as the package has it
+    (``model`` with its tag)."""
 
     model: str
     objective: str
@@ -65,6 +66,8 @@ class Job:
     """Highest; by model when None."""
     ship: bool = False
     """Its weights come back."""
+    timeless: bool = False
+    """It ends after its epochs, not by the share of time that is its own, so that others can be compared with it."""
 
     @property
     def full(self) -> bool:
@@ -84,11 +87,23 @@ class Job:
         return dataclasses.replace(self, epochs=max(1, round(steps / PASS)))
 
     @property
-    def name(self) -> str:
-        """Name of its folder."""
+    def trained(self) -> bool:
+        """Whether it is a training."""
+        return self.objective != "untrained" and "." not in self.model
+
+    @property
+    def title(self) -> str:
+        """What is trained how, in all seeds."""
+        if "." in self.model:
+            return f"{self.model}.shipped"
         variant = "" if self.augmentation == "physical" else f".{self.augmentation}"
         variant += f".masked{self.masking * 100:.0f}" if self.masking else ""
-        return f"{self.model}.{self.objective}{variant}.seed{self.seed}"
+        return f"{self.model}.{self.objective}{variant}"
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        return f"{self.title}.seed{self.seed}"
 
     def config(self, epochs: int) -> TrainingConfig:
         """Return the configuration that ``brainbench train`` would train it with.
@@ -117,9 +132,21 @@ class Job:
         return dataclasses.replace(chosen, compile="off")
 
 
-def all_jobs() -> list[Job]:
-    """Return every job, so ordered that a cut leaves whole results."""
-    return list(dict.fromkeys(_jobs()))
+def all_jobs(ablation: int | None = None) -> list[Job]:
+    """Return every job, so ordered that a cut leaves whole results.
+
+    Args:
+        ablation: Begin with the jobs that compare augmentations, of so many epochs each.
+    """
+    if ablation is None:
+        return list(dict.fromkeys(_jobs()))
+    # The published size takes longest and may go on beside all others.
+    jobs = [Job(*FULL[0], epochs=FULL_EPOCHS, timeless=True), *_compared(VARIED[0], ablation)]
+    jobs += [Job(VARIED[0], "untrained")]
+    jobs += [Job(f"{model}.{objective}", objective) for model in SMALL for objective in ("supervised", "simclr")]
+    for job in _further():
+        jobs.append(dataclasses.replace(job, epochs=ablation, timeless=True) if job.trained and not job.full else job)
+    return list({job.name: job for job in reversed(jobs)}.values())[::-1]
 
 
 def _jobs() -> Iterator[Job]:
@@ -130,14 +157,39 @@ def _jobs() -> Iterator[Job]:
         yield Job(model, "untrained")
     yield from _varied(VARIED[0])
     for seed in range(1, SEEDS):
-        for model in SMALL:
-            for objective in ("supervised", "simclr", "untrained"):
-                yield Job(model, objective, seed=seed)
+        yield from _seeds(SMALL, (seed,))
     for model, objective in FULL:
         yield Job(model, objective, epochs=FULL_EPOCHS)
         yield Job(model, "untrained")
     for model in VARIED[1:]:
         yield from _varied(model)
+
+
+def _further() -> Iterator[Job]:
+    """What is trained after a comparison: further seeds of the networks that are shipped, the cheapest first."""
+    yield from _seeds(SMALL[:1], range(1, SEEDS))
+    cheap = sorted(SMALL[1:], key=WEIGHTS.__getitem__)
+    yield from _seeds(cheap[:3], range(SEEDS))
+    for model, objective in FULL[3:]:
+        yield Job(model, objective, epochs=FULL_EPOCHS)
+        yield Job(model, "untrained")
+    yield Job(FULL[0][0], "untrained")
+    yield from _seeds(cheap[3:], range(SEEDS))
+
+
+def _seeds(models: Iterable[str], seeds: Iterable[int]) -> Iterator[Job]:
+    for model in models:
+        for seed in seeds:
+            for objective in ("supervised", "simclr"):
+                yield Job(model, objective, seed=seed, ship=seed == 0)
+            yield Job(model, "untrained", seed=seed)
+
+
+def _compared(model: str, epochs: int) -> list[Job]:
+    """Return the jobs of a comparison, those of two views first: they take twice as long."""
+    jobs = [job for objective in ("supervised", "simclr") for job in (Job(model, objective), *_varied(model))]
+    equal = [dataclasses.replace(job, epochs=epochs, ship=True, timeless=True) for job in dict.fromkeys(jobs)]
+    return sorted(equal, key=lambda job: job.objective)
 
 
 def _varied(model: str) -> Iterator[Job]:

@@ -358,6 +358,7 @@ def publish(trainer: Trainer, out: Path) -> dict[str, Any]:
         write(None)
         load_weights(model, out / BEST / WEIGHTS, what=job.model)
     found = evaluate(model, data.test.batches(), device=device)
+    checked = evaluate(model, data.validation.batches(), device=device)
     write(found)
     return {
         "job": dataclasses.asdict(job),
@@ -365,23 +366,26 @@ def publish(trainer: Trainer, out: Path) -> dict[str, Any]:
         "epochs": epochs,
         "best_epoch": best_epoch,
         "evaluation": dataclasses.asdict(found),
+        "validation": checked.top1,
         "data": data.summary(),
     }
 
 
-def evaluate_untrained(job: Job, data: Resident, out: Path, device: torch.device) -> dict[str, Any]:
-    """Probe and evaluate a network as it was drawn."""
-    config = dataclasses.replace(Job(job.model, "simclr", seed=job.seed).config(1), precision="float32")
+def evaluate_as_is(job: Job, data: Resident, out: Path, device: torch.device) -> dict[str, Any]:
+    """Evaluate a network of the package with its own decoder, or probe and evaluate one as it was drawn."""
     model = load_model(job.model, seed=job.seed, classes=len(data.classes)).to(device)
-    fit_probe(
-        model, data.train.batches(), classes=len(data.classes), epochs=config.probe_epochs, seed=job.seed, device=device
-    )
+    if job.objective == "untrained":
+        config = Job(job.model, "simclr", seed=job.seed).config(1)
+        probed = {"classes": len(data.classes), "epochs": config.probe_epochs, "seed": job.seed, "device": device}
+        fit_probe(model, data.train.batches(), **probed)
     found = evaluate(model, data.test.batches(), device=device)
+    checked = evaluate(model, data.validation.batches(), device=device)
     result = {
         "job": dataclasses.asdict(job),
         "name": job.name,
         "epochs": 0,
         "evaluation": dataclasses.asdict(found),
+        "validation": checked.top1,
         "data": data.summary(),
     }
     write_json(out / RESULT, result)
@@ -418,8 +422,8 @@ def run_job(
     if (out / RESULT).is_file():
         return str(read_json(out / RESULT).get("status", "finished"))
     started = time.monotonic()
-    if job.objective == "untrained":
-        evaluate_untrained(job, data, out, device)
+    if not job.trained:
+        evaluate_as_is(job, data, out, device)
         return "finished"
     state = read_plain(out / STATE)
     if state and state["data"] != data.hash:

@@ -18,15 +18,29 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "training-curves.png"
 
 
-def read(folders: list[Path], name: str) -> list[dict[str, Any]]:
-    """Read the lines of a file of every folder; later folders replace jobs of earlier ones."""
-    lines: dict[Any, dict[str, Any]] = {}
+def read(folder: Path, name: str) -> list[dict[str, Any]]:
+    """Read the lines of a file that came back."""
+    path = folder / name if (folder / name).is_file() else folder / "unpacked" / name
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
+
+
+def read_results(folders: list[Path]) -> list[dict[str, Any]]:
+    """Read all results; later folders replace jobs of earlier ones on the same data."""
+    found = {(line["name"], line["data"]["hash"]): line for folder in folders for line in read(folder, "results.jsonl")}
+    return list(found.values())
+
+
+def read_curves(folders: list[Path]) -> list[dict[str, Any]]:
+    """Read the curves of all jobs; of a job that was trained several times, the longest."""
+    longest: dict[str, list[dict[str, Any]]] = {}
     for folder in folders:
-        path = folder / name
-        for text in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
-            line = json.loads(text)
-            lines[line.get("name") or (line["job"], line["epoch"], line["kind"])] = line
-    return list(lines.values())
+        jobs: dict[str, dict[Any, dict[str, Any]]] = defaultdict(dict)
+        for line in read(folder, "curves.jsonl"):
+            jobs[line["job"]][line["epoch"], line["kind"]] = line
+        for name, lines in jobs.items():
+            if len(lines) >= len(longest.get(name, ())):
+                longest[name] = list(lines.values())
+    return [line for lines in longest.values() for line in lines]
 
 
 def share(value: float) -> str:
@@ -45,26 +59,28 @@ def score_text(result: dict[str, Any] | None) -> str:
 def accuracy_table(results: list[dict[str, Any]]) -> str:
     """One row per network and way of training, seeds together, beside its untrained twins."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
-    twins: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    twins: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for result in results:
-        job = result["job"]
+        job, data = result["job"], result["data"]["hash"]
         if job["objective"] == "untrained":
-            twins[job["model"]].append(result)
+            twins[job["model"], data].append(result)
         else:
-            key = (job["model"], job["objective"], job["augmentation"], job["masking"])
-            groups[key].append(result)
+            groups[job["model"], job["objective"], job["augmentation"], job["masking"], data].append(result)
     rows = []
-    for (model, objective, augmentation, masking), found in groups.items():
+    for (model, objective, augmentation, masking, data), found in groups.items():
         found.sort(key=lambda result: result["job"]["seed"])
-        first, others = found[0], twins.get(model, [])
+        architecture, _, shipped = model.partition(".")
+        first, others = found[0], twins.get((architecture, data), [])
         low, high = (first["evaluation"]["interval"][end] for end in ("low", "high"))
         seeds = ", ".join(share(result["evaluation"]["top1"]) for result in found[1:])
         rows.append(
             [
-                model,
+                architecture,
                 objective,
-                augmentation + (f" + {masking:.0%} masked" if masking else ""),
-                "/".join(str(result["epochs"]) for result in found),
+                "as shipped" if shipped else augmentation + (f" + {masking:.0%} masked" if masking else ""),
+                data[:4],
+                ", ".join(str(result["job"]["seed"]) for result in found),
+                "–" if shipped else "/".join(str(result["epochs"]) for result in found),
                 f"{share(first['evaluation']['top1'])} [{share(low)}, {share(high)}]",
                 seeds or "–",
                 share(mean(result["evaluation"]["top5"] for result in found)),
@@ -74,13 +90,14 @@ def accuracy_table(results: list[dict[str, Any]]) -> str:
                 score_text(next((item for item in others if item["job"]["seed"] == first["job"]["seed"]), None)),
             ]
         )
-    head = ["network", "objective", "augmentation", "epochs (published: 100)", "top-1 % of seed 0", "other seeds"]
+    head = ["network", "objective", "augmentation", "data", "seeds", "epochs (published: 100)", "top-1 % of the first"]
+    head += ["of the others"]
     head += ["top-5 %", "untrained twins, probed, %", "collapsed", "score", "score of the twin"]
     return table(head, rows)
 
 
 def data_text(results: list[dict[str, Any]]) -> str:
-    """Return which data the networks were trained on; where there are several sets, which networks on which."""
+    """Return which data the networks were trained on."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for result in results:
         groups[result["data"]["hash"]].append(result)
@@ -89,8 +106,7 @@ def data_text(results: list[dict[str, Any]]) -> str:
         data = found[0]["data"]
         told.append(
             f"Data {name}: {data['train']:,} sweeps to train, {data['validation']:,} to validate, {data['test']:,} of "
-            f"other objects to test; {data['left_out']:,} unstable ones left out"
-            + (f" ({', '.join(sorted(result['name'] for result in found))})." if len(groups) > 1 else ".")
+            f"other objects to test; {data['left_out']:,} unstable ones left out."
         )
     return " ".join(told)
 
@@ -133,7 +149,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=PICTURE)
     parser.add_argument("--note", default="", help="a sentence for the section: the machine, how long")
     args = parser.parse_args()
-    results, curves = read(args.folders, "results.jsonl"), read(args.folders, "curves.jsonl")
+    results, curves = read_results(args.folders), read_curves(args.folders)
     classes = results[0]["data"]["classes"]
     text = (
         f"{classes} classes (chance {100 / classes:.1f} %). {data_text(results)} {args.note}\n\n"

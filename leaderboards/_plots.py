@@ -142,29 +142,29 @@ def ablation(
     held: Callable[[Entry], str],
     what: str,
 ) -> Figure:
-    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed."""
-    groups: dict[tuple[str, str, str], dict[str, Entry]] = {}
+    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed, and on the same data."""
+    groups: dict[tuple[str, ...], dict[str, Entry]] = {}
     for entry in entries:
         if entry.trained and level(entry) and math.isfinite(entry.value):
-            model = (entry.architecture, entry.card.objective or "", held(entry))
+            model = (entry.architecture, entry.card.objective or "", held(entry), entry.card.accuracy_data or "")
             groups.setdefault(model, {}).setdefault(level(entry), entry)
     groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
     if not groups:
         return Figure(key, title, "", None, f"no model was trained with more than one {what}")
     twin = twins(entries)
     rows = [
-        (", ".join(part for part in model if part) if i == 0 else "", label, entry)
+        (", ".join(part for part in model[:-1] if part) if i == 0 else "", label, entry)
         for model, levels in groups.items()
         for i, (label, entry) in enumerate(sorted(levels.items()))
     ]
-    scale = score_scale([e.value for *_, e in rows], [e.interval for *_, e in rows], 330, WIDTH - 20)
+    scale = score_scale([e.value for *_, e in rows], [e.interval for *_, e in rows], 400, WIDTH - 20)
     colour = colours(label for _, label, _ in rows)
     drawing = Drawing(WIDTH, 44 + 20 * len(rows), f"{title}: {len(groups)} models")
     draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
     for index, (name, label, entry) in enumerate(rows):
         y = 44.0 + 20 * index
-        drawing.text(6, y + 4, cut(name, 38), "title small")
-        drawing.text(322, y + 4, cut(label, 22), "end")
+        drawing.text(6, y + 4, cut(name, 50), "title small")
+        drawing.text(392, y + 4, cut(label, 22), "end")
         draw_interval(drawing, scale, entry.interval, y, colour[label])
         other = twin.get(entry.architecture)
         if other is not None and math.isfinite(other.value):
@@ -256,3 +256,15 @@ def cut(text: str, length: int) -> str:
     """Shorten a label; of a path the last part stays."""
     text = text.rpartition("/")[2] or text
     return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def cut_name(name: str, length: int) -> str:
+    """Shorten a model's name in its middle: its end says how it was trained. ``./`` marks one of a local folder.
+
+    >>> cut_name("local-dir:zhuang-intersection-ln-small.simclr.masked75", 30)
+    './zhuang-inter…simclr.masked75'
+    """
+    folder, mark, inside = name.partition("local-dir:")
+    text = f"./{inside}" if mark and not folder and "/" not in inside else name.rpartition("/")[2] or name
+    head = (length - 1) // 2
+    return text if len(text) <= length else f"{text[:head]}…{text[head + 1 - length :]}"

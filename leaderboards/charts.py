@@ -18,6 +18,7 @@ from leaderboards._plots import (
     ablation,
     colours,
     cut,
+    cut_name,
     cut_words,
     draw_axis,
     draw_band,
@@ -67,7 +68,7 @@ def fit_per_model(board: Board, entries: Sequence[Entry]) -> Figure:
     y = 44.0
     for entry in rows:
         kind = colour[entry.card.objective or "not stated"]
-        drawing.text(242, y + 4, cut(entry.name, 36), "end" if entry.first is not None else "end quiet")
+        drawing.text(242, y + 4, cut_name(entry.name, 36), "end" if entry.first is not None else "end quiet")
         draw_interval(drawing, scale, entry.interval, y, kind)
         for row in entry.rows if entry.seeds > 1 else ():
             drawing.mark(scale.at(row.record.score.value), y, "dot", f"{kind} faint", size=2)
@@ -127,7 +128,7 @@ def layer_fit(board: Board, entries: Sequence[Entry]) -> Figure:
     for index, entry in enumerate(rows):
         x0, y0 = (index % columns) * w, (index // columns) * h
         scale = scale_of(values, y0 + h - 14, y0 + 24, top=1.0)
-        drawing.text(x0 + 24, y0 + 14, cut(entry.name, 27), "small title")
+        drawing.text(x0 + 24, y0 + 14, cut_name(entry.name, 27), "small title")
         for tick in (0.0, 0.5, 1.0):
             drawing.line(x0 + 24, scale.at(tick), x0 + w - 8, scale.at(tick), "one" if tick == 1 else "grid")
             drawing.text(x0 + 20, scale.at(tick) + 3.5, tick_text(tick), "end quiet small")
@@ -205,7 +206,7 @@ def accuracy(board: Board, entries: Sequence[Entry]) -> Figure:
     for entry in rows:
         kind = colour[entry.card.objective or "not stated"]
         card = entry.card
-        drawing.text(242, y + 4, cut(entry.name, 36), "end")
+        drawing.text(242, y + 4, cut_name(entry.name, 36), "end")
         twin = _twin_accuracy(entry, untrained)
         if twin is not None:
             drawing.rect(250, y - 6, scale.at(twin) - 250, 4, f"{kind} faint", tip=f"untrained twin {number(twin)}")

@@ -28,7 +28,7 @@ class DistillConfig:
 
     task: str
     teacher: str = ""
-    """Folder of the teacher's run."""
+    """Folder of the teacher's run, or the name of a shipped teacher."""
     hand: str = "xhand1"
     variant: str = "default"
     """Configuration of the task: ``default`` or ``published``."""

@@ -18,6 +18,7 @@ from robotics_bridge.policies.distill import CONFIG, DistillResult, StudentPolic
 from robotics_bridge.policies.distill_config import DistillConfig
 from robotics_bridge.policies.encoders import ARMS
 from robotics_bridge.policies.report import EVALUATION, GRADED
+from robotics_bridge.policies.shipped import list_teachers
 from robotics_bridge.policies.taxel_grid import TaxelGrid
 
 _log = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ def train_student(
     """Distil a student, or go on with an interrupted one, and evaluate it, also when its time is over.
 
     Args:
-        config: What is distilled; ``teacher`` names a folder.
+        config: What is distilled; ``teacher`` names a folder or a shipped one.
         out: The run's folder; a finished and evaluated run is left as it is.
         device: ``cpu``, or ``cuda`` for MuJoCo Warp.
         episodes: Per evaluation seed; 0 evaluates nothing. An evaluation says how many iterations the student had.
@@ -69,7 +70,10 @@ def train_student(
     from robotics_bridge.policies.teacher import load_teacher
 
     if not config.teacher:
-        raise UsageError("A student needs a teacher: the folder of a run of brainbench policy train.")
+        raise UsageError(
+            "A student needs a teacher: the folder of a run of brainbench policy train, or a shipped one "
+            f"({', '.join(list_teachers())})."
+        )
     out = Path(out)
     env = tasks.make(
         config.task, num_envs=config.num_envs, device=device, hand=config.hand, config=config.variant,

@@ -21,6 +21,7 @@ from brainbench.errors import DataError, DataFileNotFoundError, UsageError, miss
 from brainbench.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies import _tree
+from robotics_bridge.policies.shipped import teacher_path
 from robotics_bridge.tasks.settings import TeacherSettings
 
 if TYPE_CHECKING:
@@ -169,7 +170,7 @@ class Trainer:
         """Take up actor and critic of another run, with what they know of their inputs; learning begins anew.
 
         Args:
-            path: a folder of a run, or one of its ``model_<iteration>.safetensors``.
+            path: as :func:`load_teacher` takes it.
             std: standard deviation of actions to begin with; None takes that of the other run.
 
         Raises:
@@ -258,7 +259,7 @@ def train(
         save_every: iterations between checkpoints.
         keep_env: keep the environments' state too, which makes resuming exact; large batches may save without and
             go on with new episodes.
-        start: another run, or one of its models, whose actor and critic a new run begins with.
+        start: another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with.
         start_std: standard deviation of actions that it begins with; by default that of the other run.
         progress: called with iteration, total and a word.
 
@@ -368,25 +369,39 @@ def newest(run: Path) -> Path:
 
 
 def model_file(path: Path) -> Path:
-    """Return the last model of a run, given its folder, or the model itself."""
-    return newest(path) if path.is_dir() else path
+    """Return the last model of a run, given its folder or the name of a shipped one, or the model itself.
+
+    Raises:
+        UsageError: there is no such file, folder or name.
+        DataError: the folder holds no model.
+    """
+    found = teacher_path(path)
+    return newest(found) if found.is_dir() else found
 
 
 def load_teacher(run: str | Path, env: Env) -> Policy:
     """Return the trained actor of a run for an environment.
 
     Args:
-        run: folder of a run, or one of its ``model_<iteration>.safetensors``.
+        run: folder of a run, one of its ``model_<iteration>.safetensors``, or a name of
+            :func:`~robotics_bridge.policies.shipped.list_teachers`.
         env: environments with the same observation groups and actions.
 
     Raises:
+        UsageError: there is no such file, folder or name.
         DataError: there is no model, or it was trained on other observations.
     """
+    import torch
+
     path = Path(run)
     file = model_file(path)
     facts = read_json(file.parent / "config.json")
     settings = replace(env.task.teacher, **_plain(facts["settings"]))
-    trainer = Trainer(env, settings)
+    # To learn, a trainer seeds random numbers and spreads the first episodes; who only acts finds all as it was.
+    ages = env.episode_length_buf.clone()
+    with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+        trainer = Trainer(env, settings)
+    env.episode_length_buf.copy_(ages)
     try:
         trainer.algorithm.get_policy().load_state_dict(_tree.load(file)["actor"])
     except RuntimeError as error:

@@ -52,6 +52,16 @@ def test_a_played_task_leaves_a_strip_of_frames(tmp_path: Path) -> None:
     assert strip.read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_shipped_teacher_is_listed_and_plays() -> None:
+    found = {row["task"]: row["shipped"] for row in json.loads(_run("tasks", "--json"))}
+    assert "in_palm_rotate.careful" in found["in_palm_rotate"]
+    words = ("--agent", "in_palm_rotate.careful", "--seconds", "2", "--seed", "2", "--json")
+    out = json.loads(_run("play", "in_palm_rotate", *words))
+    # It keeps the block and reaches goals, of 20 each; random agents lose by moving.
+    assert out["episodes_ended"] == 0
+    assert out["reward"] > 5
+
+
 def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path) -> None:
     run = tmp_path / "run"
     out = _run(

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.types import GraphEdge, GraphNode, Interval, ModelGraph
-from leaderboards import _svg
+from leaderboards import _plots, _svg
 from leaderboards._diagram import diagram
 from leaderboards._plots import regression
 from leaderboards._svg import STYLE, Drawing, Scale, scale_of, standalone
@@ -154,7 +154,10 @@ def test_an_interval_off_the_axis_is_held_at_its_end(make_record):
 
 
 def test_the_examples_hold():
-    assert doctest.testmod(_svg).failed == 0
+    for module in (_svg, _plots):
+        found = doctest.testmod(module)
+        assert found.attempted
+        assert found.failed == 0
 
 
 def test_an_ablation_changes_one_thing_at_a_time(make_record):
@@ -168,3 +171,14 @@ def test_an_ablation_changes_one_thing_at_a_time(make_record):
     assert {text.split(":")[0] for text in shown} == {"net.b, physical", "net.c, image"}
     shown = [text for text in _texts(figures["masking"].drawing) if text.startswith("net.")]
     assert {text.split(":")[0] for text in shown} == {"net.a, 75% masked", "net.b, 0% masked"}
+
+
+def test_an_ablation_compares_what_was_tested_on_the_same_sweeps(make_record):
+    records = [
+        _trained(make_record("net.a", 0.9), "simclr", "physical", accuracy_data="old"),
+        _trained(make_record("net.b", 0.5), "simclr", "physical", accuracy_data="new"),
+        _trained(make_record("net.c", 0.4), "simclr", "image", accuracy_data="new"),
+        _trained(make_record("net.d", 0.3), "simclr", "none", accuracy_data="older"),
+    ]
+    shown = [text for text in _texts(_figures(*records)["augmentation"].drawing) if text.startswith("net.")]
+    assert {text.split(":")[0] for text in shown} == {"net.b, physical", "net.c, image"}

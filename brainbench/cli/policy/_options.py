@@ -59,15 +59,16 @@ def read_task_file(path: Path) -> None:
 
 
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
-    """Return the agent ``zero`` or ``random``, or the teacher or student of a run's folder."""
+    """Return the agent ``zero`` or ``random``, a shipped teacher, or the teacher or student of a run's folder."""
     from brainbench.errors import unknown_name
     from brainbench.files import read_json
-    from robotics_bridge.policies import evaluate, teacher
+    from robotics_bridge.policies import evaluate, shipped, teacher
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
-    if not Path(name).exists():
-        raise unknown_name("agent", name, evaluate.AGENTS, hint="Or give the folder of a training run.")
+    known = (*evaluate.AGENTS, *shipped.list_teachers())
+    if name not in known and not Path(name).exists():
+        raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
     config = Path(name) / "config.json"
     if config.is_file() and read_json(config).get("brainbench_student"):
         from robotics_bridge.policies.distill import StudentPolicy, load_student

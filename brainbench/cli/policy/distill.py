@@ -21,7 +21,7 @@ from brainbench.cli.policy._options import (
 
 def distill(
     task: TaskArgument,
-    teacher: Annotated[Path, typer.Option(help="Folder of a run of brainbench policy train.")],
+    teacher: Annotated[Path, typer.Option(help="A shipped teacher, or a folder of brainbench policy train.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the run; by default students/<what it is>.")] = None,
     observe: Annotated[str, typer.Option(help="Tactile observation type (table 4.3), or none.")] = "force_torque",
     placement: PlacementOption = "hand",
@@ -40,6 +40,8 @@ def distill(
     ),
     envs: Annotated[int, typer.Option(help="Environments at once.")] = 4096,
     iterations: Annotated[int | None, typer.Option(help="By default the task's own (table 4.4).")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="By default the task's own (table 4.4).")] = None,
+    epochs: Annotated[int | None, typer.Option(help="Over each iteration's steps; by default the task's own.")] = None,
     teacher_share: Annotated[float, typer.Option(help="Share of the teacher's actions at the start (β).")] = 0.0,
     teacher_iterations: Annotated[int, typer.Option(help="Iterations until that share is 0; 0 keeps it.")] = 0,
     aggregate: Annotated[int, typer.Option(help="Earlier rollouts that are learned from again.")] = 0,
@@ -67,6 +69,7 @@ def distill(
         resolution=resolution, noisy=noisy, encoder=encoder, encoder_settings=settings, embedder=embedder,
         num_envs=envs, iterations=iterations, teacher_share=teacher_share, teacher_iterations=teacher_iterations,
         aggregate=aggregate, precision=precision, save_interval=save_interval, seed=seed,
+        learning_rate=learning_rate, epochs=epochs,
     )  # fmt: skip
     folder = out or Path("students") / config.name
     with progress_bar() as progress:

@@ -6,8 +6,9 @@ from brainbench.cli._shared import JsonOption, emit, table
 
 
 def list_tasks(as_json: JsonOption = False) -> None:
-    """List the tasks with their success, length and observation groups."""
+    """List the tasks with their success, length, observation groups, and the teachers that come with the package."""
     from robotics_bridge import tasks
+    from robotics_bridge.policies.shipped import list_teachers
 
     found = []
     for name in tasks.list_tasks():
@@ -22,10 +23,14 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "success_from": task.success.threshold,
                 "student": student,
                 "teacher": list(task.groups["actor"]),
+                "shipped": list_teachers(name),
             }
         )
     rows = [
-        [f["task"], f["text"], f"{f['seconds']:g}", f"{f['metric']} ≥ {f['success_from']:.3g}", ", ".join(f["student"])]
+        [
+            f["task"], f["text"], f"{f['seconds']:g}", f"{f['metric']} ≥ {f['success_from']:.3g}",
+            ", ".join(f["student"]), ", ".join(f["shipped"]),
+        ]
         for f in found
-    ]
-    emit(found, table("", ["task", "what to do", "s", "success", "student sees"], rows), as_json=as_json)
+    ]  # fmt: skip
+    emit(found, table("", ["task", "what to do", "s", "success", "student sees", "teacher"], rows), as_json=as_json)

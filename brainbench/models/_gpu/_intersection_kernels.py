@@ -12,6 +12,8 @@ import triton.language as tl
 GATES = 4
 EPS = 1e-5
 WARPS = 8
+BACK_WARPS = 4
+"""Of a backward pass: fewer threads that keep more each take 72 instead of 84 µs (384 channels, NVIDIA H200)."""
 PROGRAMS = 264
 """Programs of a backward pass: each sums the gradients of the norms over its own rows, always in the same order."""
 
@@ -256,7 +258,7 @@ def settle_backward(
     d_x = torch.empty(batch, height, width, channels, dtype=x.dtype, device=x.device).permute(0, 3, 1, 2)
     d_state = torch.empty(batch, height, width, channels, dtype=state.dtype, device=x.device).permute(0, 3, 1, 2)
     d_y, d_after = by_places(d_y), by_places(d_after)
-    tall, wide = _tile(channels, 1024)
+    tall, wide = _tile(channels, 2048)
     settle_backward_kernel[(min(PROGRAMS, triton.cdiv(len(fused), tall)),)](
         fused,
         x,
@@ -283,7 +285,7 @@ def settle_backward(
         EPS,
         tall,
         wide,
-        num_warps=WARPS,
+        num_warps=BACK_WARPS,
     )
     return d_x, d_state
 

@@ -1,4 +1,4 @@
-"""The windows of a convolution as rows of a matrix, in one kernel per input: padded, joined and rounded on the way.
+"""The windows of a convolution as rows of a matrix, in one kernel: padded, joined and rounded on the way.
 
 Letters: R rows (stimulus, then place), C channels, (H, W) grid.
 """
@@ -10,19 +10,48 @@ import triton
 import triton.language as tl
 
 TILE = 2048
+"""Numbers that a program writes, all in one piece."""
+SLOTS = 4
+"""Inputs of one kernel; more are joined before."""
+
+
+@triton.jit
+def _from(
+    x, stimulus, batch_stride, h, w, row_stride, place_stride, c, there, FIRST: tl.constexpr, C: tl.constexpr,
+    UNIT: tl.constexpr,
+):  # fmt: skip
+    """Return the numbers of an input whose channels begin at ``FIRST``; zeros where others have theirs."""
+    c -= FIRST
+    mask = there & (c >= 0) & (c < C)
+    offset = stimulus.to(tl.int64) * batch_stride + h * row_stride + w * place_stride + c
+    offset = offset[:, None] * UNIT + tl.arange(0, UNIT)[None, :]
+    return tl.load(x + offset, mask=mask[:, None], other=0.0).to(tl.float32)
 
 
 @triton.jit
 def unfold_kernel(
-    x,
+    x0,
+    x1,
+    x2,
+    x3,
     out,
-    rows,
-    batch_stride,
-    channels,
-    row_stride,
-    place_stride,
-    start,
-    width,
+    total,
+    batch0,
+    batch1,
+    batch2,
+    batch3,
+    row0,
+    row1,
+    row2,
+    row3,
+    place0,
+    place1,
+    place2,
+    place3,
+    C0: tl.constexpr,
+    C1: tl.constexpr,
+    C2: tl.constexpr,
+    C3: tl.constexpr,
     UNIT: tl.constexpr,
     H: tl.constexpr,
     W: tl.constexpr,
@@ -32,27 +61,32 @@ def unfold_kernel(
     KERNEL_W: tl.constexpr,
     TOP: tl.constexpr,
     LEFT: tl.constexpr,
-    BLOCK_R: tl.constexpr,
-    BLOCK_C: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
-    """Write the windows of one input to its columns ``start`` to ``start + channels`` of every tap's ``width``.
+    """Write the windows of all inputs, whose channels lie side by side in every tap.
 
-    All that is counted in channels comes in units, so that the compiler knows how far addresses are aligned.
+    A thread's share is ``UNIT`` numbers, and all strides and channels come in units: threads that follow one another
+    write what follows in memory, whatever the channels are.
     """
-    r = tl.program_id(0) * BLOCK_R + tl.arange(0, BLOCK_R)
-    c = tl.program_id(1) * BLOCK_C + tl.arange(0, BLOCK_C)
-    stimulus, place = r // (OUT_H * OUT_W), r % (OUT_H * OUT_W)
-    top, left = place // OUT_W - TOP, place % OUT_W - LEFT
-    inside = (r < rows)[:, None] & (c < channels * UNIT)[None, :]
-    source = x + (stimulus.to(tl.int64) * batch_stride)[:, None] + c[None, :]
-    target = out + (r.to(tl.int64) * (KERNEL_H * KERNEL_W * width * UNIT))[:, None] + (start * UNIT + c)[None, :]
-    for i in tl.static_range(KERNEL_H):
-        for j in tl.static_range(KERNEL_W):
-            h, w = top + i, left + j
-            there = (h >= 0) & (h < H) & (w >= 0) & (w < W)
-            offset = ((h * row_stride + w * place_stride) * UNIT)[:, None]
-            value = tl.load(source + offset, mask=inside & there[:, None], other=0.0)
-            tl.store(target + (i * KERNEL_W + j) * width * UNIT, value.to(out.dtype.element_ty), mask=inside)
+    WIDTH: tl.constexpr = C0 + C1 + C2 + C3
+    start = tl.program_id(0).to(tl.int64) * BLOCK
+    inner = tl.arange(0, BLOCK)
+    unit = (start + inner).to(tl.uint32)
+    inside = start + inner < total
+    window, c = unit // WIDTH, (unit % WIDTH).to(tl.int32)
+    r, tap = window // (KERNEL_H * KERNEL_W), (window % (KERNEL_H * KERNEL_W)).to(tl.int32)
+    stimulus, place = r // (OUT_H * OUT_W), (r % (OUT_H * OUT_W)).to(tl.int32)
+    h, w = place // OUT_W - TOP + tap // KERNEL_W, place % OUT_W - LEFT + tap % KERNEL_W
+    there = inside & (h >= 0) & (h < H) & (w >= 0) & (w < W)
+    value = _from(x0, stimulus, batch0, h, w, row0, place0, c, there, 0, C0, UNIT)
+    if C1 > 0:
+        value += _from(x1, stimulus, batch1, h, w, row1, place1, c, there, C0, C1, UNIT)
+    if C2 > 0:
+        value += _from(x2, stimulus, batch2, h, w, row2, place2, c, there, C0 + C1, C2, UNIT)
+    if C3 > 0:
+        value += _from(x3, stimulus, batch3, h, w, row3, place3, c, there, C0 + C1 + C2, C3, UNIT)
+    target = out + start * UNIT + inner[:, None] * UNIT + tl.arange(0, UNIT)[None, :]
+    tl.store(target, value.to(out.dtype.element_ty), mask=inside[:, None])
 
 
 def unfold_into(
@@ -71,24 +105,27 @@ def unfold_into(
         kernel: Size of the window.
         pads: Zeros (above, left) of the inputs.
     """
-    width, start = sum(x.shape[1] for x in inputs), 0
-    for x in inputs:
-        channels = x.shape[1]
-        block = min(128, triton.next_power_of_2(channels))
-        tall = TILE // block
-        unit = math.gcd(8, channels, start, width, x.stride(2), x.stride(3))
-        unfold_kernel[triton.cdiv(len(out), tall), triton.cdiv(channels, block)](
-            x,
-            out,
-            len(out),
-            x.stride(0),
-            *(value // unit for value in (channels, x.stride(2), x.stride(3), start, width)),
-            unit,
-            *x.shape[2:],
-            *grid,
-            *kernel,
-            *pads,
-            tall,
-            block,
-        )
-        start += channels
+    if len(inputs) > SLOTS:
+        joined = torch.cat([x.permute(0, 2, 3, 1).to(out.dtype) for x in inputs[SLOTS - 1 :]], 3).permute(0, 3, 1, 2)
+        inputs = [*inputs[: SLOTS - 1], joined]
+    channels = [x.shape[1] for x in inputs] + [0] * (SLOTS - len(inputs))
+    used = [*inputs, *(inputs[0] for _ in range(SLOTS - len(inputs)))]
+    strides = [[x.stride(axis) for x in used] for axis in (0, 2, 3)]
+    unit = math.gcd(8, *channels, *(value for axis in strides for value in axis))
+    total = out.numel() // unit
+    if total >= 2**32:
+        raise ValueError(f"{out.numel():,} numbers of windows are too many for one kernel; compute fewer at a time.")
+    block = TILE // unit
+    unfold_kernel[(triton.cdiv(total, block),)](
+        *used,
+        out,
+        total,
+        *(value // unit for axis in strides for value in axis),
+        *(value // unit for value in channels),
+        unit,
+        *inputs[0].shape[2:],
+        *grid,
+        *kernel,
+        *pads,
+        block,
+    )

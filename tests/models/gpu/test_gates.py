@@ -157,3 +157,17 @@ def test_windows_are_those_of_pytorch(kernel: tuple[int, int], padding: Any, sin
     torch.testing.assert_close(windows, convolution.unfolded_plainly(inputs, geometry).float(), rtol=1e-2, atol=1e-2)
     with torch.no_grad():
         torch.testing.assert_close(convolution.convolve(conv, inputs), conv(torch.cat(inputs, 1)), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [(8, 16), (2, 6, 4), (16,), (3, 1, 2, 5, 1, 4)])
+def test_windows_of_any_number_of_inputs_lie_side_by_side(channels: tuple[int, ...], single: torch.device) -> None:
+    conv = Conv2d(sum(channels), 3, kernel_size=(2, 2), padding="same").to(single)
+    # One of single, the others of half precision; one is part of a larger map.
+    inputs = [torch.randn(5, 4, 6, count, device=single).permute(0, 3, 1, 2) for count in channels]
+    inputs[1:] = [x.bfloat16() for x in inputs[1:]]
+    inputs[0] = torch.cat((inputs[0], inputs[0]), 1)[:, : channels[0]]
+    geometry = convolution.Geometry.of(conv, (4, 6))
+    windows = convolution.unfolded(inputs, geometry)
+    assert windows.shape == (5 * 24, 4 * sum(channels))
+    expected = convolution.unfolded_plainly(inputs, geometry).float()
+    torch.testing.assert_close(windows.float(), expected, rtol=1e-2, atol=1e-2)

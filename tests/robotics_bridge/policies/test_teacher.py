@@ -87,6 +87,17 @@ def test_a_trained_actor_acts_alike_after_loading(tmp_path: Path) -> None:
     policy.reset(torch.ones(4, dtype=torch.bool))
 
 
+def test_loading_an_actor_leaves_episodes_and_random_numbers_as_they_were(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1)
+    env = _env()
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    load_teacher(tmp_path, env)
+    assert torch.equal(torch.rand(2), expected)
+    assert env.episode_length_buf.tolist() == [0] * 4
+
+
 def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
     train(_env(), tmp_path / "first", settings=SMALL, iterations=2)
     env = tasks.make("in_palm_rotate", config="careful", num_envs=4, threads=1)

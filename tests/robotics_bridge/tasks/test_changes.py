@@ -17,7 +17,7 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
         [
             "is_dropped=-300", "rotation_progress.clip=2", "obj_dist_penalty.target=0,0,0.51", "obj_dropped.height=.44",
             "reached_max_consecutive_successes.count=3", "entropy=0", "epochs=3", "schedule=fixed",
-            "learning_rate_range=1e-4,1e-3", "episode=15", "goal.start_threshold=0.4", "push.interval=1,2",
+            "learning_rate_range=1e-4,1e-3", "episode=15", "goal.start_threshold=0.3", "push.interval=1,2",
         ],
     )  # fmt: skip
     assert new.rewards["is_dropped"].weight == -300
@@ -29,8 +29,11 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
     assert new.teacher.learning_rate_range == (1e-4, 1e-3)
     assert new.goal is not None
     assert new.push is not None
-    assert (new.episode, new.goal.start_threshold, new.push.interval) == (15.0, 0.4, (1.0, 2.0))
-    assert changed(new, ["goal.start_threshold=none"]).goal == TASK.goal
+    assert (new.episode, new.goal.start_threshold, new.push.interval) == (15.0, 0.3, (1.0, 2.0))
+    assert changed(new, ["goal.start_threshold=0.4"]).goal == TASK.goal
+    none = changed(new, ["goal.start_threshold=none"]).goal
+    assert none is not None
+    assert none.start_threshold is None
     # What no word names stays.
     assert new.rewards["work_penalty"] is TASK.rewards["work_penalty"]
     assert TASK.rewards["is_dropped"].weight == -100
