@@ -49,8 +49,10 @@ class StudentResult:
     """Of the mean success."""
     note: str
     """What the interval does not cover; empty if nothing."""
+    gain: float | None = None
+    """Success beyond that of ``none``, over training seeds in common."""
     difference: Interval | None = None
-    """Of the success beyond that of ``none``, over training seeds in common."""
+    """Of the gain; with one training seed in common it covers chance in evaluation alone."""
     graded: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Quantity of :data:`GRADED` → mean over all episodes and half width of its 95 % interval over episodes."""
     iterations: int | None = None
@@ -135,8 +137,21 @@ def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult
         return result
     own, other = (dict(zip(r.seeds, r.success, strict=True)) for r in (result, bare))
     common = sorted(set(own) & set(other))
+    if not common:
+        return result
     gains = [own[seed] - other[seed] for seed in common]
-    return replace(result, difference=t_interval(gains, f"paired t over {len(common)} training seeds"))
+    interval = t_interval(gains, f"paired t over {len(common)} training seeds")
+    if len(result.seeds) == len(bare.seeds) == 1:
+        interval = newcombe_interval(result.value, result.episodes, bare.value, bare.episodes)
+    return replace(result, gain=float(np.mean(gains)), difference=interval)
+
+
+def newcombe_interval(share: float, count: int, other: float, others: int) -> Interval:
+    """Return the 95 % interval of the difference of two shares of independent episodes (Newcombe 1998, method 10)."""
+    one, two = wilson_interval(share, count), wilson_interval(other, others)
+    low = math.hypot(share - one.low, two.high - other)
+    high = math.hypot(one.high - share, other - two.low)
+    return Interval(share - other - low, share - other + high, 0.95, "Newcombe over episodes")
 
 
 def t_interval(values: Sequence[float], method: str, level: float = 0.95) -> Interval | None:
@@ -164,12 +179,15 @@ COLUMNS = (
 )  # fmt: skip
 
 
+_SHARED = COLUMNS[: COLUMNS.index("success")]
+"""What students have in common stands above a table rather than in each of its rows."""
+
+
 def rows(results: Sequence[StudentResult]) -> list[list[str]]:
     """Return the table of the results as text, in the order of :data:`COLUMNS`."""
     found = []
     for result in results:
         config, tactile = result.config, result.config.tactile
-        gain = result.difference
         where = ["–", "–", "–", "–"]
         if tactile is not None:
             learning = f" ({tactile.learning})" if "learning" in config.encoder_settings else ""
@@ -179,7 +197,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
                 config.task, config.hand, config.observe, *where,
                 "–" if result.iterations is None else str(result.iterations), str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
-                "–" if gain is None else f"{(gain.low + gain.high) / 2:+.3f}{_span(gain)}",
+                "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
                 *(_pm(result.graded.get(name)) for name in ("goals", "turn_rate", "seconds", "returns")),
             ]
         )  # fmt: skip
@@ -187,7 +205,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
 
 
 def _pm(value: tuple[float, float] | None) -> str:
-    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.1g}"
+    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.2g}"
 
 
 def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
@@ -222,6 +240,23 @@ def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:
         ]
         for item in agents
     ]  # fmt: skip
+
+
+def concise(table: Sequence[Sequence[str]]) -> tuple[str, list[str], list[list[str]]]:
+    """Return what all rows share, as words, and the columns and rows that are left.
+
+    Args:
+        table: Rows in the order of :data:`COLUMNS`; a dash in one of them says nothing.
+    """
+    said = [{row[index] for row in table} - {"–"} for index in range(len(COLUMNS))]
+    shared = [len(found) <= 1 and name in _SHARED for name, found in zip(COLUMNS, said, strict=True)]
+    words = [
+        f"{name}: {next(iter(found))}"
+        for name, found, drop in zip(COLUMNS, said, shared, strict=True)
+        if drop and found
+    ]
+    kept = [index for index, drop in enumerate(shared) if not drop]
+    return ", ".join(words), [COLUMNS[index] for index in kept], [[row[index] for index in kept] for row in table]
 
 
 def _span(interval: Interval | None) -> str:

@@ -10,7 +10,17 @@ from brainbench.errors import DataError
 from brainbench.files import write_json
 from leaderboards import rank, read_record, write_record
 from robotics_bridge.policies.distill_config import DistillConfig
-from robotics_bridge.policies.report import COLUMNS, agent_rows, draw, read_agents, read_results, records, rows
+from robotics_bridge.policies.report import (
+    COLUMNS,
+    agent_rows,
+    concise,
+    draw,
+    newcombe_interval,
+    read_agents,
+    read_results,
+    records,
+    rows,
+)
 
 
 def _write(folder, shares, *, seed=0, **changes) -> None:
@@ -56,6 +66,28 @@ def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
     expected = stats.binomtest(36, 60).proportion_ci(method="wilson")
     assert (only.interval.low, only.interval.high) == pytest.approx((expected.low, expected.high), abs=1e-6)
     assert records([only])[0].score.status == "unreliable"
+
+
+def test_the_gain_of_a_single_student_has_an_interval_over_episodes(tmp_path) -> None:
+    published = newcombe_interval(56 / 70, 70, 48 / 80, 80)  # Newcombe 1998, table II, contrast (a), method 10
+    assert (published.low, published.high) == pytest.approx((0.0524, 0.3339), abs=5e-5)
+    _write(tmp_path, [0.8] * 3, observe="force_torque")
+    _write(tmp_path, [0.5] * 3, observe="none")
+    felt, bare = read_results([tmp_path])
+    assert felt.gain == pytest.approx(0.3)
+    expected = newcombe_interval(0.8, 60, 0.5, 60)
+    assert felt.difference is not None
+    assert (felt.difference.low, felt.difference.high) == pytest.approx((expected.low, expected.high))
+    assert bare.gain is None
+
+
+def test_what_all_students_share_is_said_once(tmp_path) -> None:
+    _write(tmp_path, [0.8] * 3, observe="force_torque")
+    _write(tmp_path, [0.5] * 3, observe="none")
+    title, columns, found = concise(rows(read_results([tmp_path])))
+    assert title.startswith("task: in_palm_rotate, hand: xhand1, placement: hand, resolution: med, noise: clean")
+    assert columns[:2] == ["touch", "success"]
+    assert [row[0] for row in found] == ["force_torque", "none"]
 
 
 def test_what_happened_beside_success_stands_in_the_table_and_in_records(tmp_path) -> None:
