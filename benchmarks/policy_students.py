@@ -167,22 +167,28 @@ def lay_out(options: argparse.Namespace) -> None:
 
     results, agents = report.read_results([options.lay_out]), report.read_agents([options.lay_out])
     title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
-    notes = list(dict.fromkeys(result.note for result in results if result.note))
+    notes = report.remarks(results)
     found = {}
     for line in (options.lay_out / "students.jsonl").read_text(encoding="utf-8").splitlines():
         row = json.loads(line)
         if "control_steps" in row:
             found[row["arm"]] = row
+    least = min(row["iterations"] for row in found.values())
     cost = [
         [
-            name, f"{row['control_steps'] / 1e6:.1f}e6", f"{row['learning_s']:.0f}", f"{row['acting']:.2f}",
-            f"{row['learning']:.2f}", f"{row['loss']:.3f}",
+            name, f"{row['control_steps'] / 1e6:.1f}e6", f"{row['learning_s']:.0f}", f"{row['loss']:.3f}",
+            f"{seen(options.lay_out / name, least):.3f}",
         ]
         for name, row in found.items()
     ]  # fmt: skip
     parts = [f"{title}.", table(columns, rows)]
     parts += [f"Notes: {'; '.join(notes)}."] if notes else []
-    parts.append(table(["arm", "control steps", "s in all", "acting (s)", "learning (s)", "imitation loss"], cost))
+    parts.append(
+        table(
+            ["arm", "control steps", "s", "imitation loss", f"success in training, iterations {least - 7} to {least}"],
+            cost,
+        )
+    )
     if options.notes:
         parts.append(options.notes.read_text(encoding="utf-8").strip())
     body = "\n\n".join(parts)
@@ -192,6 +198,14 @@ def lay_out(options: argparse.Namespace) -> None:
         curves(options.lay_out, _PICTURES / "policy-students-learning.png")
         command = "python benchmarks/policy_students.py --teacher in_palm_rotate.careful --config careful"
         write_section(f"Students of {options.task}", command, body, where=options.device)
+
+
+def seen(folder: Path, iteration: int) -> float:
+    """Return the success in training over the last eight iterations up to one."""
+    (file,) = folder.rglob("log.jsonl")
+    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    own = [row for row in rows if row["kind"] == "episode" and iteration - 8 < row["step"] <= iteration]
+    return sum(row["episodes"] * row["success"] for row in own) / sum(row["episodes"] for row in own)
 
 
 def curves(folder: Path, path: Path) -> None:

@@ -27,7 +27,6 @@ def report(
     from robotics_bridge.policies import report as students
 
     results, agents = students.read_results(folders), students.read_agents(folders)
-    notes = list(dict.fromkeys(result.note for result in results if result.note))
     rows = [*students.rows(results), *students.agent_rows(agents)]
     title, columns, rows = students.concise(rows)
     first = columns.index("success")
@@ -48,5 +47,5 @@ def report(
         }
         for result in results
     ]  # fmt: skip
-    lines = [text, *(f"Note: {note}." for note in notes), *written]
+    lines = [text, *(f"Note: {note}." for note in students.remarks(results)), *written]
     emit({"students": data, "agents": agents, "records": written}, "\n".join(lines), as_json=as_json)
