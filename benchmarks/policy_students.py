@@ -8,6 +8,10 @@ Each student is a process of its own; ``--together`` of them share a GPU. Rows a
 ``STUDENTS/students.jsonl``. By ``--end`` all have stopped, were evaluated as far as they got (their evaluation says how
 far), and lie in ``$OUT/results.tar.gz`` (all but weights) and ``$OUT/models-<n>.tar`` of at most 15 MiB each, renewed
 whenever one is done. Run again with the same folder, students that were stopped go on.
+
+    python benchmarks/policy_students.py --lay-out STUDENTS [--notes FILE] [--device "2 × NVIDIA H200"] [--write]
+
+lays out what came back: a table, and with ``--write`` a section of RESULTS.md and two pictures.
 """
 
 from __future__ import annotations
@@ -34,6 +38,9 @@ ARMS: dict[str, dict[str, Any]] = {
     "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
 }
 _TAR = 15 << 20
+_SMOOTH = 8
+"""Iterations over which curves are averaged."""
+_PICTURES = Path(__file__).resolve().parent.parent / "docs" / "images"
 _PER_EVALUATION = 60.0
 """Seconds kept for making the environments of a student and for its evaluation."""
 
@@ -153,9 +160,92 @@ def pack(out: Path, to: Path, arms: list[str], most: int) -> None:
         file.close()
 
 
+def lay_out(options: argparse.Namespace) -> None:
+    """Print the comparison; with ``--write`` keep it as a section and draw it, and how students learned."""
+    from benchmarks.results import table, write_section
+    from robotics_bridge.policies import report
+
+    results, agents = report.read_results([options.lay_out]), report.read_agents([options.lay_out])
+    title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
+    notes = report.remarks(results)
+    found = {}
+    for line in (options.lay_out / "students.jsonl").read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        if "control_steps" in row:
+            found[row["arm"]] = row
+    least = min(row["iterations"] for row in found.values())
+    cost = [
+        [
+            name, f"{row['control_steps'] / 1e6:.1f}e6", f"{row['learning_s']:.0f}", f"{row['loss']:.3f}",
+            f"{seen(options.lay_out / name, least):.3f}",
+        ]
+        for name, row in found.items()
+    ]  # fmt: skip
+    parts = [f"{title}.", table(columns, rows)]
+    parts += [f"Notes: {'; '.join(notes)}."] if notes else []
+    parts.append(
+        table(
+            ["arm", "control steps", "s", "imitation loss", f"success in training, iterations {least - 7} to {least}"],
+            cost,
+        )
+    )
+    if options.notes:
+        parts.append(options.notes.read_text(encoding="utf-8").strip())
+    body = "\n\n".join(parts)
+    print(body)
+    if options.write:
+        report.draw(results, _PICTURES / "policy-students.png", agents=agents)
+        curves(options.lay_out, _PICTURES / "policy-students-learning.png")
+        command = "python benchmarks/policy_students.py --teacher in_palm_rotate.careful --config careful"
+        write_section(f"Students of {options.task}", command, body, where=options.device)
+
+
+def seen(folder: Path, iteration: int) -> float:
+    """Return the success in training over the last eight iterations up to one."""
+    (file,) = folder.rglob("log.jsonl")
+    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    own = [row for row in rows if row["kind"] == "episode" and iteration - 8 < row["step"] <= iteration]
+    return sum(row["episodes"] * row["success"] for row in own) / sum(row["episodes"] for row in own)
+
+
+def curves(folder: Path, path: Path) -> None:
+    """Draw success in training and the loss of imitation over the iterations of every student."""
+    import matplotlib as mpl
+    import numpy as np
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
+    for arm in ARMS:
+        for file in sorted((folder / arm).rglob("log.jsonl")):
+            rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+            for axis, kind, key in ((axes[0], "episode", "success"), (axes[1], "loss", "behaviour")):
+                own = [row for row in rows if row["kind"] == kind and key in row]
+                if not own:
+                    continue
+                weights = np.array([row.get("episodes", 1.0) for row in own])
+                window = np.ones(min(_SMOOTH, len(own)))
+                means = np.convolve(weights * [row[key] for row in own], window, "valid")
+                means /= np.convolve(weights, window, "valid")
+                axis.plot([row["step"] for row in own][len(window) - 1 :], means, label=arm, lw=1.2)
+    axes[0].set(ylabel="success in training", xlabel="iteration", ylim=(0, None))
+    axes[1].set(ylabel="imitation loss", xlabel="iteration", yscale="log")
+    axes[0].legend(frameon=False, fontsize=7)
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--teacher", type=Path, required=True, help="folder of a run, or one of its models")
+    parser.add_argument(
+        "--teacher", type=Path, default=Path("in_palm_rotate.careful"), help="shipped, or a run's folder"
+    )
+    parser.add_argument("--lay-out", type=Path, help="folder of students that came back")
+    parser.add_argument("--notes", type=Path, help="text that follows the tables")
+    parser.add_argument("--write", action="store_true")
     parser.add_argument("--task", default="in_palm_rotate")
     parser.add_argument("--config", default="default", help="configuration of the task; that of the teacher")
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
@@ -178,7 +268,9 @@ def main() -> None:
     parser.add_argument("--tars", type=int, default=5, help="files of weights at most; later arms keep none")
     parser.add_argument("--arm", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.arm is None:
+    if options.lay_out is not None:
+        lay_out(options)
+    elif options.arm is None:
         together(options)
     elif options.arm == "agents":
         others(options)

@@ -31,6 +31,7 @@ from brainbench.types import Progress
 from robotics_bridge.policies._chunk import ChunkStep
 from robotics_bridge.policies._rollouts import Recorder, Rollout
 from robotics_bridge.policies.distill_config import DistillConfig
+from robotics_bridge.policies.shipped import student_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 
 _log = logging.getLogger(__name__)
@@ -399,13 +400,18 @@ def save_student(path: Path, student: TactilePolicy) -> None:
 def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
     """Return a distilled student in evaluation mode, and its run's configuration.
 
+    Args:
+        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_students`.
+        device: Of its weights.
+
     Raises:
+        UsageError: there is no such folder or name.
         DataError: the folder holds no student, or its weights are damaged.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    folder = Path(folder)
+    folder = student_path(folder)
     described = read_json(folder / CONFIG)
     if not isinstance(described, dict) or described.get("brainbench_student") != 1:
         raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")

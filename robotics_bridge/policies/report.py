@@ -27,6 +27,7 @@ EVALUATION, AGENTS = "evaluation.json", "agents.json"
 GRADED = ("metric", "goals", "turn_rate", "seconds", "returns", "dropped")
 """Quantities of an episode beside its success."""
 _Z = 1.959964
+_STOPPED = "stopped after"
 FEWEST_SEEDS = 3
 """Training seeds below which an interval says little about a new student."""
 
@@ -49,8 +50,10 @@ class StudentResult:
     """Of the mean success."""
     note: str
     """What the interval does not cover; empty if nothing."""
+    gain: float | None = None
+    """Success beyond that of ``none``, over training seeds in common."""
     difference: Interval | None = None
-    """Of the success beyond that of ``none``, over training seeds in common."""
+    """Of the gain; with one training seed in common it covers chance in evaluation alone."""
     graded: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Quantity of :data:`GRADED` → mean over all episodes and half width of its 95 % interval over episodes."""
     iterations: int | None = None
@@ -115,7 +118,7 @@ def _result(members: Sequence[tuple[DistillConfig, list[dict[str, Any]]]]) -> St
     learned = min((item["iterations"] for item in every if item.get("iterations")), default=None)
     wanted = members[0][0].iterations
     if learned is not None and wanted is not None and learned < wanted:
-        note = "; ".join(filter(None, (note, f"stopped after {learned} of {wanted} iterations")))
+        note = "; ".join(filter(None, (note, f"{_STOPPED} {learned} of {wanted} iterations")))
     return StudentResult(
         members[0][0], seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=learned
     )
@@ -135,8 +138,21 @@ def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult
         return result
     own, other = (dict(zip(r.seeds, r.success, strict=True)) for r in (result, bare))
     common = sorted(set(own) & set(other))
+    if not common:
+        return result
     gains = [own[seed] - other[seed] for seed in common]
-    return replace(result, difference=t_interval(gains, f"paired t over {len(common)} training seeds"))
+    interval = t_interval(gains, f"paired t over {len(common)} training seeds")
+    if len(result.seeds) == len(bare.seeds) == 1:
+        interval = newcombe_interval(result.value, result.episodes, bare.value, bare.episodes)
+    return replace(result, gain=float(np.mean(gains)), difference=interval)
+
+
+def newcombe_interval(share: float, count: int, other: float, others: int) -> Interval:
+    """Return the 95 % interval of the difference of two shares of independent episodes (Newcombe 1998, method 10)."""
+    one, two = wilson_interval(share, count), wilson_interval(other, others)
+    low = math.hypot(share - one.low, two.high - other)
+    high = math.hypot(one.high - share, other - two.low)
+    return Interval(share - other - low, share - other + high, 0.95, "Newcombe over episodes")
 
 
 def t_interval(values: Sequence[float], method: str, level: float = 0.95) -> Interval | None:
@@ -164,12 +180,15 @@ COLUMNS = (
 )  # fmt: skip
 
 
+_SHARED = COLUMNS[: COLUMNS.index("success")]
+"""What students have in common stands above a table rather than in each of its rows."""
+
+
 def rows(results: Sequence[StudentResult]) -> list[list[str]]:
     """Return the table of the results as text, in the order of :data:`COLUMNS`."""
     found = []
     for result in results:
         config, tactile = result.config, result.config.tactile
-        gain = result.difference
         where = ["–", "–", "–", "–"]
         if tactile is not None:
             learning = f" ({tactile.learning})" if "learning" in config.encoder_settings else ""
@@ -179,7 +198,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
                 config.task, config.hand, config.observe, *where,
                 "–" if result.iterations is None else str(result.iterations), str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
-                "–" if gain is None else f"{(gain.low + gain.high) / 2:+.3f}{_span(gain)}",
+                "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
                 *(_pm(result.graded.get(name)) for name in ("goals", "turn_rate", "seconds", "returns")),
             ]
         )  # fmt: skip
@@ -187,7 +206,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
 
 
 def _pm(value: tuple[float, float] | None) -> str:
-    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.1g}"
+    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.2g}"
 
 
 def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
@@ -224,8 +243,64 @@ def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     ]  # fmt: skip
 
 
+def concise(table: Sequence[Sequence[str]]) -> tuple[str, list[str], list[list[str]]]:
+    """Return what all rows share, as words, and the columns and rows that are left.
+
+    Args:
+        table: Rows in the order of :data:`COLUMNS`; a dash in one of them says nothing.
+    """
+    said = [{row[index] for row in table} - {"–"} for index in range(len(COLUMNS))]
+    shared = [len(found) <= 1 and name in _SHARED for name, found in zip(COLUMNS, said, strict=True)]
+    words = [
+        f"{name}: {next(iter(found))}"
+        for name, found, drop in zip(COLUMNS, said, shared, strict=True)
+        if drop and found
+    ]
+    kept = [index for index, drop in enumerate(shared) if not drop]
+    return ", ".join(words), [COLUMNS[index] for index in kept], [[row[index] for index in kept] for row in table]
+
+
+def remarks(results: Sequence[StudentResult]) -> list[str]:
+    """Return every note once; how far students were trained in one line."""
+    parts = dict.fromkeys(part for result in results for part in result.note.split("; ") if part)
+    early = [result for result in results if _STOPPED in result.note]
+    found = [part for part in parts if not part.startswith(_STOPPED)]
+    if early:
+        learned = sorted({result.iterations or 0 for result in early})
+        span = f"{learned[0]}" if len(learned) == 1 else f"{learned[0]} to {learned[-1]}"
+        wanted = ", ".join(str(number) for number in sorted({result.config.iterations or 0 for result in early}))
+        found.append(f"{_STOPPED} {span} of {wanted} iterations")
+    return found
+
+
 def _span(interval: Interval | None) -> str:
     return "" if interval is None else f" [{interval.low:.3f}, {interval.high:.3f}]"
+
+
+def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
+    """Return the command line that distils a student, but for what only a file of students can set.
+
+    Args:
+        config: What is distilled.
+        stop_at: Iterations that it learned, where those are not all.
+    """
+    words: dict[str, Any] = {"teacher": config.teacher, "config": config.variant, "observe": config.observe}
+    if config.tactile is not None:
+        words |= {"placement": config.placement, "resolution": config.resolution, "encoder": config.encoder}
+        words |= {"noisy": ""} if config.noisy else {}
+        words |= {name: config.encoder_settings.get(name) for name in ("learning", "time", "pretrained")}
+    words |= {"embedder": config.embedder, "hand": config.hand, "envs": config.num_envs, "seed": config.seed}
+    words |= {"precision": config.precision, "iterations": config.iterations, "learning-rate": config.learning_rate}
+    words |= {"epochs": config.epochs, "stop-at": stop_at if stop_at != config.iterations else None}
+    usual = DistillConfig(task=config.task)
+    given = {
+        name: value
+        for name, value in words.items()
+        if value is not None
+        and value != getattr(usual, {"config": "variant", "envs": "num_envs"}.get(name, name), None)
+    }
+    text = " ".join(f"--{name} {value}".rstrip() for name, value in given.items())
+    return f"brainbench policy distill {config.task} {text}".rstrip()
 
 
 def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
@@ -262,7 +337,7 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
                     **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
                     **config.plain(),
                 },
-                "command": f"brainbench policy distill {config.task} --observe {config.observe}",
+                "command": command(config, stop_at=result.iterations),
             },
         )
         card = ModelCard(
@@ -286,7 +361,7 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
     longest = max(len(found) for found in panels.values())
     turning = any("turn_rate" in result.graded for result in results)
     figure, axes = plt.subplots(
-        len(panels), 1 + turning, figsize=(4.6 + 3.2 * turning, (1.3 + 0.34 * longest) * len(panels)), squeeze=False,
+        len(panels), 1 + turning, figsize=(4.6 + 3.2 * turning, (1.6 + 0.34 * longest) * len(panels)), squeeze=False,
         layout="constrained", sharey="row",
     )  # fmt: skip
     for row, ((task, hand), found) in zip(axes, panels.items(), strict=True):
@@ -312,7 +387,7 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
         row[0].set_title(f"{task}, {hand}", fontsize=9)
         row[-1].set_xlabel("share of successful episodes" if not turning else "rotation about the axis (rad/s)")
         if others:
-            row[-1].legend(fontsize=7, frameon=False)
+            row[0].legend(fontsize=7, frameon=False, ncols=len(others), loc="upper left", bbox_to_anchor=(0, -0.18))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)

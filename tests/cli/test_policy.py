@@ -62,6 +62,16 @@ def test_a_shipped_teacher_is_listed_and_plays() -> None:
     assert out["reward"] > 5
 
 
+def test_a_shipped_student_plays_with_its_own_touch_and_is_exported_here(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name = "in_palm_rotate.force-torque-hand"
+    out = json.loads(_run("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))
+    assert out["agent"] == name
+    _run("export", name)
+    assert (tmp_path / f"{name}.onnx").is_file()
+    assert json.loads((tmp_path / f"{name}.onnx.json").read_text())["deployment"]["observe"] == "force_torque"
+
+
 def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path) -> None:
     run = tmp_path / "run"
     out = _run(

@@ -59,23 +59,29 @@ def read_task_file(path: Path) -> None:
 
 
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
-    """Return the agent ``zero`` or ``random``, a shipped teacher, or the teacher or student of a run's folder."""
+    """Return the agent ``zero`` or ``random``, a shipped policy, or the teacher or student of a run's folder."""
     from brainbench.errors import unknown_name
     from brainbench.files import read_json
     from robotics_bridge.policies import evaluate, shipped, teacher
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
-    known = (*evaluate.AGENTS, *shipped.list_teachers())
+    known = (*evaluate.AGENTS, *shipped.list_teachers(), *shipped.list_students())
     if name not in known and not Path(name).exists():
         raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
-    config = Path(name) / "config.json"
+    config = _folder(name) / "config.json"
     if config.is_file() and read_json(config).get("brainbench_student"):
         from robotics_bridge.policies.distill import StudentPolicy, load_student
 
         student, _ = load_student(name, device=str(env.device))
         return StudentPolicy(student)
     return teacher.load_teacher(name, env)
+
+
+def _folder(name: str) -> Path:
+    from robotics_bridge.policies.shipped import FOLDER
+
+    return FOLDER / name if not Path(name).exists() and (FOLDER / name).is_dir() else Path(name)
 
 
 def touch_of(names: list[str]) -> dict[str, Any]:
@@ -89,7 +95,7 @@ def touch_of(names: list[str]) -> dict[str, Any]:
 
     found: dict[str, dict[str, Any]] = {}
     for name in names:
-        config = Path(name) / "config.json"
+        config = _folder(name) / "config.json"
         if config.is_file():
             facts = read_json(config)
             if facts.get("brainbench_student"):

@@ -31,6 +31,9 @@ def deploy(
         bool, typer.Option("--shadow", help="Simulate touch beside the hand, for what it does not measure.")
     ] = False,
     threads: Annotated[int, typer.Option(help="Of the network's computations.")] = 1,
+    ahead: Annotated[
+        bool, typer.Option("--realtime", help="Run the loop ahead of all other work of the computer (SCHED_FIFO).")
+    ] = False,
     record: Annotated[Path | None, typer.Option(help="Folder to write the session to, as a LeRobot data set.")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -39,6 +42,7 @@ def deploy(
     Exit status 1: it was stopped for safety.
     """
     from robotics_bridge.policies.deploy import session
+    from robotics_bridge.policies.deploy.realtime import realtime
     from robotics_bridge.policies.deploy.sim_hand import Faults, simulated_hand
     from robotics_bridge.policies.deploy.udp import UdpDriver
 
@@ -62,7 +66,8 @@ def deploy(
             link, limits={"timeout": timeout, "pressure": pressure}, sources=sources, fallback=fallback,
             threads=threads, record=tape,
         )  # fmt: skip
-        report = controller.run(seconds)
+        with realtime() if ahead else contextlib.nullcontext():
+            report = controller.run(seconds)
     facts: dict[str, Any] = {**vars(report)}
     if record is not None and tape is not None and tape.episode.state:
         facts["episode"] = str(tape.write(record, joints))

@@ -25,7 +25,7 @@ def evaluate(
     task: TaskArgument,
     agents: Annotated[
         list[str] | None,
-        typer.Argument(help="Shipped teachers, or folders of teachers or students; zero and random always run."),
+        typer.Argument(help="Shipped policies, or folders of teachers or students; zero and random always run."),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Per agent and seed.")] = 100,
     seeds: Annotated[int, typer.Option(help="Evaluation seeds.")] = 3,

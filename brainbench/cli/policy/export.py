@@ -11,8 +11,10 @@ from brainbench.cli._shared import JsonOption, emit
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Folder of a student (brainbench policy distill).")],
-    out: Annotated[Path | None, typer.Option(help="File to write; by default policy.onnx in the folder.")] = None,
+    run: Annotated[Path, typer.Argument(help="A shipped student, or a folder of brainbench policy distill.")],
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; by default policy.onnx in the folder of the run, or here.")
+    ] = None,
     format: Annotated[str, typer.Option(help="onnx or jit.")] = "onnx",
     as_json: JsonOption = False,
 ) -> None:
@@ -21,7 +23,8 @@ def export(
     from robotics_bridge.policies.export import STEPS, SUFFIXES, export_policy
 
     student, described = load_student(run)
-    target = out or run / f"policy{SUFFIXES.get(format, '')}"
+    suffix = SUFFIXES.get(format, "")
+    target = out or (run / f"policy{suffix}" if run.exists() else Path(f"{run.name}{suffix}"))
     found = export_policy(student, target, format=format, deployment=described["deployment"], name=run.name)
     text = (
         f"{found.path}: {found.state_size:,} numbers of memory; {STEPS} steps with resets differ by at most "

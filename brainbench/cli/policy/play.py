@@ -27,7 +27,7 @@ from brainbench.cli.policy._options import (
 
 def play(
     task: TaskArgument,
-    agent: Annotated[str, typer.Option(help="zero, random, a shipped teacher, or a run's folder.")] = "random",
+    agent: Annotated[str, typer.Option(help="zero, random, a shipped policy, or a run's folder.")] = "random",
     video: Annotated[Path | None, typer.Option(help="Write a film here (.mp4 or .gif).")] = None,
     strip: Annotated[Path | None, typer.Option(help="Write six frames side by side here (.png).")] = None,
     seconds: Annotated[float, typer.Option(help="Simulated time.")] = 4.0,

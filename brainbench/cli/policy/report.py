@@ -27,9 +27,10 @@ def report(
     from robotics_bridge.policies import report as students
 
     results, agents = students.read_results(folders), students.read_agents(folders)
-    notes = list(dict.fromkeys(result.note for result in results if result.note))
     rows = [*students.rows(results), *students.agent_rows(agents)]
-    text = table("", list(students.COLUMNS), rows, right=(7, 8))
+    title, columns, rows = students.concise(rows)
+    first = columns.index("success")
+    text = table(title, columns, rows, right=tuple(range(first, len(columns))))
     if picture is not None:
         students.draw(results, picture, agents=agents)
     written = []
@@ -40,11 +41,11 @@ def report(
     data = [
         {
             "student": result.config.name.rpartition("_seed")[0], "success": result.value, "seeds": result.seeds,
-            "interval": result.interval, "over_none": result.difference, "episodes": result.episodes,
-            "metric": result.metric, "note": result.note, "iterations": result.iterations,
+            "interval": result.interval, "over_none": result.difference, "gain": result.gain,
+            "episodes": result.episodes, "metric": result.metric, "note": result.note, "iterations": result.iterations,
             "graded": {name: {"mean": mean, "half_width": half} for name, (mean, half) in result.graded.items()},
         }
         for result in results
     ]  # fmt: skip
-    lines = [text, *(f"Note: {note}." for note in notes), *written]
+    lines = [text, *(f"Note: {note}." for note in students.remarks(results)), *written]
     emit({"students": data, "agents": agents, "records": written}, "\n".join(lines), as_json=as_json)

@@ -6,9 +6,9 @@ from brainbench.cli._shared import JsonOption, emit, table
 
 
 def list_tasks(as_json: JsonOption = False) -> None:
-    """List the tasks with their success, length, observation groups, and the teachers that come with the package."""
+    """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
-    from robotics_bridge.policies.shipped import list_teachers
+    from robotics_bridge.policies.shipped import list_students, list_teachers
 
     found = []
     for name in tasks.list_tasks():
@@ -23,7 +23,7 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "success_from": task.success.threshold,
                 "student": student,
                 "teacher": list(task.groups["actor"]),
-                "shipped": list_teachers(name),
+                "shipped": [*list_teachers(name), *list_students(name)],
             }
         )
     rows = [
@@ -33,4 +33,4 @@ def list_tasks(as_json: JsonOption = False) -> None:
         ]
         for f in found
     ]  # fmt: skip
-    emit(found, table("", ["task", "what to do", "s", "success", "student sees", "teacher"], rows), as_json=as_json)
+    emit(found, table("", ["task", "what to do", "s", "success", "student sees", "trained"], rows), as_json=as_json)

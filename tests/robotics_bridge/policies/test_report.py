@@ -7,10 +7,22 @@ import pytest
 from scipy import stats
 
 from brainbench.errors import DataError
-from brainbench.files import write_json
+from brainbench.files import read_json, write_json
 from leaderboards import rank, read_record, write_record
 from robotics_bridge.policies.distill_config import DistillConfig
-from robotics_bridge.policies.report import COLUMNS, agent_rows, draw, read_agents, read_results, records, rows
+from robotics_bridge.policies.report import (
+    COLUMNS,
+    agent_rows,
+    command,
+    concise,
+    draw,
+    newcombe_interval,
+    read_agents,
+    read_results,
+    records,
+    remarks,
+    rows,
+)
 
 
 def _write(folder, shares, *, seed=0, **changes) -> None:
@@ -58,6 +70,38 @@ def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
     assert records([only])[0].score.status == "unreliable"
 
 
+def test_the_gain_of_a_single_student_has_an_interval_over_episodes(tmp_path) -> None:
+    published = newcombe_interval(56 / 70, 70, 48 / 80, 80)  # Newcombe 1998, table II, contrast (a), method 10
+    assert (published.low, published.high) == pytest.approx((0.0524, 0.3339), abs=5e-5)
+    _write(tmp_path, [0.8] * 3, observe="force_torque")
+    _write(tmp_path, [0.5] * 3, observe="none")
+    felt, bare = read_results([tmp_path])
+    assert felt.gain == pytest.approx(0.3)
+    expected = newcombe_interval(0.8, 60, 0.5, 60)
+    assert felt.difference is not None
+    assert (felt.difference.low, felt.difference.high) == pytest.approx((expected.low, expected.high))
+    assert bare.gain is None
+
+
+def test_what_all_students_share_is_said_once(tmp_path) -> None:
+    _write(tmp_path, [0.8] * 3, observe="force_torque")
+    _write(tmp_path, [0.5] * 3, observe="none")
+    title, columns, found = concise(rows(read_results([tmp_path])))
+    assert title.startswith("task: in_palm_rotate, hand: xhand1, placement: hand, resolution: med, noise: clean")
+    assert columns[:2] == ["touch", "success"]
+    assert [row[0] for row in found] == ["force_torque", "none"]
+    assert remarks(read_results([tmp_path])) == ["one training seed: the interval covers chance in evaluation alone"]
+
+
+def test_how_far_students_were_trained_is_said_once(tmp_path) -> None:
+    for observe, learned in (("force_torque", 77), ("none", 110)):
+        _write(tmp_path, [0.5] * 3, observe=observe, iterations=6000)
+        folder = next(path for path in tmp_path.iterdir() if observe in path.name)
+        found = read_json(folder / "evaluation.json")
+        write_json(folder / "evaluation.json", [{**item, "iterations": learned} for item in found])
+    assert remarks(read_results([tmp_path]))[1:] == ["stopped after 77 to 110 of 6000 iterations"]
+
+
 def test_what_happened_beside_success_stands_in_the_table_and_in_records(tmp_path) -> None:
     config = DistillConfig(task="in_palm_rotate", observe="none", iterations=100)
     rng = np.random.default_rng(0)
@@ -97,6 +141,20 @@ def test_records_make_a_board_of_the_leaderboard(tmp_path) -> None:
     assert board.recordings == "in_palm_rotate on xhand1 (default)"
     assert "force_torque" in board.rows[0].record.score.name
     assert board.rows[0].first == 1
+
+
+def test_a_record_says_how_to_make_its_student(tmp_path) -> None:
+    assert command(DistillConfig(task="in_palm_rotate")) == "brainbench policy distill in_palm_rotate"
+    config = DistillConfig(
+        task="in_palm_rotate", variant="careful", teacher="in_palm_rotate.careful", placement="tips", noisy=True,
+        encoder="zhuang-small.simclr", encoder_settings={"learning": "frozen"}, num_envs=64, iterations=6000,
+        learning_rate=5e-4,
+    )  # fmt: skip
+    assert command(config, stop_at=77) == (
+        "brainbench policy distill in_palm_rotate --teacher in_palm_rotate.careful --config careful --placement tips "
+        "--encoder zhuang-small.simclr --noisy --learning frozen --envs 64 --iterations 6000 --learning-rate 0.0005 "
+        "--stop-at 77"
+    )
 
 
 def test_the_picture_shows_every_group(tmp_path) -> None:

@@ -10,7 +10,8 @@ import torch
 from brainbench.errors import UsageError
 from brainbench.files import read_json
 from robotics_bridge import tasks
-from robotics_bridge.policies.shipped import FOLDER, list_teachers, teacher_path
+from robotics_bridge.policies.distill import StudentPolicy, load_student
+from robotics_bridge.policies.shipped import FOLDER, list_students, list_teachers, student_path, teacher_path
 from robotics_bridge.policies.teacher import Trainer, load_teacher
 
 
@@ -28,11 +29,29 @@ def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     assert torch.isfinite(action).all()
 
 
+@pytest.mark.parametrize("name", list_students())
+def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path: Path) -> None:
+    from robotics_bridge.policies.export import export_policy
+
+    student, facts = load_student(name)
+    kept = facts["distill"]
+    assert (kept["task"], kept["teacher"]) == (name.partition(".")[0], "in_palm_rotate.careful")
+    assert f"# {name}\n" in (FOLDER / name / "README.md").read_text(encoding="utf-8")
+    assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.7e6
+    senses = {key: kept[key] for key in ("observe", "placement", "resolution", "noisy")}
+    env = tasks.make(kept["task"], num_envs=2, hand=kept["hand"], threads=1, **senses)
+    assert torch.isfinite(StudentPolicy(student)(env.reset())).all()
+    assert export_policy(student, tmp_path / "policy", deployment=facts["deployment"]).difference < 1e-5
+
+
 def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -> None:
     assert teacher_path("in_palm_rotate.careful") == FOLDER / "in_palm_rotate.careful"
     assert teacher_path(tmp_path) == tmp_path
     with pytest.raises(UsageError, match=r"did you mean 'in_palm_rotate.careful'.*folder of a training run"):
         teacher_path("in_palm_rotate.carefull")
+    assert student_path("in_palm_rotate.force-torque-hand").parent == FOLDER
+    with pytest.raises(UsageError, match=r"did you mean 'in_palm_rotate.force-torque-hand'"):
+        student_path("in_palm_rotate.force-torque-tips")
 
 
 def test_learning_goes_on_from_a_shipped_teacher() -> None:

@@ -1,0 +1,44 @@
+"""The records of policies that the repository ships are intact, make one board, and say how they were made."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import leaderboards
+from brainbench.cli import app
+from leaderboards import rank, read_records
+from leaderboards.entries import entries_of
+from tests.leaderboards.test_schema import VALIDATOR
+
+POLICIES = Path(leaderboards.__file__).parent / "policies"
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return read_records(POLICIES)
+
+
+def test_records_are_intact_and_make_one_board_on_which_touch_leads(stored) -> None:
+    assert [item.problem for item in stored if item.problem] == []
+    for item in stored:
+        VALIDATOR.validate(json.loads(item.path.read_text(encoding="utf-8")))
+    (board,) = rank(item.record for item in stored if item.record)
+    names = [entry.name for entry in entries_of(board)]
+    assert names[0].startswith("in_palm_rotate_xhand1_force_torque_hand")
+    assert names[-1] == "in_palm_rotate_xhand1_none"
+
+
+def test_every_command_is_one_that_exists_and_one_student_is_no_reliable_answer(stored) -> None:
+    for item in stored:
+        assert item.record is not None
+        assert item.record.score.status == "unreliable"
+        program, *words = shlex.split(item.record.score.provenance["command"])
+        assert program == "brainbench"
+        # All words are parsed before help is shown: an unknown option would be refused.
+        assert CliRunner().invoke(app, [*words, "--help"]).exit_code == 0
+        assert CliRunner().invoke(app, [*words, "--no-such-option", "--help"]).exit_code != 0
