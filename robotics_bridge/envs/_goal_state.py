@@ -68,7 +68,9 @@ class GoalState:
         if self._turn is not None:
             twist, _ = twist_and_swing(step, rotate(quat, self._turn))
             self.turned += twist
-            self.turned_held += twist * held
+            if self._axis is None:
+                # Where a goal commands an axis, rotation about that one is counted, below.
+                self.turned_held += twist * held
             place = self._step % self._ring.shape[0]
             self.turned_before.copy_(self._ring.index_select(0, place)[0])
             self._ring.index_copy_(0, place, self.turned.unsqueeze(0))
