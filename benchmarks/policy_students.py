@@ -114,7 +114,8 @@ def together(options: argparse.Namespace) -> None:
     """Run all arms, some at once per GPU, and pack what they leave."""
     options.out.mkdir(parents=True, exist_ok=True)
     words = sys.argv[1:]
-    waiting = ["agents", *options.arms]
+    waiting = [*([] if options.no_agents else ["agents"]), *options.arms]
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     running: dict[subprocess.Popen[bytes], tuple[str, int]] = {}
     places = [gpu for _ in range(options.together) for gpu in range(options.gpus)]
     while waiting or running:
@@ -126,7 +127,7 @@ def together(options: argparse.Namespace) -> None:
             gpu = places.pop(0)
             environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "2")}
             if options.device != "cpu":
-                environment["CUDA_VISIBLE_DEVICES"] = str(gpu)
+                environment["CUDA_VISIBLE_DEVICES"] = visible[gpu] if visible else str(gpu)
             process = subprocess.Popen([sys.executable, __file__, *words, "--arm", name], env=environment)
             running[process] = name, gpu
         time.sleep(0.2)
@@ -251,6 +252,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gpus", type=int, default=1)
+    parser.add_argument("--no-agents", action="store_true", help="do not evaluate the teacher, zero and random again")
     parser.add_argument("--together", type=int, default=1, help="processes per GPU")
     parser.add_argument("--envs", type=int, default=4096)
     parser.add_argument("--iterations", type=int, default=300, help="after which each student stops")
