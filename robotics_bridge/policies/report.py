@@ -55,9 +55,14 @@ class StudentResult:
     difference: Interval | None = None
     """Of the gain; with one training seed in common it covers chance in evaluation alone."""
     graded: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Quantity of :data:`GRADED` → mean over all episodes and half width of its 95 % interval over episodes."""
+    """Quantity of :data:`GRADED` → mean over all episodes and half width of its 95 % interval: t over training seeds,
+    with one training seed normal over episodes."""
     iterations: int | None = None
     """Fewest that any of the students learned."""
+    learned: tuple[int | None, ...] = ()
+    """Iterations that each of the students learned, in the order of their seeds; None where it is not said."""
+    unused: tuple[str, ...] = ()
+    """Evaluated students of this group that were left out, and why."""
 
     @property
     def value(self) -> float:
@@ -65,29 +70,70 @@ class StudentResult:
         return float(np.mean(self.success))
 
 
-def read_results(folders: Iterable[str | Path]) -> list[StudentResult]:
+def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[StudentResult]:
     """Return the results of all evaluated students below some folders, best first within each task and hand.
 
+    Where a student was trained more than once with the same training seed, the one that learned longest counts: two
+    runs of one seed are no two seeds.
+
+    Args:
+        folders: Searched for students at any depth.
+        at_least: Iterations; students that learned fewer are left out. Those that do not say how many stay.
+
     Raises:
-        DataFileNotFoundError: no student was evaluated there.
+        DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
         DataError: an evaluation is damaged.
     """
-    groups: dict[str, list[tuple[DistillConfig, list[dict[str, Any]]]]] = defaultdict(list)
+    groups: dict[str, list[_Member]] = defaultdict(list)
     for root in folders:
         for path in sorted(Path(root).rglob(EVALUATION)):
             described = read_json(path.parent / "config.json")
             if not isinstance(described, dict) or not isinstance(described.get("distill"), dict):
                 continue
-            config = DistillConfig.of(described["distill"])
-            groups[config.name.rpartition("_seed")[0]].append((config, _evaluations(path)))
+            member = _Member(DistillConfig.of(described["distill"]), tuple(_evaluations(path)))
+            groups[member.config.name.rpartition("_seed")[0]].append(member)
     if not groups:
         raise DataFileNotFoundError(
             "No evaluated student was found; brainbench policy distill evaluates what it has trained."
         )
-    results = [_result(members) for members in groups.values()]
+    results = [result for members in groups.values() if (result := _result(*_counted(members, at_least))) is not None]
+    if not results:
+        longest = max(member.learned or 0 for members in groups.values() for member in members)
+        raise DataFileNotFoundError(
+            f"None of the students learned {at_least} iterations; the longest that any did is {longest}."
+        )
     bare = {(r.config.task, r.config.hand): r for r in results if r.config.observe == "none"}
     found = [_against(result, bare.get((result.config.task, result.config.hand))) for result in results]
     return sorted(found, key=lambda r: (r.config.task, r.config.hand, -r.value, r.config.name))
+
+
+@dataclass(frozen=True)
+class _Member:
+    """One student and its evaluations, one per evaluation seed."""
+
+    config: DistillConfig
+    evaluations: tuple[dict[str, Any], ...]
+
+    @property
+    def learned(self) -> int | None:
+        """Iterations; None where no evaluation says how many."""
+        return min((item["iterations"] for item in self.evaluations if item.get("iterations")), default=None)
+
+
+def _counted(members: Sequence[_Member], at_least: int) -> tuple[list[_Member], tuple[str, ...]]:
+    """Return one student per training seed, by seed, and what is said of the others."""
+    best: dict[int, _Member] = {}
+    unused = []
+    for member in sorted(members, key=lambda member: -(member.learned or 0)):
+        seed, learned = member.config.seed, "unknown" if member.learned is None else str(member.learned)
+        told = f"{member.config.name.replace('_seed', ', seed ')} after {learned} iterations"
+        if member.learned is not None and member.learned < at_least:
+            unused.append(f"{told} (fewer than {at_least})")
+        elif seed in best:
+            unused.append(f"{told} (trained once more, for {best[seed].learned})")
+        else:
+            best[seed] = member
+    return [best[seed] for seed in sorted(best)], tuple(unused)
 
 
 def _evaluations(path: Path) -> list[dict[str, Any]]:
@@ -100,11 +146,12 @@ def _evaluations(path: Path) -> list[dict[str, Any]]:
     return found
 
 
-def _result(members: Sequence[tuple[DistillConfig, list[dict[str, Any]]]]) -> StudentResult:
-    members = sorted(members, key=lambda member: member[0].seed)
-    shares = [float(np.mean([np.mean(item["success"]) for item in found])) for _, found in members]
-    every = [item for _, found in members for item in found]
-    graded = {name: found for name in GRADED if (found := _mean(every, name)) is not None}
+def _result(members: Sequence[_Member], unused: tuple[str, ...]) -> StudentResult | None:
+    if not members:
+        return None
+    shares = [float(np.mean([np.mean(item["success"]) for item in member.evaluations])) for member in members]
+    every = [item for member in members for item in member.evaluations]
+    graded = {name: found for name in GRADED if (found := _grade(members, name)) is not None}
     episodes = sum(len(item["success"]) for item in every)
     interval = t_interval(shares, f"t over {len(members)} training seeds")
     note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
@@ -113,22 +160,36 @@ def _result(members: Sequence[tuple[DistillConfig, list[dict[str, Any]]]]) -> St
     if interval is None or len(set(shares)) == 1:
         # Equal shares, such as no success at all, tell nothing of their spread.
         interval = wilson_interval(float(np.mean(shares)), episodes)
-    seeds = tuple(config.seed for config, _ in members)
+    first, seeds = members[0].config, tuple(member.config.seed for member in members)
     metric = graded.get("metric", (math.nan, math.nan))[0]
-    learned = min((item["iterations"] for item in every if item.get("iterations")), default=None)
-    wanted = members[0][0].iterations
-    if learned is not None and wanted is not None and learned < wanted:
-        note = "; ".join(filter(None, (note, f"{_STOPPED} {learned} of {wanted} iterations")))
-    return StudentResult(
-        members[0][0], seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=learned
-    )
+    learned = tuple(member.learned for member in members)
+    fewest = min((number for number in learned if number is not None), default=None)
+    result = StudentResult(
+        first, seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=fewest,
+        learned=learned, unused=unused,
+    )  # fmt: skip
+    if fewest is not None and first.iterations is not None and fewest < first.iterations:
+        stopped = f"{_STOPPED} {_learned(result)} of {first.iterations} iterations"
+        result = replace(result, note="; ".join(filter(None, (note, stopped))))
+    return result
 
 
-def _mean(every: Sequence[Mapping[str, Any]], name: str) -> tuple[float, float] | None:
-    values = np.concatenate([np.asarray(item.get(name) or [], dtype=float) for item in every])
-    values = values[np.isfinite(values)]
+def _learned(*results: StudentResult) -> str:
+    """Return the fewest and the most iterations that some students learned; empty where none is said."""
+    numbers = sorted({number for result in results for number in result.learned if number is not None})
+    return " to ".join(str(number) for number in numbers[:: max(len(numbers) - 1, 1)])
+
+
+def _grade(members: Sequence[_Member], name: str) -> tuple[float, float] | None:
+    """Return the mean of a quantity and the half width of its interval; None where no student tells of it."""
+    told = [[np.asarray(item.get(name) or [], dtype=float) for item in member.evaluations] for member in members]
+    seeds = [found[np.isfinite(found)] for found in map(np.concatenate, told)]
+    values = np.concatenate(seeds)
     if not len(values):
         return None
+    over = t_interval([float(found.mean()) for found in seeds if len(found)], "")
+    if over is not None:
+        return float(values.mean()), (over.high - over.low) / 2
     spread = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
     return float(values.mean()), _Z * spread / math.sqrt(len(values))
 
@@ -196,7 +257,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
         found.append(
             [
                 config.task, config.hand, config.observe, *where,
-                "–" if result.iterations is None else str(result.iterations), str(len(result.seeds)),
+                _learned(result) or "–", str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
                 "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
                 *(_pm(result.graded.get(name)) for name in ("goals", "turn_rate", "seconds", "returns")),
@@ -261,16 +322,14 @@ def concise(table: Sequence[Sequence[str]]) -> tuple[str, list[str], list[list[s
 
 
 def remarks(results: Sequence[StudentResult]) -> list[str]:
-    """Return every note once; how far students were trained in one line."""
+    """Return every note once; how far students were trained in one line; at the end the students left out."""
     parts = dict.fromkeys(part for result in results for part in result.note.split("; ") if part)
     early = [result for result in results if _STOPPED in result.note]
     found = [part for part in parts if not part.startswith(_STOPPED)]
     if early:
-        learned = sorted({result.iterations or 0 for result in early})
-        span = f"{learned[0]}" if len(learned) == 1 else f"{learned[0]} to {learned[-1]}"
         wanted = ", ".join(str(number) for number in sorted({result.config.iterations or 0 for result in early}))
-        found.append(f"{_STOPPED} {span} of {wanted} iterations")
-    return found
+        found.append(f"{_STOPPED} {_learned(*early)} of {wanted} iterations")
+    return found + [f"left out: {told}" for result in results for told in result.unused]
 
 
 def _span(interval: Interval | None) -> str:
@@ -334,10 +393,14 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
                     "episodes": result.episodes,
                     "metric": result.metric,
                     "iterations_learned": result.iterations,
+                    "seeds": list(result.seeds),
                     **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
                     **config.plain(),
                 },
-                "command": command(config, stop_at=result.iterations),
+                "command": "; ".join(
+                    command(replace(config, seed=seed), stop_at=learned)
+                    for seed, learned in zip(result.seeds, result.learned, strict=True)
+                ),
             },
         )
         card = ModelCard(

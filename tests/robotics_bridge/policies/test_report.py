@@ -35,6 +35,11 @@ def _write(folder, shares, *, seed=0, **changes) -> None:
     write_json(folder / config.name / "evaluation.json", found)
 
 
+def _learn(folder, iterations) -> None:
+    for path in folder.rglob("evaluation.json"):
+        write_json(path, [{**item, "iterations": iterations} for item in read_json(path)])
+
+
 def _three_seeds(folder) -> None:
     for seed, (felt, bare) in enumerate([(0.8, 0.5), (0.9, 0.55), (0.7, 0.45)]):
         _write(folder, [felt] * 3, seed=seed, observe="force_torque")
@@ -91,6 +96,58 @@ def test_what_all_students_share_is_said_once(tmp_path) -> None:
     assert columns[:2] == ["touch", "success"]
     assert [row[0] for row in found] == ["force_torque", "none"]
     assert remarks(read_results([tmp_path])) == ["one training seed: the interval covers chance in evaluation alone"]
+
+
+def test_two_runs_of_one_training_seed_are_no_two_seeds(tmp_path) -> None:
+    for run, share, learned in (("first", 0.4, 77), ("again", 0.6, 110)):
+        _write(tmp_path / run, [share] * 3, observe="none", iterations=110)
+        _learn(tmp_path / run, learned)
+    (only,) = read_results([tmp_path])
+    assert (only.seeds, only.success, only.learned) == ((0,), (pytest.approx(0.6),), (110,))
+    assert only.unused == ("in_palm_rotate_xhand1_none, seed 0 after 77 iterations (trained once more, for 110)",)
+    assert f"left out: {only.unused[0]}" in remarks([only])
+    assert only.note == "one training seed: the interval covers chance in evaluation alone"
+
+
+def test_students_that_learned_too_little_are_left_out_by_name(tmp_path) -> None:
+    for seed, learned in enumerate((110, 98, 18)):
+        _write(tmp_path / str(seed), [0.5 + seed / 10] * 3, seed=seed, observe="none", iterations=110)
+        _learn(tmp_path / str(seed), learned)
+    (every,) = read_results([tmp_path])
+    assert (every.seeds, every.iterations) == ((0, 1, 2), 18)
+    assert "stopped after 18 to 110 of 110 iterations" in every.note
+    (kept,) = read_results([tmp_path], at_least=98)
+    assert (kept.seeds, kept.learned) == ((0, 1), (110, 98))
+    assert kept.unused == ("in_palm_rotate_xhand1_none, seed 2 after 18 iterations (fewer than 98)",)
+    assert "only 2 training seeds" in kept.note
+    assert rows([kept])[0][COLUMNS.index("iterations")] == "98 to 110"
+    with pytest.raises(DataError, match="None of the students learned 500 iterations; the longest that any did is 110"):
+        read_results([tmp_path], at_least=500)
+
+
+def test_what_happened_beside_success_has_t_intervals_over_training_seeds(tmp_path) -> None:
+    means = [0.8, 1.1, 0.9]
+    for seed, mean in enumerate(means):
+        _write(tmp_path, [0.5] * 3, seed=seed, observe="none")
+        path = next(path for path in tmp_path.iterdir() if path.name.endswith(f"seed{seed}")) / "evaluation.json"
+        write_json(path, [{**item, "goals": [mean - 0.5, mean + 0.5] * 10} for item in read_json(path)])
+    (only,) = read_results([tmp_path])
+    mean, half = only.graded["goals"]
+    low, high = stats.ttest_1samp(means, 0).confidence_interval()
+    assert (mean - half, mean + half) == pytest.approx((low, high))
+
+
+def test_a_record_of_several_seeds_says_how_to_make_each(tmp_path) -> None:
+    _three_seeds(tmp_path)
+    score = records(read_results([tmp_path]))[0].score
+    assert [subject.subject for subject in score.subjects] == ["seed 0", "seed 1", "seed 2"]
+    assert score.status == "ok"
+    assert score.provenance["settings"]["seeds"] == [0, 1, 2]
+    assert score.provenance["command"].split("; ") == [
+        "brainbench policy distill in_palm_rotate",
+        "brainbench policy distill in_palm_rotate --seed 1",
+        "brainbench policy distill in_palm_rotate --seed 2",
+    ]
 
 
 def test_how_far_students_were_trained_is_said_once(tmp_path) -> None:
