@@ -9,9 +9,12 @@ Each student is a process of its own; ``--together`` of them share a GPU. Rows a
 far), and lie in ``$OUT/results.tar.gz`` (all but weights) and ``$OUT/models-<n>.tar`` of at most 15 MiB each, renewed
 whenever one is done. Run again with the same folder, students that were stopped go on.
 
-    python benchmarks/policy_students.py --lay-out STUDENTS [--notes FILE] [--device "2 × NVIDIA H200"] [--write]
+    python benchmarks/policy_students.py --lay-out FOLDER … [--at-least 90] [--notes FILE] [--device "2 × NVIDIA H200"]
+        [--write] [--records FOLDER]
 
-lays out what came back: a table, and with ``--write`` a section of RESULTS.md and two pictures.
+lays out what came back, several training seeds of an arm and several folders together: tables of arms, of every
+student and of the differences between arms; with ``--write`` a section of RESULTS.md and two pictures, with
+``--records`` records for a leaderboard, whose commands name the teacher as it is shipped.
 """
 
 from __future__ import annotations
@@ -24,7 +27,11 @@ import sys
 import tarfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from robotics_bridge.policies.distill_config import DistillConfig
+    from robotics_bridge.policies.report import StudentResult
 
 NETWORK = "zhuang-intersection-ln-small"
 ARMS: dict[str, dict[str, Any]] = {
@@ -37,6 +44,12 @@ ARMS: dict[str, dict[str, Any]] = {
     "ead_supervised": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.supervised"},
     "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
 }
+CONTRASTS = (
+    ("ft_hand", "ft_tips"), ("bool_hand", "bool_tips"), ("ft_tips", "bool_tips"), ("ft_hand", "bool_hand"),
+    ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
+    ("ft_hand", "ead_simclr"), ("bool_tips", "none"), ("ead_untrained", "none"),
+)  # fmt: skip
+"""Arms whose differences are tested."""
 _TAR = 15 << 20
 _SMOOTH = 8
 """Iterations over which curves are averaged."""
@@ -82,7 +95,8 @@ def train(options: argparse.Namespace) -> None:
     )  # fmt: skip
     logged = [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     last = {kind: next((row for row in reversed(logged) if row["kind"] == kind), {}) for kind in ("loss", "time")}
-    row: dict[str, Any] = {"arm": options.arm, "status": student.result.status, "iterations": student.result.iterations}
+    row: dict[str, Any] = {"arm": options.arm, "seed": options.seed, "status": student.result.status}
+    row |= {"iterations": student.result.iterations}
     row |= {"control_steps": student.result.iterations * config.steps_per_env * config.num_envs}
     row |= {"learning_s": round(student.result.seconds, 1), "s": round(time.time() - began, 1)}
     row |= {"loss": last["loss"].get("behaviour"), "acting": last["time"].get("acting")}
@@ -163,53 +177,124 @@ def pack(out: Path, to: Path, arms: list[str], most: int) -> None:
 
 def lay_out(options: argparse.Namespace) -> None:
     """Print the comparison; with ``--write`` keep it as a section and draw it, and how students learned."""
+    from dataclasses import replace
+
     from benchmarks.results import table, write_section
+    from leaderboards import write_record
     from robotics_bridge.policies import report
 
-    results, agents = report.read_results([options.lay_out]), report.read_agents([options.lay_out])
+    results = report.read_results(options.lay_out, at_least=options.at_least)
+    agents = report.read_agents(options.lay_out)
     title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
-    notes = report.remarks(results)
-    found = {}
-    for line in (options.lay_out / "students.jsonl").read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
-        if "control_steps" in row:
-            found[row["arm"]] = row
-    least = min(row["iterations"] for row in found.values())
-    cost = [
-        [
-            name, f"{row['control_steps'] / 1e6:.1f}e6", f"{row['learning_s']:.0f}", f"{row['loss']:.3f}",
-            f"{seen(options.lay_out / name, least):.3f}",
-        ]
-        for name, row in found.items()
-    ]  # fmt: skip
+    named = {arm: result for arm in ARMS for result in results if arm_of(result.config) == arm}
+    notes = report.remarks([replace(result, left_out=()) for result in results])
+    left = [f"{arm} seed {item.seed} ({item.iterations})" for arm, r in named.items() for item in r.left_out]
+    notes += [f"left out, after so many iterations: {', '.join(left)}"] if left else []
     parts = [f"{title}.", table(columns, rows)]
     parts += [f"Notes: {'; '.join(notes)}."] if notes else []
-    parts.append(
-        table(
-            ["arm", "control steps", "s", "imitation loss", f"success in training, iterations {least - 7} to {least}"],
-            cost,
-        )
-    )
+    logs = found_logs(options.lay_out, named)
+    parts += [every_student(named, logs), differences(named)]
     if options.notes:
         parts.append(options.notes.read_text(encoding="utf-8").strip())
     body = "\n\n".join(parts)
     print(body)
     if options.write:
         report.draw(results, _PICTURES / "policy-students.png", agents=agents)
-        curves(options.lay_out, _PICTURES / "policy-students-learning.png")
-        command = "python benchmarks/policy_students.py --teacher in_palm_rotate.careful --config careful"
+        curves(logs, _PICTURES / "policy-students-learning.png")
+        command = f"python benchmarks/policy_students.py --teacher {options.teacher} --config careful"
         write_section(f"Students of {options.task}", command, body, where=options.device)
+    if options.records is not None:
+        shipped = [replace(result, config=replace(result.config, teacher=str(options.teacher))) for result in results]
+        for record in report.records(shipped):
+            print(write_record(record, options.records))
 
 
-def seen(folder: Path, iteration: int) -> float:
-    """Return the success in training over the last eight iterations up to one."""
-    (file,) = folder.rglob("log.jsonl")
-    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    own = [row for row in rows if row["kind"] == "episode" and iteration - 8 < row["step"] <= iteration]
+def arm_of(config: DistillConfig) -> str | None:
+    """Return the arm that a student belongs to."""
+    learned = {} if config.tactile is None else {"encoder": config.tactile.arm}
+    for arm, settings in ARMS.items():
+        wanted = {"placement": config.placement, "encoder": learned.get("encoder"), **settings}
+        if config.observe == "none" == settings["observe"]:
+            return arm
+        frozen = config.encoder_settings.get("learning") == "frozen"
+        if (config.observe, config.placement) == (settings["observe"], wanted["placement"]) and (
+            frozen == ("encoder" in settings) and learned.get("encoder") == wanted["encoder"]
+        ):
+            return arm
+    return None
+
+
+def found_logs(folders: list[Path], named: dict[str, StudentResult]) -> dict[tuple[str, int], list[dict[str, Any]]]:
+    """Return the log of every student that counts, by arm and training seed."""
+    from brainbench.files import read_json
+    from robotics_bridge.policies.distill_config import DistillConfig
+
+    logs = {}
+    for path in (path for folder in folders for path in sorted(folder.rglob("log.jsonl"))):
+        config = DistillConfig.of(read_json(path.parent / "config.json")["distill"])
+        arm = arm_of(config)
+        if arm not in named or config.seed not in named[arm].seeds:
+            continue
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        if len(rows) > len(logs.get((arm, config.seed), [])):
+            logs[arm, config.seed] = rows
+    return dict(sorted(logs.items(), key=lambda item: (list(ARMS).index(item[0][0]), item[0][1])))
+
+
+def every_student(named: dict[str, StudentResult], logs: dict[tuple[str, int], list[dict[str, Any]]]) -> str:
+    """Return the table of single students: one row per arm and training seed."""
+    from benchmarks.results import table
+
+    least = min(learned or 0 for result in named.values() for learned in result.learned)
+    rows = []
+    for (arm, seed), log in logs.items():
+        result = named[arm]
+        number = result.seeds.index(seed)
+        learned = result.learned[number] or 0
+        steps = learned * result.config.steps_per_env * result.config.num_envs
+        loss = [row["behaviour"] for row in log if row["kind"] == "loss"][-_SMOOTH:]
+        rows.append(
+            [
+                arm, str(seed), str(learned), f"{steps / 1e6:.1f}e6", f"{sum(loss) / len(loss):.3f}",
+                f"{seen(log, least):.3f}", f"{result.success[number]:.3f}",
+            ]
+        )  # fmt: skip
+    span = f"{least - _SMOOTH + 1} to {least}"
+    columns = ["arm", "training seed", "iterations", "control steps", f"imitation loss, last {_SMOOTH}"]
+    return table([*columns, f"success in training, iterations {span}", "success in evaluation"], rows)
+
+
+def differences(named: dict[str, StudentResult]) -> str:
+    """Return the table of :data:`CONTRASTS`, and of what spread they were held against."""
+    from benchmarks.results import table
+    from brainbench.metrics.multiple import adjust
+    from robotics_bridge.policies.contrasts import contrast, pooled_spread
+
+    spread, freedom = pooled_spread([result.success for result in named.values()])
+    pairs = [(one, other) for one, other in CONTRASTS if one in named and other in named]
+    found = [contrast(named[one].success, named[other].success, spread, freedom) for one, other in pairs]
+    held = adjust([item.p for item in found], "holm")
+    rows = [
+        [
+            f"{one} – {other}", f"{len(named[one].seeds)}, {len(named[other].seeds)}", f"{item.difference:+.3f}",
+            f"[{item.interval.low:+.3f}, {item.interval.high:+.3f}]", f"{p:.2g}",
+        ]
+        for (one, other), item, p in zip(pairs, found, held, strict=True)
+    ]  # fmt: skip
+    said = (
+        f"Training seeds spread success by {spread:.3f} (standard deviation pooled over {len(named)} arms, {freedom} "
+        "degrees of freedom). Differences of arms against it:"
+    )
+    return f"{said}\n\n{table(['arms', 'seeds', 'success', '95 % interval', 'p (Holm)'], rows)}"
+
+
+def seen(log: list[dict[str, Any]], iteration: int) -> float:
+    """Return the success in training over the last iterations up to one."""
+    own = [row for row in log if row["kind"] == "episode" and iteration - _SMOOTH < row["step"] <= iteration]
     return sum(row["episodes"] * row["success"] for row in own) / sum(row["episodes"] for row in own)
 
 
-def curves(folder: Path, path: Path) -> None:
+def curves(logs: dict[tuple[str, int], list[dict[str, Any]]], path: Path) -> None:
     """Draw success in training and the loss of imitation over the iterations of every student."""
     import matplotlib as mpl
     import numpy as np
@@ -217,22 +302,32 @@ def curves(folder: Path, path: Path) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
-    for arm in ARMS:
-        for file in sorted((folder / arm).rglob("log.jsonl")):
-            rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-            for axis, kind, key in ((axes[0], "episode", "success"), (axes[1], "loss", "behaviour")):
-                own = [row for row in rows if row["kind"] == kind and key in row]
-                if not own:
-                    continue
-                weights = np.array([row.get("episodes", 1.0) for row in own])
-                window = np.ones(min(_SMOOTH, len(own)))
-                means = np.convolve(weights * [row[key] for row in own], window, "valid")
-                means /= np.convolve(weights, window, "valid")
-                axis.plot([row["step"] for row in own][len(window) - 1 :], means, label=arm, lw=1.2)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
+    told, spans, most = set(), [], []
+    for (arm, seed), rows in logs.items():
+        color = f"C{list(ARMS).index(arm)}"
+        for axis, kind, key in ((axes[0], "episode", "success"), (axes[1], "loss", "behaviour")):
+            own = [row for row in rows if row["kind"] == kind and key in row]
+            if not own:
+                continue
+            weights = np.array([row.get("episodes", 1.0) for row in own])
+            window = np.ones(min(_SMOOTH, len(own)))
+            means = np.convolve(weights * [row[key] for row in own], window, "valid")
+            means /= np.convolve(weights, window, "valid")
+            label = arm if axis is axes[0] and arm not in told else None
+            axis.plot([row["step"] for row in own][len(window) - 1 :], means, color=color, label=label, lw=1)
+            if axis is axes[1]:
+                spans.append((0.95 * float(means.min()), 1.05 * float(np.quantile(means, 0.9))))
+                most.append((max(row[key] for row in own), f"{arm}, seed {seed}"))
+        told.add(arm)
+    # One loss that explodes would leave the others no height; it is named instead.
+    top = max(high for _, high in spans)
+    far = [f"{name}: one iteration reaches {loss:.0e}" for loss, name in most if loss > 100 * top]
+    axes[1].set_ylim(min(low for low, _ in spans), top)
+    axes[1].text(0.98, 0.98, "\n".join(far), fontsize=7, ha="right", va="top", transform=axes[1].transAxes)
     axes[0].set(ylabel="success in training", xlabel="iteration", ylim=(0, None))
-    axes[1].set(ylabel="imitation loss", xlabel="iteration", yscale="log")
-    axes[0].legend(frameon=False, fontsize=7)
+    axes[1].set(ylabel="imitation loss", xlabel="iteration")
+    figure.legend(frameon=False, fontsize=7, ncols=len(told), loc="outside lower center", handlelength=1.2)
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=110)
@@ -244,7 +339,9 @@ def main() -> None:
     parser.add_argument(
         "--teacher", type=Path, default=Path("in_palm_rotate.careful"), help="shipped, or a run's folder"
     )
-    parser.add_argument("--lay-out", type=Path, help="folder of students that came back")
+    parser.add_argument("--lay-out", type=Path, nargs="+", help="folders of students that came back")
+    parser.add_argument("--at-least", type=int, default=0, help="iterations; what learned fewer is left out, by name")
+    parser.add_argument("--records", type=Path, help="folder for records of what is laid out")
     parser.add_argument("--notes", type=Path, help="text that follows the tables")
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--task", default="in_palm_rotate")

@@ -33,6 +33,17 @@ FEWEST_SEEDS = 3
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """An evaluated student that a result does not count."""
+
+    seed: int
+    """Training seed."""
+    iterations: int | None
+    """That it learned; None where it is not said."""
+    reason: str
+
+
+@dataclass(frozen=True)
 class StudentResult:
     """Students that differ in their training seed only."""
 
@@ -61,8 +72,8 @@ class StudentResult:
     """Fewest that any of the students learned."""
     learned: tuple[int | None, ...] = ()
     """Iterations that each of the students learned, in the order of their seeds; None where it is not said."""
-    unused: tuple[str, ...] = ()
-    """Evaluated students of this group that were left out, and why."""
+    left_out: tuple[LeftOut, ...] = ()
+    """Evaluated students of this group that do not count, and why."""
 
     @property
     def value(self) -> float:
@@ -120,20 +131,19 @@ class _Member:
         return min((item["iterations"] for item in self.evaluations if item.get("iterations")), default=None)
 
 
-def _counted(members: Sequence[_Member], at_least: int) -> tuple[list[_Member], tuple[str, ...]]:
-    """Return one student per training seed, by seed, and what is said of the others."""
+def _counted(members: Sequence[_Member], at_least: int) -> tuple[list[_Member], tuple[LeftOut, ...]]:
+    """Return one student per training seed, by seed, and the others."""
     best: dict[int, _Member] = {}
-    unused = []
+    others = []
     for member in sorted(members, key=lambda member: -(member.learned or 0)):
-        seed, learned = member.config.seed, "unknown" if member.learned is None else str(member.learned)
-        told = f"{member.config.name.replace('_seed', ', seed ')} after {learned} iterations"
-        if member.learned is not None and member.learned < at_least:
-            unused.append(f"{told} (fewer than {at_least})")
+        seed, learned = member.config.seed, member.learned
+        if learned is not None and learned < at_least:
+            others.append(LeftOut(seed, learned, f"fewer than {at_least}"))
         elif seed in best:
-            unused.append(f"{told} (trained once more, for {best[seed].learned})")
+            others.append(LeftOut(seed, learned, f"trained once more, for {best[seed].learned}"))
         else:
             best[seed] = member
-    return [best[seed] for seed in sorted(best)], tuple(unused)
+    return [best[seed] for seed in sorted(best)], tuple(others)
 
 
 def _evaluations(path: Path) -> list[dict[str, Any]]:
@@ -146,7 +156,7 @@ def _evaluations(path: Path) -> list[dict[str, Any]]:
     return found
 
 
-def _result(members: Sequence[_Member], unused: tuple[str, ...]) -> StudentResult | None:
+def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> StudentResult | None:
     if not members:
         return None
     shares = [float(np.mean([np.mean(item["success"]) for item in member.evaluations])) for member in members]
@@ -166,7 +176,7 @@ def _result(members: Sequence[_Member], unused: tuple[str, ...]) -> StudentResul
     fewest = min((number for number in learned if number is not None), default=None)
     result = StudentResult(
         first, seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=fewest,
-        learned=learned, unused=unused,
+        learned=learned, left_out=left_out,
     )  # fmt: skip
     if fewest is not None and first.iterations is not None and fewest < first.iterations:
         stopped = f"{_STOPPED} {_learned(result)} of {first.iterations} iterations"
@@ -203,8 +213,9 @@ def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult
         return result
     gains = [own[seed] - other[seed] for seed in common]
     interval = t_interval(gains, f"paired t over {len(common)} training seeds")
-    if len(result.seeds) == len(bare.seeds) == 1:
-        interval = newcombe_interval(result.value, result.episodes, bare.value, bare.episodes)
+    if len(common) == 1:
+        counts = (r.episodes // len(r.seeds) for r in (result, bare))
+        interval = newcombe_interval(own[common[0]], next(counts), other[common[0]], next(counts))
     return replace(result, gain=float(np.mean(gains)), difference=interval)
 
 
@@ -329,7 +340,12 @@ def remarks(results: Sequence[StudentResult]) -> list[str]:
     if early:
         wanted = ", ".join(str(number) for number in sorted({result.config.iterations or 0 for result in early}))
         found.append(f"{_STOPPED} {_learned(*early)} of {wanted} iterations")
-    return found + [f"left out: {told}" for result in results for told in result.unused]
+    return found + [
+        f"left out: {result.config.name.rpartition('_seed')[0]}, seed {item.seed}, after "
+        f"{'unknown' if item.iterations is None else item.iterations} iterations ({item.reason})"
+        for result in results
+        for item in result.left_out
+    ]
 
 
 def _span(interval: Interval | None) -> str:
@@ -412,7 +428,10 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
 
 
 def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence[Mapping[str, Any]] = ()) -> Path:
-    """Draw success and rotation with intervals, two panels per task and hand; agents that are no students as lines."""
+    """Draw success and rotation with intervals, two panels per task and hand; agents that are no students as lines.
+
+    A mark is a mean, a dot the success of one training seed.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -434,12 +453,12 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
             low, high = (result.value,) * 2 if interval is None else (interval.low, interval.high)
             color = "0.55" if result.config.observe == "none" else "tab:blue"
             row[0].plot([low, high], [height, height], color=color, lw=1.5)
-            row[0].plot(result.success, [height] * len(result.success), ".", color="0.75", ms=4)
-            row[0].plot(result.value, height, "o", color=color, ms=5)
+            row[0].plot(result.value, height, "|", color=color, ms=11, mew=2)
+            row[0].plot(result.success, [height] * len(result.success), "o", color=color, ms=4, mec="white", mew=0.5)
             if "turn_rate" in result.graded:
                 mean, half = result.graded["turn_rate"]
                 row[1].plot([mean - half, mean + half], [height, height], color=color, lw=1.5)
-                row[1].plot(mean, height, "o", color=color, ms=5)
+                row[1].plot(mean, height, "|", color=color, ms=11, mew=2)
         for axis, name in zip(row, ("success_rate", "turn_rate"), strict=False):
             for number, item in enumerate(item for item in others if name in item):
                 label = Path(item["agent"]).name
@@ -460,7 +479,8 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
 
 def _label(result: StudentResult) -> str:
     config, tactile = result.config, result.config.tactile
+    seeds = f"{len(result.seeds)} seeds" if len(result.seeds) > 1 else "one seed"
     if tactile is None:
-        return "none"
+        return f"none\n{seeds}"
     noise = ", noisy" if config.noisy else ""
-    return f"{config.observe}, {config.placement}, {config.resolution}{noise}\n{tactile.arm}"
+    return f"{config.observe}, {config.placement}, {config.resolution}{noise}\n{tactile.arm}, {seeds}"

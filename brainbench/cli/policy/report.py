@@ -51,7 +51,7 @@ def report(
                 {"seed": seed, "success": share, "iterations": learned}
                 for seed, share, learned in zip(result.seeds, result.success, result.learned, strict=True)
             ],
-            "left_out": result.unused,
+            "left_out": [vars(item) for item in result.left_out],
             "graded": {name: {"mean": mean, "half_width": half} for name, (mean, half) in result.graded.items()},
         }
         for result in results

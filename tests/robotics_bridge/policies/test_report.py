@@ -12,6 +12,7 @@ from leaderboards import rank, read_record, write_record
 from robotics_bridge.policies.distill_config import DistillConfig
 from robotics_bridge.policies.report import (
     COLUMNS,
+    LeftOut,
     agent_rows,
     command,
     concise,
@@ -104,8 +105,9 @@ def test_two_runs_of_one_training_seed_are_no_two_seeds(tmp_path) -> None:
         _learn(tmp_path / run, learned)
     (only,) = read_results([tmp_path])
     assert (only.seeds, only.success, only.learned) == ((0,), (pytest.approx(0.6),), (110,))
-    assert only.unused == ("in_palm_rotate_xhand1_none, seed 0 after 77 iterations (trained once more, for 110)",)
-    assert f"left out: {only.unused[0]}" in remarks([only])
+    assert only.left_out == (LeftOut(0, 77, "trained once more, for 110"),)
+    said = "left out: in_palm_rotate_xhand1_none, seed 0, after 77 iterations (trained once more, for 110)"
+    assert said in remarks([only])
     assert only.note == "one training seed: the interval covers chance in evaluation alone"
 
 
@@ -118,7 +120,7 @@ def test_students_that_learned_too_little_are_left_out_by_name(tmp_path) -> None
     assert "stopped after 18 to 110 of 110 iterations" in every.note
     (kept,) = read_results([tmp_path], at_least=98)
     assert (kept.seeds, kept.learned) == ((0, 1), (110, 98))
-    assert kept.unused == ("in_palm_rotate_xhand1_none, seed 2 after 18 iterations (fewer than 98)",)
+    assert kept.left_out == (LeftOut(2, 18, "fewer than 98"),)
     assert "only 2 training seeds" in kept.note
     assert rows([kept])[0][COLUMNS.index("iterations")] == "98 to 110"
     with pytest.raises(DataError, match="None of the students learned 500 iterations; the longest that any did is 110"):
