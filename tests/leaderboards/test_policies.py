@@ -33,7 +33,7 @@ def test_records_are_intact_and_make_one_board_on_which_touch_leads(stored) -> N
     assert names[-1] == "in_palm_rotate_xhand1_none"
 
 
-def test_every_training_seed_has_a_command_that_exists_and_students_stopped_early_are_no_reliable_answer(
+def test_every_training_seed_has_a_command_that_exists_and_students_stopped_early_are_unreliable(
     stored,
 ) -> None:
     for item in stored:
