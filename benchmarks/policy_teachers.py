@@ -5,6 +5,10 @@
         --processor NAME=FILE … [--notes FILE] [--write]
 
 A folder is what ``--out`` named. ``--after`` names the run whose networks another began with; its curve follows.
+
+    PYTHONPATH=. python benchmarks/policy_teachers.py --first TASK=FOLDER … [--notes FILE] [--write]
+
+is the section of first teachers, one run per task, with what their episodes of training were like on the way.
 """
 
 from __future__ import annotations
@@ -21,6 +25,8 @@ from benchmarks.results import table, write_section
 PICTURE = Path(__file__).resolve().parent.parent / "docs" / "images" / "policy-learning.png"
 _SMOOTH = 8
 """Iterations over whose episodes a curve's point is the mean."""
+STEP = 0.025
+"""Seconds of a control step."""
 
 
 def lines(path: Path) -> list[dict[str, Any]]:
@@ -61,6 +67,39 @@ def body(runs: dict[str, Path], after: dict[str, str], processor: dict[str, Path
             )  # fmt: skip
     columns = ["agent", "begun from", "control steps", "minutes", "success", "goals an episode", "return"]
     return table([*columns, "success on C MuJoCo", "goals on C MuJoCo"], found)
+
+
+def first(runs: dict[str, Path]) -> str:
+    """One row per task and agent, and one per task and moment of training."""
+    found, way = [], []
+    for task, folder in runs.items():
+        (log,) = folder.glob("teacher-*/log.jsonl")
+        logged = lines(log)
+        minutes = sum(row["collect_s"] + row["learn_s"] for row in logged) / 60
+        for row in (row for row in lines(folder / "policy.jsonl") if row["part"] == "evaluation"):
+            trained = row["agent"] == "teacher"
+            steps = [f"{row['control_steps'] / 1e6:.1f}e6", f"{minutes:.1f}"] if trained else ["–", "–"]
+            names = ("metric", "seconds", "returns")
+            found.append(
+                [task, row["agent"], *steps, share(row)]
+                + [f"{row[name]:.2f} ± {row[f'{name}_half_width']:.2f}" for name in names]
+            )
+        rows = [row for row in logged if row.get("episode/episodes")]
+        # Powers of two show where it stopped changing.
+        numbers = [2**power for power in range(3, 12) if 2**power < len(rows) - _SMOOTH / 2] + [len(rows)]
+        for number in numbers:
+            own = rows[max(number - _SMOOTH, 0) : number]
+            weights = [row["episode/episodes"] for row in own]
+            keys = ("episode/success", "episode/metric", "episode/length", "episode/return")
+            means = [float(np.average([row[key] for row in own], weights=weights)) for key in keys]
+            means[2] *= STEP
+            way.append(
+                [task, f"{own[-1]['steps'] / 1e6:.1f}e6", f"{means[0]:.3f}"]
+                + [f"{value:.2f}" for value in (*means[1:], own[-1]["std"])]
+            )
+    columns = ["task", "agent", "control steps", "minutes", "success", "goals, or rad turned", "s", "return"]
+    moments = ["task", "control steps", "success in training", "goals, or rad turned", "s", "return", "action std"]
+    return f"{table(columns, found)}\n\n{table(moments, way)}"
 
 
 def draw(runs: dict[str, Path], after: dict[str, str], path: Path) -> None:
@@ -105,20 +144,29 @@ def draw(runs: dict[str, Path], after: dict[str, str], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", nargs="+", required=True)
+    parser.add_argument("--runs", nargs="+", default=[])
+    parser.add_argument("--first", nargs="+", default=[], help="one run per task, in place of --runs")
     parser.add_argument("--after", nargs="*", default=[])
     parser.add_argument("--processor", nargs="*", default=[])
     parser.add_argument("--notes", type=Path, help="text that follows the table")
     parser.add_argument("--device", default="one NVIDIA H200 per run")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    runs = {name: Path(folder) for name, folder in pairs(options.runs).items()}
+    if bool(options.runs) == bool(options.first):
+        parser.error("give --runs or --first")
+    runs = {name: Path(folder) for name, folder in pairs(options.runs or options.first).items()}
     after = pairs(options.after)
-    text = body(runs, after, {name: Path(file) for name, file in pairs(options.processor).items()})
+    if options.first:
+        text = first(runs)
+    else:
+        text = body(runs, after, {name: Path(file) for name, file in pairs(options.processor).items()})
     if options.notes:
         text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
     print(text)
-    if options.write:
+    if options.write and options.first:
+        command = f"python benchmarks/policy.py --part teacher --device cuda --tasks {' '.join(runs)} --envs 8192 …"
+        write_section("First teachers of other tasks", command, text, where=options.device)
+    elif options.write:
         draw(runs, after, PICTURE)
         command = (
             "python benchmarks/policy.py --part teacher --device cuda --tasks in_palm_rotate …; policy_teachers.py"
