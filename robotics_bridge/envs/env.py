@@ -230,7 +230,8 @@ class Env:
         """Advance all environments by one control step.
 
         Args:
-            action: [B, A]; 0 is the rest position, 1 is ``task.action_ratio`` of the joint's range from it.
+            action: [B, A]; 0 is the rest position, 1 is ``task.action_ratio`` of the joint's range from it. Beyond
+                ``task.action_limit`` it counts as that limit.
 
         Returns:
             Observations by group (the next step overwrites ``tactile``), reward [B], terminated [B] and truncated [B]
@@ -247,7 +248,8 @@ class Env:
                 f"received {tuple(action.shape)}."
             )
         self.last_action.copy_(self.action)
-        self.action.copy_(action.detach())
+        limit = self.task.action_limit
+        self.action.copy_(action.detach() if limit is None else action.detach().clamp(-limit, limit))
         self._aim_part(self)
         self._advance()
         result = self._judge_part(self)

@@ -15,7 +15,7 @@ from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import ball
 from robotics_bridge.tasks.registry import register
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import Noise, Placement, Reward, Success, Task
+from robotics_bridge.tasks.task import ACTION_LIMIT, Noise, Placement, Reward, Success, Task
 from robotics_bridge.tasks.thermometers import Thermal, Thermometers
 
 if TYPE_CHECKING:
@@ -116,5 +116,5 @@ def with_thermal(thermal: Thermal) -> Task:
 
 @register("hot_ball")
 def default() -> Task:
-    """Return the task on which we train: the published one."""
-    return replace(published())
+    """Return the task on which we train: the published one with bounded actions."""
+    return replace(published(), action_limit=ACTION_LIMIT)

@@ -14,7 +14,17 @@ from robotics_bridge.tasks.in_palm_rotate import PALM_UP
 from robotics_bridge.tasks.objects import PRIMITIVES
 from robotics_bridge.tasks.registry import register
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import Ending, Noise, ObjectRandomisation, Placement, Push, Reward, Success, Task
+from robotics_bridge.tasks.task import (
+    ACTION_LIMIT,
+    Ending,
+    Noise,
+    ObjectRandomisation,
+    Placement,
+    Push,
+    Reward,
+    Success,
+    Task,
+)
 
 
 @register("in_hand_repose", "published")
@@ -62,5 +72,5 @@ def published() -> Task:
 
 @register("in_hand_repose")
 def default() -> Task:
-    """Return the task on which we train: the published one."""
-    return replace(published())
+    """Return the task on which we train: the published one with bounded actions."""
+    return replace(published(), action_limit=ACTION_LIMIT)

@@ -13,7 +13,17 @@ from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.objects import PRIMITIVES
 from robotics_bridge.tasks.registry import register
 from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import Ending, Noise, ObjectRandomisation, Placement, Push, Reward, Success, Task
+from robotics_bridge.tasks.task import (
+    ACTION_LIMIT,
+    Ending,
+    Noise,
+    ObjectRandomisation,
+    Placement,
+    Push,
+    Reward,
+    Success,
+    Task,
+)
 
 PALM_UP = (0.7071067811865476, 0.0, -0.7071067811865475, 0.0)
 """The palm faces up, the fingers point along −x."""
@@ -80,7 +90,7 @@ def default() -> Task:
     Actions are counted from a cupped hand instead of a flat one: from there random actions turn the block now and
     then. Rotation weighs more, but only slow turns count, and so does coming nearer to the goal in every direction;
     reaching it pays; the goal begins wide. The block's place is where it lies, 2 cm higher, so that lying still costs
-    nothing. Without the approach to the goal, teachers threw the block round and lost it.
+    nothing. Without the approach to the goal, teachers threw the block round and lost it. Actions are bounded.
     """
     task = published()
     rewards = dict(task.rewards)
@@ -93,7 +103,9 @@ def default() -> Task:
     goal = SteppingRotation(
         axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333, start_threshold=0.4
     )
-    return replace(task, joints={"xhand1": CUPPED}, rewards=rewards, teacher=settings, goal=goal)
+    return replace(
+        task, joints={"xhand1": CUPPED}, rewards=rewards, teacher=settings, goal=goal, action_limit=ACTION_LIMIT
+    )
 
 
 @register("in_palm_rotate", "careful")

@@ -14,7 +14,17 @@ from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import SCREWDRIVERS
 from robotics_bridge.tasks.registry import register
 from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import Ending, Noise, ObjectRandomisation, Placement, Push, Reward, Success, Task
+from robotics_bridge.tasks.task import (
+    ACTION_LIMIT,
+    Ending,
+    Noise,
+    ObjectRandomisation,
+    Placement,
+    Push,
+    Reward,
+    Success,
+    Task,
+)
 
 UP, TURN = (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)
 """Axis of the tool from tip to handle, and the axis about which it is to be turned (its own frame)."""
@@ -102,5 +112,5 @@ def published() -> Task:
 
 @register("screwdriver")
 def default() -> Task:
-    """Return the task on which we train: the published one."""
-    return replace(published())
+    """Return the task on which we train: the published one with bounded actions."""
+    return replace(published(), action_limit=ACTION_LIMIT)

@@ -181,6 +181,12 @@ class Task:
     # --- control ---
     action_ratio: float = 0.5
     """Part of a joint's range by which an action of 1 moves its target away from rest."""
+    action_limit: float | None = None
+    """Largest action, either way, that counts and is observed as the last one; None (published) for none.
+
+    Far beyond what moves a joint it changes no motion, but policies that read their own last action can otherwise run
+    away from themselves.
+    """
     # --- randomness ---
     actuators: ActuatorRandomisation | None = ActuatorRandomisation()
     object_changes: ObjectRandomisation = ObjectRandomisation()
@@ -210,6 +216,8 @@ class Task:
     def __post_init__(self) -> None:
         if not (self.episode > 0 and math.isfinite(self.episode)):
             raise UsageError(f"An episode of task {self.name!r} has a positive length (s); received {self.episode!r}.")
+        if self.action_limit is not None and not self.action_limit > 0:
+            raise UsageError(f"The action_limit of task {self.name!r} is positive; received {self.action_limit!r}.")
         if not self.objects or self.copies < 1:
             raise UsageError(f"Task {self.name!r} needs at least one object.")
         for name, (low, high) in self._ranges().items():
@@ -235,6 +243,8 @@ class Task:
         return found
 
 
+ACTION_LIMIT = 100.0
+"""Bound of actions of the tasks on which we train; from about 2 on, a joint's target stays at its limit."""
 GROUPS = (
     "proprio", "tactile", "link_pose", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props", "priv_thermal",
     "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",

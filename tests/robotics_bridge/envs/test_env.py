@@ -160,6 +160,20 @@ def test_actions_map_to_targets_within_the_joints_limits() -> None:
     assert (env.action_map.targets(np.full(5, -9.0)) == low).all()
 
 
+def test_an_action_beyond_the_limit_counts_as_the_limit_and_moves_the_same_joints() -> None:
+    far, near = _make(2, _calm(action_limit=100.0)), _make(2, _calm(action_limit=100.0))
+    free = _make(2, _calm())
+    for env, size in ((far, 1e9), (near, 100.0), (free, 1e9)):
+        env.reset()
+        env.step(torch.full((2, env.num_actions), -size))
+    assert far.observations["proprio"][:, -5:].unique().tolist() == [-100.0]
+    assert free.observations["proprio"][:, -5:].unique().tolist() == [-1e9]
+    assert torch.equal(far.world.qpos, near.world.qpos)
+    assert torch.equal(far.world.qpos, free.world.qpos)
+    with pytest.raises(UsageError, match="action_limit of task 'in_palm_rotate' is positive; received 0"):
+        _calm(action_limit=0.0)
+
+
 def test_changed_masses_are_what_mujoco_derives_itself() -> None:
     mujoco = mujoco_module()
     env = _make(3, _calm(object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1))))

@@ -174,6 +174,7 @@ def test_settings_are_those_released(reference: Path, name: str, hand: str) -> N
     wanted = action["dofs_name"] if action["dofs_name"] != ["*"] else robot["dofs_name"]
     assert set(model.moved) == set(wanted)
     assert action["scale_ratio"] == task.action_ratio
+    assert task.action_limit is None
     rewards = c["reward_options"]
     assert {k: r.weight for k, r in task.rewards.items()} == {
         k: r["weight"] for k, r in rewards.items() if isinstance(r, dict)
