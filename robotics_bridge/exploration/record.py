@@ -100,7 +100,11 @@ class HandRecording:
     """What was asked for."""
 
     def grid(self) -> torch.Tensor:
-        """Return the wrenches as [K, T/S, S·6, 5, 7], in the hand's own units."""
+        """Return the wrenches as [K, T/S, S·6, 5, 7], in the hand's own units.
+
+        Raises:
+            UsageError: the frames do not divide into time steps of five sub-steps.
+        """
         import torch
 
         count, frames = self.wrench.shape[:2]

@@ -46,7 +46,12 @@ class Hand:
     """Resolution → layout read from a probe file; ``custom`` of :meth:`with_probes`."""
 
     def mjspec(self) -> Any:
-        """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world."""
+        """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world.
+
+        Raises:
+            UsageError: the hand has neither data nor a file.
+            DataError: its file is missing, or MuJoCo cannot read it.
+        """
         if self.spec is not None:
             return build(self.spec)
         if self.path is None:
@@ -137,7 +142,8 @@ def read_mjspec(path: Path) -> Any:
     paths given from the file's own folder are found too.
 
     Raises:
-        DataError: the file is missing, or MuJoCo cannot read it.
+        DataFileNotFoundError: the file is missing.
+        DataError: MuJoCo cannot read it.
     """
     mujoco = engine()
 

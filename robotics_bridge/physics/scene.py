@@ -78,7 +78,11 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Variants:
-    """Shapes that one geometry takes in different environments."""
+    """Shapes that one geometry takes in different environments.
+
+    Raises:
+        UsageError: there is no choice, or the assignment names one that does not exist.
+    """
 
     choices: tuple[Geometry, ...]
     assignment: tuple[int, ...] = ()

@@ -61,6 +61,9 @@ class HandState:
             num_links: L.
             contacts: room C for contacts of all environments together.
             device: ``cpu`` or ``cuda``.
+
+        Raises:
+            UsageError: fewer than one environment or link, or negative room.
         """
         if num_envs < 1 or num_links < 1 or contacts < 0:
             raise UsageError(

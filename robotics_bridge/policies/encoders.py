@@ -102,7 +102,11 @@ class EncoderConfig:
 
 
 class TactileEncoder(nn.Module):
-    """What all arms share."""
+    """What all arms share.
+
+    Args:
+        config: Which encoder, and what it reads; fixes :attr:`shape` and the state.
+    """
 
     state_size: int = 0
     """H."""
@@ -153,7 +157,11 @@ class TactileEncoder(nn.Module):
 
 
 class RunningScale(nn.Module):
-    """x / rms per channel, the root mean square of all values seen that are not zero; silence stays silence."""
+    """x / rms per channel, the root mean square of all values seen that are not zero; silence stays silence.
+
+    Args:
+        channels: C; the last axis of what is scaled.
+    """
 
     total: torch.Tensor
     count: torch.Tensor

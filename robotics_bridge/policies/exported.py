@@ -66,6 +66,9 @@ class JitPolicy(nn.Module):
 
     The step is traced, since encoders are no TorchScript; what remembers is scripted, so ``torch.jit.script`` of the
     whole gives a file with ``forward`` and ``reset``.
+
+    Args:
+        policy: What is exported, in evaluation mode.
     """
 
     def __init__(self, policy: TactilePolicy) -> None:

@@ -32,7 +32,15 @@ _EMBEDDING, _WIDTHS, _LSTM = 64, (512, 256, 128), 128
 
 
 class GroupEncoder(nn.Module):
-    """The embedding of a flat group: nothing, an MLP [512, 256, 128] → 64, or an LSTM 128 → 64."""
+    """The embedding of a flat group: nothing, an MLP [512, 256, 128] → 64, or an LSTM 128 → 64.
+
+    Args:
+        size: Numbers n of the group, [B, n].
+        kind: ``none``, ``mlp`` or ``lstm`` (:data:`EMBEDDERS`).
+
+    Raises:
+        UsageError: there is no such kind.
+    """
 
     def __init__(self, size: int, kind: str) -> None:
         super().__init__()

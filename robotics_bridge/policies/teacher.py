@@ -50,7 +50,13 @@ class TeacherResult:
 
 
 class Policy:
-    """A trained actor that acts on observation groups: ``policy(observations) -> [B, A]`` (mean actions)."""
+    """A trained actor that acts on observation groups: ``policy(observations) -> [B, A]`` (mean actions).
+
+    Args:
+        actor: Model class of rsl_rl, put into evaluation mode.
+        num_envs: B, environments it acts in.
+        device: Of the actions.
+    """
 
     def __init__(self, actor: torch.nn.Module, num_envs: int, device: Any) -> None:
         self.actor = actor.eval()
@@ -360,7 +366,7 @@ def newest(run: Path) -> Path:
     """Return the last ``model_<iteration>.safetensors`` of a run.
 
     Raises:
-        DataError: the folder holds no model.
+        DataFileNotFoundError: the folder holds no model.
     """
     found = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
     if not found:

@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class AudioSensor(Sensor):
-    """A sensor that reads a block of samples [N, K] per update."""
+    """A sensor that reads a block of samples [N, K] per update.
+
+    Raises:
+        UsageError: a block without a sample, or a knob of the sensor is out of range.
+    """
 
     samples: int = 160
     """K: the sample rate is K over the time step."""
@@ -49,6 +53,9 @@ class ContactAudio(AudioSensor):
 
     A rise of the summed normal force by more than ``threshold`` within one update is an impact of the impulse
     ΔF·Δt; sliding is noise of the strength F·v. Engines that give no contact forces are silent.
+
+    Raises:
+        UsageError: a threshold, strength or contact time is negative or no number.
     """
 
     modes: Modes
@@ -90,6 +97,9 @@ class ActuationAudio(AudioSensor):
 
     Loudness is β_load |τ| + β_pow |τ ω|, the whine a bank of partials on κ |ω|. Write torque and speed of the joints
     to the views of :func:`joint_drive` before each update.
+
+    Raises:
+        UsageError: there is no joint, or a strength, pitch or frequency is negative or no number.
     """
 
     joints: int

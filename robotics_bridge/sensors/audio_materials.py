@@ -55,7 +55,11 @@ ELASTIC_MATERIALS: dict[str, ElasticMaterial] = {
 
 
 def elastic_material(name: str | ElasticMaterial) -> ElasticMaterial:
-    """Return a material by name of :data:`ELASTIC_MATERIALS` (``metal`` is steel); a material passes through."""
+    """Return a material by name of :data:`ELASTIC_MATERIALS` (``metal`` is steel); a material passes through.
+
+    Raises:
+        UsageError: there is no material of that name.
+    """
     if isinstance(name, ElasticMaterial):
         return name
     chosen = "steel" if name == "metal" else name

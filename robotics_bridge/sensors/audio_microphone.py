@@ -57,6 +57,10 @@ class Microphone:
 class Listener:
     """Renders what a microphone hears, block by block.
 
+    Args:
+        microphone: Where it is and which sources it hears; all of the suite if it names none.
+        suite: Whose audio sensors are the sources; update it before each block.
+
     Raises:
         UsageError: a source is unknown, none exists, or their blocks differ in length.
     """

@@ -104,7 +104,8 @@ def read_log(path: str | os.PathLike[str]) -> Log:
     """Read a CSV file with a header: ``time`` (s), optionally ``reference`` and ``episode``, else probes.
 
     Raises:
-        DataError: the file is missing, has no time or probe, or holds what is no number.
+        DataFileNotFoundError: the file is missing.
+        DataError: it has no time or probe, fewer than 20 rows, uneven steps, or holds what is no number.
     """
     name = Path(path).name
     if not Path(path).is_file():

@@ -70,6 +70,9 @@ class ElastomerTaxel(QuerySensor):
     The pad is the surface of the link's own geometries (or the plane of the probes, if the link has none). What
     indents it pushes markers apart (4.19); points that slide along it drag them (4.20). Defaults are the published
     parameters; ``layer`` replaces the Gaussian shear kernel by that of an elastic layer.
+
+    Raises:
+        UsageError: the way to sum dilation is unknown or does not fit the probes or the layer, or a length is negative.
     """
 
     dilate_scale: float = 100.0
@@ -149,7 +152,12 @@ class ElastomerTaxel(QuerySensor):
 
 
 class ElastomerRuntime(ProbeRuntime):
-    """Serves elastomers that follow the same points and sum their dilation in the same way."""
+    """Serves elastomers that follow the same points and sum their dilation in the same way.
+
+    Args:
+        sensors: Of one group, by name; those of a group share what decides which kernels run.
+        context: Of the suite: scene, environments, device, clock and geometries.
+    """
 
     def __init__(self, sensors: Mapping[str, ElastomerTaxel], context: Context) -> None:
         super().__init__(sensors, 3, context)

@@ -36,6 +36,9 @@ class KinematicTaxel(QuerySensor):
 
     ``physical`` takes plus signs (friction drags the sensor along) and never pulls; ``thesis`` takes the published
     minus signs. Defaults are the published parameters (4.10).
+
+    Raises:
+        UsageError: the convention or the total is unknown, or the exponent is not positive.
     """
 
     stiffness: float = 500.0
@@ -76,7 +79,12 @@ class KinematicTaxel(QuerySensor):
 
 
 class KinematicRuntime(ProbeRuntime):
-    """Serves kinematic taxels."""
+    """Serves kinematic taxels.
+
+    Args:
+        sensors: Of one group, by name; those of a group share what decides which kernels run.
+        context: Of the suite: scene, environments, device, clock and geometries.
+    """
 
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: Context) -> None:
         from robotics_bridge.sensors._probe_kernels import kinematic_params

@@ -254,6 +254,9 @@ def simulate(
         name: Name of the sensor.
         device: ``cpu`` or ``cuda``.
         env_offset: Number of the first environment in the whole experiment.
+
+    Raises:
+        UsageError: the signal has not four axes.
     """
     from robotics_bridge._device import pick_device, warp
     from robotics_bridge.sensors.noise_stages import DelayLine, NoisePart, NoiseStage

@@ -153,6 +153,12 @@ class DelayLine:
 
     A late reading carries the noise it was recorded with. Before the first reading after a reset has arrived,
     the first is read.
+
+    Args:
+        parts: Sensors within the planar array, one after another on N.
+        channels: C.
+        num_envs: B.
+        context: Of the suite; lends clock, device and seed.
     """
 
     def __init__(self, parts: Sequence[NoisePart], channels: int, num_envs: int, context: Any) -> None:

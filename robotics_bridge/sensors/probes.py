@@ -24,6 +24,9 @@ class SurfaceDistanceProbe(QuerySensor):
     """Shortest signed distance [N] from each probe to the surfaces it tracks (m), negative inside.
 
     Needs no contact. Its noise knob ``radius`` is an error of the distance.
+
+    Raises:
+        UsageError: ``max_range`` is not positive.
     """
 
     nearest: bool = False
@@ -50,7 +53,12 @@ class SurfaceDistanceProbe(QuerySensor):
 
 
 class DistanceRuntime(ProbeRuntime):
-    """Serves surface-distance probes."""
+    """Serves surface-distance probes.
+
+    Args:
+        sensors: Of one group, by name; those of a group share what decides which kernels run.
+        context: Of the suite: scene, environments, device, clock and geometries.
+    """
 
     def __init__(self, sensors: Mapping[str, SurfaceDistanceProbe], context: Context) -> None:
         super().__init__(sensors, 1, context, reach=None)
@@ -96,7 +104,11 @@ class ContactDepthProbe(QuerySensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ContactProbe(QuerySensor):
-    """Contact [N] as 0 or 1, from the depth by a Schmitt trigger (thesis 4.3); noise acts on the depth."""
+    """Contact [N] as 0 or 1, from the depth by a Schmitt trigger (thesis 4.3); noise acts on the depth.
+
+    Raises:
+        UsageError: the threshold is negative, or the release lies outside 0 and the threshold.
+    """
 
     threshold: float = 5e-4
     """Depth η_on (m) beyond which contact begins."""
@@ -121,7 +133,13 @@ class ContactProbe(QuerySensor):
 
 
 class DepthRuntime(ProbeRuntime):
-    """Serves contact-depth and contact probes."""
+    """Serves contact-depth and contact probes.
+
+    Args:
+        sensors: Of one group, by name; those of a group share what decides which kernels run.
+        context: Of the suite: scene, environments, device, clock and geometries.
+        binary: Whether the sensors are contact probes, read as 0 or 1.
+    """
 
     def __init__(
         self, sensors: Mapping[str, ContactDepthProbe] | Mapping[str, ContactProbe], context: Context, *, binary: bool

@@ -29,6 +29,9 @@ class ProximityTaxel(ProbeSensor):
 
     ``thesis`` pulls along +a and takes the torque about the taxel (published); ``physical`` pushes the sensor along
     −a and takes it about the link's origin, so that taxels add up to a wrench. Defaults: published parameters.
+
+    Raises:
+        UsageError: the convention is unknown, or it follows no surface point.
     """
 
     stiffness: float = 300.0
@@ -62,7 +65,12 @@ class ProximityTaxel(ProbeSensor):
 
 
 class ProximityRuntime(ProbeRuntime):
-    """Serves proximity taxels that track the same geometries."""
+    """Serves proximity taxels that track the same geometries.
+
+    Args:
+        sensors: Of one group, by name; those of a group share what decides which kernels run.
+        context: Of the suite: scene, environments, device, clock and geometries.
+    """
 
     def __init__(self, sensors: Mapping[str, ProximityTaxel], context: Context) -> None:
         from robotics_bridge.sensors._cloud_kernels import cloud_structs

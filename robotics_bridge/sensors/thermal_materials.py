@@ -10,7 +10,11 @@ from brainbench.errors import UsageError, unknown_name
 
 @dataclass(frozen=True)
 class ThermalMaterial:
-    """How a body conducts, stores and radiates heat."""
+    """How a body conducts, stores and radiates heat.
+
+    Raises:
+        UsageError: a number is not positive, or the emissivity lies outside 0 and 1.
+    """
 
     conductivity: float
     """k [W/(m·K)]."""
@@ -54,7 +58,11 @@ MATERIALS: dict[str, ThermalMaterial] = {
 
 
 def material(name: str | ThermalMaterial) -> ThermalMaterial:
-    """Return a material by name of :data:`MATERIALS`; a material passes through."""
+    """Return a material by name of :data:`MATERIALS`; a material passes through.
+
+    Raises:
+        UsageError: there is no material of that name.
+    """
     if isinstance(name, ThermalMaterial):
         return name
     if name not in MATERIALS:

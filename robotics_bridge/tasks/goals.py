@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Goal(abc.ABC):
-    """An orientation to reach; a new one is proposed as soon as it is."""
+    """An orientation to reach; a new one is proposed as soon as it is.
+
+    Raises:
+        UsageError: the threshold is not positive, it begins narrower than it ends, or a share lies outside 0 and 1.
+    """
 
     threshold: float = 0.1
     """Angle below which the goal counts as reached [rad]."""

@@ -21,7 +21,11 @@ _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
 
 @dataclass(frozen=True)
 class Solid:
-    """A primitive in the body's frame."""
+    """A primitive in the body's frame.
+
+    Raises:
+        UsageError: the kind is unknown, or its sizes are not positive or not as many as the kind has.
+    """
 
     kind: str
     """``box``, ``cylinder``, ``capsule`` or ``sphere``."""
@@ -88,6 +92,15 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
     """Return a screwdriver along the body's y axis, tip at the origin, handle above [m].
 
     The handle is a cylinder, the shaft a capsule that ends in the tip.
+
+    Args:
+        length: Of the tool, tip to end [m].
+        handle_length: Of the handle, less than that [m].
+        handle_radius: [m].
+        shaft_radius: [m].
+
+    Raises:
+        UsageError: the handle is not shorter than the tool.
     """
     if not 0 < handle_length < length:
         raise UsageError(f"The handle is shorter than the tool; received {handle_length} m of {length} m.")
@@ -101,7 +114,16 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
 
 
 def with_sizes(shapes: Sequence[Shape], span: tuple[float, float], steps: int = 8) -> tuple[Shape, ...]:
-    """Return every shape at several sizes, evenly over a range of factors; (1, 1) leaves them as they are."""
+    """Return every shape at several sizes, evenly over a range of factors; (1, 1) leaves them as they are.
+
+    Args:
+        shapes: At factor 1.
+        span: Smallest and largest factor.
+        steps: How many sizes.
+
+    Raises:
+        UsageError: the range is not positive or falls.
+    """
     if span == (1.0, 1.0):
         return tuple(shapes)
     if not 0 < span[0] <= span[1]:

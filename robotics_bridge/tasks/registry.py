@@ -41,7 +41,11 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
 
 
 def forget(name: str) -> None:
-    """Remove a task that was registered."""
+    """Remove a task that was registered.
+
+    Raises:
+        UsageError: no such task was registered; tasks of the package stay.
+    """
     if name not in _MADE or name in _OWN:
         raise unknown_name("task of yours", name, [n for n in _MADE if n not in _OWN])
     del _MADE[name]

@@ -15,7 +15,11 @@ _WIDEST = (1e-5, 1e-2)
 
 @dataclass(frozen=True, kw_only=True)
 class TeacherSettings:
-    """PPO of the privileged teacher, upper half of table 4.4."""
+    """PPO of the privileged teacher, upper half of table 4.4.
+
+    Raises:
+        UsageError: the schedule is unknown, or a range is empty or does not hold the learning rate.
+    """
 
     num_envs: int = 8192
     steps_per_env: int = 24

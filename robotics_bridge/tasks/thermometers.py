@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Thermal:
-    """What fingers and balls are made of. The first four numbers are the axes of figure 4.8 and section 4.6.3."""
+    """What fingers and balls are made of. The first four numbers are the axes of figure 4.8 and section 4.6.3.
+
+    Raises:
+        UsageError: the target is not hotter than the room, or the margin lies outside 0 and 1.
+    """
 
     conductivity: float = 150.0
     """Of the fingers [W/(m·K)]."""

@@ -91,6 +91,7 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
     Raises:
         DataFileNotFoundError: the file or its contract is missing.
         DataError: the contract is of another kind.
+        UsageError: the contract does not say what a hand needs; export the policy from a trained run.
     """
     path = Path(path)
     contract = path.with_name(f"{path.name}.json")
