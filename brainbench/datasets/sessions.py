@@ -103,7 +103,11 @@ class Table:
         return ends
 
     def require(self, column: str) -> None:
-        """Raise the error for an unknown column, naming the nearest one."""
+        """Raise the error for an unknown column, naming the nearest one.
+
+        Raises:
+            UsageError: there is no such column.
+        """
         if column not in self.data:
             raise unknown_name("column", column, self.columns, hint=f"(in {self.label})")
 

@@ -28,6 +28,9 @@ class Window:
 
     ``first-contact`` is the earliest contact of any whisker (tables ``contacts_by_whisker_*``) that
     starts inside the trial and before the window's end.
+
+    Raises:
+        UsageError: it has no end, no positive length, or ends at the first contact.
     """
 
     anchor: str = "start"

@@ -138,7 +138,11 @@ def bootstrap_score(
 def bootstrap_animals(
     rdms: Floats, animals: Animals, comparison: str, *, draws: int, levels: Levels, seed: int
 ) -> Bootstrap:
-    """Bootstrap the score of layers [L, P] against the scored animals; see :func:`bootstrap_score`."""
+    """Bootstrap the score of layers [L, P] against the scored animals; see :func:`bootstrap_score`.
+
+    Raises:
+        UsageError: there is no draw, or levels ``all`` without draws of every animal by this comparison.
+    """
     if draws < 1:
         raise UsageError(f"A bootstrap needs at least 1 draw; received {draws}.")
     scored = [animals.subjects[index] for index in animals.scored]

@@ -92,6 +92,11 @@ class Decoder:
     """Decodes any assignment of classes to the stimuli of the same rows.
 
     Names of classes do not matter, so each partition of the stimuli is decoded once.
+
+    Args:
+        matrix: Responses, one row each; finite.
+        rows: Stimulus of each row, numbered from 0, each at least once.
+        penalty: As of :func:`decode`.
     """
 
     def __init__(self, matrix: Floats, rows: Ints, *, penalty: float = 1.0) -> None:

@@ -51,7 +51,11 @@ class PatternMetric(OfMeanResponses):
     """Whether values are corrected for noise, so that animals below the reliability gate do not count."""
 
     def similarity(self, model: Floats, brain: Floats) -> float:
-        """Return how alike features [K, F] and mean responses [K, U] are; larger is more alike."""
+        """Return how alike features [K, F] and mean responses [K, U] are; larger is more alike.
+
+        Raises:
+            UsageError: the metric does not define it.
+        """
         raise UsageError(f"The metric {self.name or type(self).__name__!r} does not define similarity(model, brain).")
 
     def compare(self, model: Floats, brain: AnimalPatterns) -> float:

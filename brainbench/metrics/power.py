@@ -40,7 +40,11 @@ _CHUNK_ELEMENTS = 1 << 21
 
 @dataclass(frozen=True)
 class Design:
-    """An experiment, and the truth it is to find."""
+    """An experiment, and the truth it is to find.
+
+    Raises:
+        UsageError: a number is out of range, or the effect is larger than what the animals share allows.
+    """
 
     stimuli: int = 6
     animals: int = 11

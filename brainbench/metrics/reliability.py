@@ -203,7 +203,14 @@ def _draws(
 def usable_sessions(
     blocks: Sequence[TrialBlock], count: int, names: list[str], *, least: int
 ) -> tuple[list[Session], str | None, tuple[str, ...]]:
-    """Check the sessions, leave out what cannot be split and say what."""
+    """Check the sessions, leave out what cannot be split and say what.
+
+    Returns:
+        Sessions that can be split; why none can, or None; notes for people.
+
+    Raises:
+        UsageError: trials and labels differ in number, or a label is none of the stimuli.
+    """
     sessions: list[Session] = []
     lacking: list[str] = []
     total = np.zeros(count, dtype=np.int64)
@@ -261,7 +268,11 @@ def _without_noise(
 
 
 def trial_hashes(block: TrialBlock, responses: Floats, codes: Ints) -> Hashes:
-    """Return one hash per trial, of its key or of its content."""
+    """Return one hash per trial, of its key or of its content.
+
+    Raises:
+        UsageError: keys are not one per trial, or repeat.
+    """
     if block.keys is None:
         return content_hashes(responses, codes)
     if len(block.keys) != len(codes):

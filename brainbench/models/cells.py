@@ -49,6 +49,9 @@ class Cell(nn.Module):
         out_channels: Channels of y.
         kernel_size: One number or (rows, columns) of the gates' convolution.
         layer_norm: Normalise each gate over channels.
+
+    Raises:
+        UsageError: there is no channel.
     """
 
     state_factor: ClassVar[int] = 1
@@ -120,6 +123,16 @@ class TimeDecay(Cell):
     There is no gate to normalise, so ``layer_norm`` normalises the output (y = LN(s)); the trace itself
     stays as it is, or it would forget how strong the stimulus was. Works on any [B, C, ...].
     ``kernel_size`` is accepted for a uniform signature and unused.
+
+    Args:
+        in_channels: C.
+        out_channels: C again.
+        kernel_size: Unused.
+        layer_norm: Normalise the output over channels.
+        tau: τ before training.
+
+    Raises:
+        UsageError: the numbers of channels differ.
     """
 
     tnn_names: ClassVar[Mapping[str, str]] = {"norm": "norm"}
@@ -149,7 +162,14 @@ class TimeDecay(Cell):
 
 
 class GatedCell(Cell):
-    """A cell with one fused convolution for all its gates."""
+    """A cell with one fused convolution for all its gates.
+
+    Args:
+        in_channels: Channels of x.
+        out_channels: Channels of y.
+        kernel_size: One number or (rows, columns) of the gates' convolution.
+        layer_norm: Normalise each gate over channels.
+    """
 
     gates: ClassVar[tuple[str, ...]] = ()
     fused_parts: ClassVar[tuple[str, ...]] = ("settle",)
@@ -225,6 +245,15 @@ class IntersectionRNN(GatedCell):
     """Cell gated through time and through depth (Collins et al. 2017).
 
     State: p = σ(p' + 1), s ← p s + (1 − p) tanh(m'). Output: q = σ(q' + 1), y = q x + (1 − q) relu(n').
+
+    Args:
+        in_channels: Channels of x.
+        out_channels: Channels of y; the same number.
+        kernel_size: One number or (rows, columns) of the gates' convolution.
+        layer_norm: Normalise each gate over channels.
+
+    Raises:
+        UsageError: the numbers of channels differ.
     """
 
     gates = ("gh", "h", "gy", "y")
@@ -273,6 +302,12 @@ class GRU(GatedCell):
 
     r = σ(r' + 1), u = σ(u') from cat(x, s); c = tanh of a second convolution of cat(x, r s);
     s ← u s + (1 − u) c, y = s. The fixed +1 sits on the reset gate alone.
+
+    Args:
+        in_channels: Channels of x.
+        out_channels: Channels of y.
+        kernel_size: One number or (rows, columns) of the gates' convolution.
+        layer_norm: Normalise each gate over channels.
     """
 
     gates = ("r", "u")
@@ -323,6 +358,12 @@ class LSTM(GatedCell):
     """Long short-term memory; the state is cat(c, h) [B, 2 out, H, W].
 
     c ← c σ(f' + 1) + σ(i') tanh(j'), normalised too with ``layer_norm``; h = tanh(c) σ(o'); y = h.
+
+    Args:
+        in_channels: Channels of x.
+        out_channels: Channels of y.
+        kernel_size: One number or (rows, columns) of the gates' convolution.
+        layer_norm: Normalise each gate and c over channels.
     """
 
     state_factor = 2

@@ -73,6 +73,9 @@ class EAD(nn.Module):
         normaliser: None is :meth:`Normaliser.physical`.
         unroll: How a temporal graph is unrolled; other encoders know one way only.
 
+    Raises:
+        UsageError: the unrolling is unknown, or the encoder is no temporal graph and knows one way only.
+
     ``layers`` lists what :meth:`activations` can return, from stimulus to output.
     """
 

@@ -192,7 +192,16 @@ class TemporalGraph(nn.Module):
     def init_state(
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> GraphState:
-        """Return the state before the first step: silent nodes and empty memories, all zeros."""
+        """Return the state before the first step: silent nodes and empty memories, all zeros.
+
+        Args:
+            batch: B.
+            device: Of the state; by default that of the weights.
+            dtype: Of the state; by default that of the weights.
+
+        Raises:
+            UsageError: the shape of the stimulus is still open.
+        """
         if self._open_grid:
             raise UsageError("The stimulus shape is still open; pass input_shape to TemporalGraph.from_config.")
         like = next(self.parameters())
@@ -220,6 +229,9 @@ class TemporalGraph(nn.Module):
         """Advance by one step of the stimulus [B, C, H, W]; return the output [B, ...] and the next state.
 
         Equals :meth:`forward` step by step.
+
+        Raises:
+            UsageError: the stimulus has another shape, or the unrolling is unknown.
         """
         check_unroll(unroll)
         if x.ndim != 4:

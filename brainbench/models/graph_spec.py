@@ -71,7 +71,11 @@ class Dense:
 
 @dataclass(frozen=True)
 class Memory:
-    """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged."""
+    """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged.
+
+    Raises:
+        UsageError: there is no such cell.
+    """
 
     kind: str = "time-decay"
     kernel_size: tuple[int, int] = (2, 2)

@@ -15,7 +15,13 @@ from brainbench.types import GRID_SHAPE
 
 
 class SimCLRHead(nn.Module):
-    """Projection [B, F] → [B, 128]: F → 2048 → 128 with batch norms, linear layers without bias (Chen et al. 2020)."""
+    """Projection [B, F] → [B, 128]: F → 2048 → 128 with batch norms, linear layers without bias (Chen et al. 2020).
+
+    Args:
+        features: F.
+        hidden: Width of the hidden layer.
+        outputs: Width of the projection.
+    """
 
     def __init__(self, features: int, *, hidden: int = 2048, outputs: int = 128) -> None:
         super().__init__()
@@ -33,7 +39,13 @@ class SimCLRHead(nn.Module):
 
 
 class SimSiamHead(nn.Module):
-    """Projector F → 2048 → 2048 → 2048 and predictor 2048 → 512 → 2048 (Chen & He 2021)."""
+    """Projector F → 2048 → 2048 → 2048 and predictor 2048 → 512 → 2048 (Chen & He 2021).
+
+    Args:
+        features: F.
+        hidden: Width of the projector and of its result.
+        bottleneck: Width of the predictor's hidden layer.
+    """
 
     def __init__(self, features: int, *, hidden: int = 2048, bottleneck: int = 512) -> None:
         super().__init__()
@@ -61,7 +73,16 @@ class SimSiamHead(nn.Module):
 
 
 class AutoencoderHead(nn.Module):
-    """Reconstruction [B, T, F] → [B, T, C, 5, 7]: a linear layer to 15 channels, then three transposed convolutions."""
+    """Reconstruction [B, T, F] → [B, T, C, 5, 7]: a linear layer to 15 channels, then three transposed convolutions.
+
+    Args:
+        features: F.
+        channels: C of the stimulus; half as many, rounded down, stand behind the linear layer.
+        grid: (rows, columns) of the stimulus.
+
+    Raises:
+        UsageError: there are fewer than 2 channels.
+    """
 
     def __init__(self, features: int, *, channels: int = 30, grid: tuple[int, int] = GRID_SHAPE) -> None:
         super().__init__()

@@ -58,6 +58,9 @@ class Learner(nn.Module):
         model: Maps [B, T, C, H, W] in SI to [B, classes]. Self-supervised objectives need one of
             :class:`~brainbench.models.ead.EAD`'s kind, with ``encode``, ``features`` and ``normaliser``.
 
+    Raises:
+        UsageError: the objective learns from features, and the network names none.
+
     ``views`` says how many augmented views of a batch the forward pass takes.
     """
 
@@ -93,7 +96,11 @@ class Supervised(Learner):
 
 
 class SimCLR(Learner):
-    """Contrast of two views at the last step's features."""
+    """Contrast of two views at the last step's features.
+
+    Args:
+        model: As of :class:`Learner`.
+    """
 
     views = 2
 
@@ -109,7 +116,11 @@ class SimCLR(Learner):
 
 
 class SimSiam(Learner):
-    """Prediction of one view's projection from the other's."""
+    """Prediction of one view's projection from the other's.
+
+    Args:
+        model: As of :class:`Learner`.
+    """
 
     views = 2
 
@@ -129,6 +140,9 @@ class Autoencoding(Learner):
     """Reconstruction of every step of the stimulus, in normalised units, from the features.
 
     Features know a step only after the encoder's latency, so those of step t + latency reconstruct step t.
+
+    Args:
+        model: As of :class:`Learner`.
     """
 
     def __init__(self, model: nn.Module) -> None:
@@ -137,7 +151,11 @@ class Autoencoding(Learner):
         self.head = AutoencoderHead(self.model.features, channels=channels, grid=(rows, columns))
 
     def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        """Return (loss, None)."""
+        """Return (loss, None).
+
+        Raises:
+            UsageError: sweeps are no longer than the encoder's latency.
+        """
         del labels
         x, latency = views[0], self.model.spec.latency
         if x.shape[1] <= latency:

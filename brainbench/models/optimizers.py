@@ -31,6 +31,9 @@ class LARS(Optimizer):
         momentum: m.
         weight_decay: λ.
         trust: η.
+
+    Raises:
+        UsageError: a number is negative.
     """
 
     def __init__(

@@ -29,7 +29,11 @@ computes in float32."""
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to run a network."""
+    """One way to run a network.
+
+    Raises:
+        UsageError: the precision or the unrolling is unknown, or there is no step.
+    """
 
     precision: str = "float32"
     unroll: Unroll = "biological"
@@ -48,8 +52,13 @@ class Setting:
 class Reduced(nn.Module):
     """A network run in one setting; it can be scored and extracted from like the network itself.
 
+    Args:
+        name: Of the registry.
+        setting: Way to run it.
+        seed: Of untrained weights.
+
     Raises:
-        UsageError: the network cannot be unrolled that way.
+        UsageError: the network is no encoder-attender-decoder, or cannot be unrolled that way.
     """
 
     def __init__(self, name: str, setting: Setting, *, seed: int = 0) -> None:

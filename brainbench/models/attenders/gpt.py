@@ -38,7 +38,14 @@ class GPTState:
 
 
 class GPTBlock(nn.Module):
-    """Pre-norm attention and a four times wider MLP, each added to the stream [B, tokens, width]."""
+    """Pre-norm attention and a four times wider MLP, each added to the stream [B, tokens, width].
+
+    Args:
+        width: Of the stream.
+        heads: Of attention; they divide the width.
+        dropout: Share of the attention weights and of the added values that is dropped while training.
+        depth: Blocks in all; what each adds is scaled by 1/√(2 depth).
+    """
 
     def __init__(self, width: int, heads: int, dropout: float, depth: int) -> None:
         super().__init__()
@@ -84,6 +91,13 @@ class GPTAttender(nn.Module):
     Args:
         features: F, features of one step.
         width: Width of the stream; a multiple of ``heads``.
+        blocks: Number of blocks.
+        heads: Of attention, in each block.
+        context: Tokens that fit, two per step and one over.
+        dropout: Share dropped while training.
+
+    Raises:
+        UsageError: the width is no multiple of the heads.
 
     25,778,688 parameters for 512 → 512; 6,532,608 for 512 → 256.
     """

@@ -60,6 +60,13 @@ class MambaBlock(nn.Module):
 
     Per inner channel and state: h_t = exp(Δ_t A) h_{t−1} + Δ_t B_t u_t, y_t = C_t · h_t + D u_t, where the step
     Δ_t and the vectors B_t, C_t are functions of the input; y is gated by SiLU of a second branch.
+
+    Args:
+        width: Of the stream.
+        expansion: Inner width per width.
+        states: States per inner channel.
+        convolution: Steps that the short convolution sees.
+        depth: Blocks in all; what each adds is scaled by 1/√depth.
     """
 
     def __init__(self, width: int, *, expansion: int, states: int, convolution: int, depth: int) -> None:
@@ -145,6 +152,9 @@ class MambaAttender(nn.Module):
         expansion: Inner width per width.
         states: States per inner channel.
         convolution: Steps that the short convolution sees.
+
+    Raises:
+        UsageError: a size is not positive.
     """
 
     max_steps: int | None = None

@@ -22,7 +22,13 @@ _WIDTHS = (64, 128, 256, 512)
 
 
 class BasicBlock(nn.Module):
-    """Two 3×3 convolutions with batch norm around a shortcut, [B, C, H, W] → [B, out, H', W']."""
+    """Two 3×3 convolutions with batch norm around a shortcut, [B, C, H, W] → [B, out, H', W'].
+
+    Args:
+        in_channels: C.
+        out_channels: Of the result.
+        stride: Of the first convolution and of the shortcut.
+    """
 
     def __init__(self, in_channels: int, out_channels: int, stride: int) -> None:
         super().__init__()

@@ -25,7 +25,13 @@ S4State = tuple[tuple[torch.Tensor, System], ...]
 
 
 class S4Block(nn.Module):
-    """x + GLU(GELU(state space(LayerNorm(x)))), [B, T, width]."""
+    """x + GLU(GELU(state space(LayerNorm(x)))), [B, T, width].
+
+    Args:
+        width: Of the stream.
+        pairs: Conjugate pairs of states per channel.
+        dropout: Share of what the state space gives that is dropped while training.
+    """
 
     def __init__(self, width: int, pairs: int, dropout: float) -> None:
         super().__init__()

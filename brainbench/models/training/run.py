@@ -426,7 +426,11 @@ def _evaluation(values: dict[str, Any]) -> Evaluation:
 
 
 def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
-    """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log."""
+    """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log.
+
+    Raises:
+        DataError: the folder holds no log.
+    """
     from brainbench.models.training.logs import LOG
 
     path = Path(folder) / LOG
