@@ -25,13 +25,18 @@ class Convolution:
     """2-D convolution of the concatenated inputs."""
 
     channels: int
+    """Of the output."""
     kernel_size: tuple[int, int] = (2, 2)
+    """Rows, columns."""
     stride: tuple[int, int] = (1, 1)
+    """Rows, columns."""
     padding: Literal["same", "valid"] | tuple[int, int] = "same"
+    """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
     use_bias: bool = True
     bias: float | None = 0.0
     """Initial bias; None draws it within 1/√fan_in."""
     dropout: float = 0.0
+    """Share dropped while training."""
     activation: str | None = None
     """Applied before the memory."""
     initialiser: Mapping[str, Any] | None = None
@@ -54,10 +59,12 @@ class Dense:
     """Linear layer of the flattened, concatenated inputs."""
 
     features: int
+    """Of the output."""
     use_bias: bool = True
     bias: float | None = 0.1
     """Initial bias; None draws it within 1/√fan_in."""
     dropout: float = 0.0
+    """Share dropped while training."""
     activation: str | None = None
     """Applied before the memory."""
     initialiser: Mapping[str, Any] | None = None
@@ -78,8 +85,11 @@ class Memory:
     """
 
     kind: str = "time-decay"
+    """One of :data:`MEMORIES`."""
     kernel_size: tuple[int, int] = (2, 2)
+    """Of the gates, rows and columns."""
     layer_norm: bool = False
+    """Normalise each gate over channels."""
     tau: float = 0.0
     """Initial time decay; other kinds ignore it."""
 
@@ -96,9 +106,13 @@ class Pool:
     size: tuple[int, int]
     """Window of a maximum; output size of an average."""
     stride: tuple[int, int] | None = None
+    """Of a maximum; None is its window."""
     padding: tuple[int, int] = (0, 0)
+    """Of a maximum: cells added at every edge."""
     ceil_mode: bool = False
+    """Of a maximum: a window may reach beyond the edge."""
     flatten: bool = False
+    """Give one vector in place of a grid."""
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return the shape after pooling (C, H, W)."""

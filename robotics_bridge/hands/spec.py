@@ -29,6 +29,7 @@ class Capsule:
     end: Vector
     """Centre of the other round end [m]."""
     radius: float
+    """[m]."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Box:
     """A box along the axes of its link."""
 
     center: Vector
+    """In the link's frame [m]."""
     half: Vector
     """Half edges [m]."""
 
@@ -45,7 +47,9 @@ class Sphere:
     """A ball."""
 
     center: Vector
+    """In the link's frame [m]."""
     radius: float
+    """[m]."""
 
 
 Solid = Capsule | Box | Sphere
@@ -85,8 +89,11 @@ class Link:
 
     name: str
     mass: float
+    """[kg], of all its solids."""
     solids: tuple[Solid, ...] = ()
+    """What collides and carries the mass; a pad lies on the first."""
     pad: Pad | None = None
+    """Where it feels; None for nowhere."""
     grids: Mapping[str, Grid] = field(default_factory=dict)
     """Resolution → grid."""
 
@@ -97,7 +104,9 @@ class Joint:
 
     name: str
     parent: str
+    """Link nearer to the palm."""
     child: str
+    """Link that it moves."""
     position: Vector
     """Of the child's frame in the parent's [m]."""
     rpy: Vector

@@ -39,6 +39,7 @@ class TaskModel:
     models: Sequence[Any]
     """``mujoco.MjModel`` per shape; they differ in numbers only."""
     shapes: tuple[Shape, ...]
+    """Of the objects, one per model."""
     objects: tuple[str, ...]
     """Names of the free bodies."""
     joints: tuple[str, ...]
@@ -48,13 +49,15 @@ class TaskModel:
     stiffness: NDArray[np.float64]
     """[J] (N·m/rad or N/m)."""
     damping: NDArray[np.float64]
+    """[J] (N·m·s/rad or N·s/m)."""
     effort: NDArray[np.float64]
     """[J] largest torque (N·m) or force (N)."""
     rest: NDArray[np.float64]
     """[J] positions at the start and of joints that are held (rad or m)."""
     low: NDArray[np.float64]
+    """[J] lower limits (rad or m)."""
     high: NDArray[np.float64]
-    """[J] limits."""
+    """[J] upper limits (rad or m)."""
     tips: Mapping[str, tuple[float, float, float]]
     """Finger tip → point (m, link frame)."""
 

@@ -29,14 +29,21 @@ class TrainingConfig:
     model: str
     """Registry name without a tag."""
     objective: str = "supervised"
+    """One of :data:`~brainbench.models.registry.OBJECTIVES`."""
     optimizer: str = "sgd"
+    """One of :data:`~brainbench.models.optimizers.OPTIMIZERS`."""
     schedule: str = "step"
+    """One of :data:`~brainbench.models.optimizers.SCHEDULES`."""
     learning_rate: float = 1e-2
+    """At its highest."""
     warmup_epochs: int = 0
+    """Over which the rate of the ``cosine`` schedule rises, from 1e-4 of its highest."""
     epochs: int = EPOCHS
+    """Passes through the training sweeps."""
     batch_size: int = BATCH_SIZE
     """Sweeps per optimiser step, over all processes."""
     decoder: str = "linear"
+    """One of :data:`~brainbench.models.decoders.DECODERS`."""
     augmentation: str = "physical"
     """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.augment`)."""
     masking: float = 0.0
