@@ -48,6 +48,26 @@ def test_report_prints_a_table_and_writes_records(tmp_path) -> None:
     assert (tmp_path / "report.png").stat().st_size > 5000
 
 
+def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp_path) -> None:
+    given = {"bool": (0.75, 0.7), "none": (0.25, 0.3, 0.2), "force": (0.7, 0.75)}
+    for observe, shares in given.items():
+        for seed, share in enumerate(shares):
+            config = DistillConfig(task="screwdriver", observe=observe, seed=seed)
+            write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+            found = [{"seed": 0, "success": [float(index < 20 * share) for index in range(20)]}]
+            write_json(tmp_path / config.name / "evaluation.json", found)
+    pairs = json.loads(_run("report", tmp_path, "--differences", "--json"))["differences"]
+    assert len(pairs) == 3
+    assert {item["degrees_of_freedom"] for item in pairs} == {4}
+    clear = {frozenset((item["first"], item["second"])) for item in pairs if item["p"] < 0.01}
+    assert len(clear) == 2
+    assert all("none" in names for names in clear)
+    text = _run("report", tmp_path, "--differences")
+    assert "First less second" in text
+    with pytest.raises(UsageError, match="one training seed"):
+        _run("report", next(tmp_path.glob("*none_seed0")), "--differences")
+
+
 def _exported(folder):
     """A policy of the XHand1 as brainbench policy export writes it."""
     hand = hands.load("xhand1")

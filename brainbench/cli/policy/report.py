@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.cli._shared import JsonOption, emit, table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from robotics_bridge.policies.report import StudentResult
 
 
 def report(
@@ -19,6 +24,9 @@ def report(
     at_least: Annotated[
         int, typer.Option(help="Leave out students that learned fewer iterations, and say which.", min=0)
     ] = 0,
+    differences: Annotated[
+        bool, typer.Option("--differences", help="Test every pair of students of a task and hand against each other.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print success and its 95 % interval per task, observation type and encoder, and the gain over no touch.
@@ -26,7 +34,8 @@ def report(
     Goals reached, rotation about the commanded axis (rad/s, while anything touched the object), seconds until the
     object dropped and the return follow. Intervals are t intervals over training seeds, with one training seed
     intervals over episodes. Of several runs of one training seed the longest counts. Agents in agents.json files,
-    which brainbench policy evaluate --out writes, stand beside the students.
+    which brainbench policy evaluate --out writes, stand beside the students. Differences are held against the spread
+    between training seeds pooled over all students of a task and hand, p corrected for the pairs (Holm).
     """
     from robotics_bridge.policies import report as students
 
@@ -56,5 +65,46 @@ def report(
         }
         for result in results
     ]  # fmt: skip
-    lines = [text, *(f"Note: {note}." for note in students.remarks(results)), *written]
-    emit({"students": data, "agents": agents, "records": written}, "\n".join(lines), as_json=as_json)
+    pairs = _pairs(results) if differences else []
+    lines = [text, *(f"Note: {note}." for note in students.remarks(results))]
+    if differences:
+        columns = ["first", "second", "success", "95 % interval", "p (Holm)"]
+        found = [
+            [
+                item["first"], item["second"], f"{item['difference']:+.3f}",
+                "[{:+.3f}, {:+.3f}]".format(*item["interval"]), f"{item['p']:.2g}",
+            ]
+            for item in pairs
+        ]  # fmt: skip
+        lines.append("\n" + table("First less second", columns, found, right=(2, 3, 4)))
+    data = {"students": data, "agents": agents, "records": written, "differences": pairs}
+    emit(data, "\n".join([*lines, *written]), as_json=as_json)
+
+
+def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
+    """Return the differences of all pairs of each task and hand, best students first."""
+    from itertools import combinations, groupby
+
+    from brainbench.metrics.multiple import adjust
+    from robotics_bridge.policies.contrasts import contrast, pooled_spread
+
+    found = []
+    for place, members in groupby(results, key=lambda result: (result.config.task, result.config.hand)):
+        group = list(members)
+        spread, freedom = pooled_spread([result.success for result in group])
+        pairs = list(combinations(group, 2))
+        tested = [contrast(one.success, other.success, spread, freedom) for one, other in pairs]
+        for (one, other), item, p in zip(pairs, tested, adjust([item.p for item in tested], "holm"), strict=True):
+            names = [_short(result, place) for result in (one, other)]
+            found.append(
+                {
+                    "task": place[0], "hand": place[1], "first": names[0], "second": names[1],
+                    "difference": item.difference, "interval": (item.interval.low, item.interval.high), "p": float(p),
+                    "spread": spread, "degrees_of_freedom": freedom,
+                }
+            )  # fmt: skip
+    return found
+
+
+def _short(result: StudentResult, place: tuple[str, str]) -> str:
+    return result.config.name.rpartition("_seed")[0].removeprefix("_".join(place) + "_")
