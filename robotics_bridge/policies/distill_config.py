@@ -30,12 +30,17 @@ class DistillConfig:
     teacher: str = ""
     """Folder of the teacher's run, or the name of a shipped teacher."""
     hand: str = "xhand1"
+    """Name or file (:func:`robotics_bridge.hands.load`)."""
     variant: str = "default"
     """Configuration of the task: ``default`` or ``published``."""
     observe: str = "force_torque"
+    """Observation type of table 4.3, or ``agg_bool``."""
     placement: str = "hand"
+    """Where taxels sit: ``tips``, ``fingers``, ``palm`` or ``hand``."""
     resolution: str = "med"
+    """How many there are: ``low``, ``med`` or ``high``."""
     noisy: bool = False
+    """Whether they have the published noise (table 4.12)."""
     encoder: str = AUTO
     """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.ARMS`, or a network's name."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
@@ -43,16 +48,23 @@ class DistillConfig:
     embedder: str = "mlp"
     """Of flat groups: ``none``, ``mlp`` or ``lstm``."""
     hidden: tuple[int, ...] = (512, 256, 128)
+    """Widths of the head's layers."""
     num_envs: int = 4096
+    """Environments at once."""
     steps_per_env: int = 24
+    """Control steps of every environment in an iteration."""
     iterations: int | None = None
     learning_rate: float | None = None
     epochs: int | None = None
+    """Passes over the steps of an iteration."""
     gradient_length: int | None = None
+    """Steps through which gradients flow back in time."""
     clip: float | None = None
     """Largest change of an action within an iteration that still lowers the loss."""
     max_grad_norm: float | None = None
+    """Norm to which longer gradients are cut."""
     loss: str | None = None
+    """One of :data:`LOSSES`."""
     teacher_share: float = 0.0
     """Share of actions that the teacher takes at the start (β of DAgger); 0 is the published, on-policy way."""
     teacher_iterations: int = 0
@@ -60,7 +72,9 @@ class DistillConfig:
     aggregate: int = 0
     """Earlier rollouts that are kept and learned from again."""
     save_interval: int = 100
+    """Iterations from one saved state to the next."""
     seed: int = 0
+    """Of weights, episodes and the teacher's share."""
     precision: str = "float32"
     """Of the tactile encoder in learning and acting: ``float32`` or ``bf16`` (mixed). The rest is single."""
 

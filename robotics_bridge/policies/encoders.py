@@ -40,11 +40,12 @@ class EncoderConfig:
     name: str = AUTO
     """An arm (:data:`ARMS`), or the name of a network."""
     hand: str = "xhand1"
+    """Name or file of the hand whose taxels it reads; the next three as of a student."""
     observe: str = "force_torque"
     placement: str = "hand"
     resolution: str = "med"
     slots: int = 5
-    """S."""
+    """S, physics steps in a control step."""
     features: int = 32
     """F: size of the embedding that the head gets."""
     time: Time = "native"

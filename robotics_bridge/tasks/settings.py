@@ -22,14 +22,22 @@ class TeacherSettings:
     """
 
     num_envs: int = 8192
+    """Environments at once."""
     steps_per_env: int = 24
+    """Control steps of every environment in an iteration."""
     iterations: int = 6000
     learning_rate: float = 1e-3
+    """Of the first iteration."""
     epochs: int = 5
+    """Passes over the steps of an iteration."""
     minibatches: int = 4
+    """Parts of a pass, a gradient step each."""
     discount: float = 0.998
+    """γ, per control step."""
     gae_lambda: float = 0.95
+    """λ of the advantages (Schulman et al. 2016)."""
     clip: float = 0.2
+    """Largest change of an action's likelihood ratio that still pays (ε of PPO)."""
     desired_kl: float = 0.01
     """Aim of the adaptive learning rate."""
     schedule: str = "adaptive"
@@ -37,10 +45,15 @@ class TeacherSettings:
     learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
     """Bounds of the adaptive rate; the widest are those of rsl_rl."""
     entropy: float = 2e-3
+    """Weight of the bonus for spread actions."""
     value_loss: float = 1.0
+    """Weight of the critic's loss."""
     max_grad_norm: float = 1.0
+    """Norm to which longer gradients are cut."""
     hidden: tuple[int, ...] = (512, 256, 128)
+    """Widths of the layers of actor and critic."""
     initial_std: float = 1.0
+    """Standard deviation of the first actions."""
     std_type: str = "log"
     """How the policy's standard deviation is kept (text above table 4.4; the released settings say ``log``)."""
     std_range: tuple[float, float] = (1e-6, 1e6)
@@ -48,7 +61,9 @@ class TeacherSettings:
     rnd_weight: float = 100.0
     """Of the curiosity reward, per second; 0 trains without it."""
     rnd_outputs: int = 8
+    """Numbers of the random network that the curious one predicts (Burda et al. 2018)."""
     rnd_learning_rate: float = 1e-3
+    """Of the predicting network."""
 
     def __post_init__(self) -> None:
         if self.schedule not in SCHEDULES:
@@ -126,10 +141,13 @@ class StudentSettings:
     iterations: int = 6000
     learning_rate: float = 1e-4
     epochs: int = 5
+    """Passes over the steps of an iteration."""
     gradient_length: int = 2
     """Steps through which gradients flow back in time."""
     clip: float | None = None
+    """Largest change of an action within an iteration that still lowers the loss; None for any."""
     max_grad_norm: float | None = None
+    """Norm to which longer gradients are cut; None leaves them."""
     loss: str = "mse"
     """``mse`` or ``inv_var_mse`` (each action weighted by the inverse of its variance)."""
 
@@ -141,6 +159,8 @@ class Decoder:
     target: str
     """Name of the group."""
     weight: float = 1.0
+    """Of its mean squared error in the loss."""
     scale: float = 1.0
     """Factor on the target."""
     hidden: tuple[int, ...] = field(default=(128, 64))
+    """Widths of its layers."""

@@ -83,7 +83,9 @@ class Push:
     """A random force on the object, for one physics step each time (thesis, table 4.9)."""
 
     x: Range = (0.0, 0.0)
+    """[N]; this and the next two along the world's axes."""
     y: Range = (0.0, 0.0)
+    """[N]."""
     z: Range = (0.0, 0.0)
     """[N]."""
     interval: Range = (2.0, 4.0)
@@ -112,11 +114,15 @@ class Solver:
     """How exactly physics is solved (as in the released settings)."""
 
     timestep: float = 0.005
+    """Of physics [s]."""
     decimation: int = 5
     """Physics steps in a control step."""
     iterations: int = 50
+    """Of the constraint solver, at most."""
     line_search: int = 50
+    """Iterations of its line search, at most."""
     tolerance: float = 1e-5
+    """Improvement below which it stops (as MuJoCo's ``opt.tolerance``)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,9 +42,13 @@ class Actuation:
     names: tuple[str, ...]
     """Joints A that actions move."""
     default: NDArray[np.float64]
+    """[A] targets of zero actions (rad)."""
     scale: NDArray[np.float64]
+    """[A] change of the target per unit of action (rad)."""
     low: NDArray[np.float64]
+    """[A] least targets (rad)."""
     high: NDArray[np.float64]
+    """[A] greatest targets (rad)."""
     frozen: Mapping[str, float] = field(default_factory=dict)
     """Joint → position (rad) of those that actions do not move."""
 
@@ -81,7 +85,9 @@ class Report:
     reason: str
     """Why it was stopped; empty if not."""
     ticks: int
+    """Control steps that were decided."""
     seconds: float
+    """Time of the session."""
     latency: dict[str, Any]
     """Of reading, deciding and sending, in ms."""
     processor: dict[str, Any]

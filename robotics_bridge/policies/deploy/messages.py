@@ -29,12 +29,19 @@ class Message:
     """A message that was read."""
 
     kind: int
+    """:data:`STATE` or :data:`COMMAND`."""
     joints: int
+    """J."""
     fingers: int
+    """F."""
     flags: int
+    """:data:`STOP`, or 0."""
     sequence: int
+    """Number of the message; goes on from 0 after 2³²."""
     time: float
+    """Of the sender's clock (s)."""
     values: NDArray[np.float64]
+    """Positions (rad), velocities (rad/s) and pressures of a state, targets (rad) of a command, one after another."""
 
 
 def encode(

@@ -35,6 +35,7 @@ class PressureCalibration:
     """
 
     scale: float = 1000.0
+    """``agg_force`` of one unit of the maker's contact pressure."""
     per_finger: Mapping[str, float] = field(default_factory=dict)
     """Finger → scale of its own."""
     axes: tuple[float, float, float] = (-1.0, -1.0, 1.0)
