@@ -48,17 +48,25 @@ class Sweep:
     name: str
     entries: tuple[SweepEntry, ...]
     types: tuple[str, ...]
+    """Observation types, each at every placement of an entry."""
     extra_types: tuple[str, ...]
     """Types beyond the published ones."""
     resolutions: tuple[str, ...]
+    """Of the taxels, in the subset ``all`` and in that of one type."""
     noisy: tuple[bool, ...]
+    """Without noise, with it, or both; in the same subsets."""
     seeds: tuple[int, ...]
+    """Training seeds, every student once with each."""
     pinned_resolution: str
+    """The one resolution of the subsets ``types`` and ``encoders``."""
     pinned_noisy: bool
+    """Whether taxels have noise in these."""
     encoder_types: tuple[str, ...]
+    """Observation types of the subset ``encoders``."""
     arms: tuple[Mapping[str, Any], ...]
     """Encoder and its settings, for the subset ``encoders``."""
     variant: str
+    """Configuration of the tasks."""
     teacher: str
     """Folder of a teacher's run, with ``{task}`` and ``{hand}``."""
 
