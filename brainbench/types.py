@@ -53,7 +53,9 @@ class Interval:
     low: float
     high: float
     level: float = 0.95
+    """Share of repetitions whose intervals hold the truth."""
     method: str = ""
+    """How it was made, over what, and why it may be unreliable."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,9 @@ class Ceiling:
     """Noise ceiling of the raw (uncorrected) comparison: what a perfect model could reach."""
 
     lower: float
+    """Each animal against the mean of the others."""
     upper: float
+    """Each animal against the mean of all."""
     method: str = "leave-one-animal-out (lower), mean of all (upper)"
 
 
@@ -78,7 +82,9 @@ class SubjectScore:
     """Spearman-Brown-corrected split-half reliability of this animal's RDM."""
     status: Status = "ok"
     units: int = 0
+    """Neurons that entered."""
     trials: int = 0
+    """Trials that entered."""
     layer: str | None = None
     """Layer evaluated on this animal; it was chosen without this animal's data."""
 
@@ -91,6 +97,7 @@ class LayerScore:
     value: float
     """Mean noise-corrected score over the animals whose RDM is reliable."""
     r: float
+    """Mean raw comparison over the same animals."""
     status: Status = "ok"
     interval: Interval | None = None
     """Of ``value``, over animals."""
@@ -105,34 +112,50 @@ class Score:
     """
 
     name: str
+    """Of the model."""
     value: float
+    """Mean over animals, corrected for their noise where the metric can be."""
     status: Status
+    """``ok``, ``unreliable`` or ``undefined``."""
     reasons: tuple[str, ...] = ()
+    """Why it is not ``ok``, and what else a reader must know, in words."""
     r: float = math.nan
     """Mean raw comparison over animals."""
     reliability: float = math.nan
     """Mean Spearman-Brown-corrected split-half reliability over animals."""
     reliability_interval: Interval | None = None
+    """Of ``reliability``, over animals."""
     interval: Interval | None = None
+    """Of ``value``."""
     p: float = math.nan
+    """Of a value as high without a match, by ``p_method``."""
     p_method: str = ""
+    """The test, what was exchanged and how often."""
     p_smallest: float = math.nan
     """Smallest p that this number of stimuli can give."""
     ceiling: Ceiling | None = None
+    """Of ``r``; None where the metric has none."""
     layer: str | None = None
     """The layer chosen most often when each animal in turn is held out."""
     layer_rule: str = ""
+    """How layers were chosen."""
     best_layer: str | None = None
+    """Layer of ``best_layer_value``."""
     best_layer_value: float = math.nan
     """The optimistic maximum over layers, chosen and evaluated on the same data. Not a result."""
     layers: tuple[LayerScore, ...] = ()
     subjects: tuple[SubjectScore, ...] = ()
     estimator: str = "default"
     metric: str = ""
+    """What was compared and how, in words."""
     stimuli: tuple[str, ...] = ()
+    """Names, in the order of the RDMs."""
     model_rdm: tuple[float, ...] = ()
+    """[P], of ``layer``."""
     brain_rdm: tuple[float, ...] = ()
+    """[P], mean over the animals that were scored."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    """Versions, machine, data with hashes, settings and the command that makes it again."""
 
     def to_json(self) -> str:
         """Serialise deterministically; NaN becomes null."""
@@ -238,14 +261,19 @@ class ModelCard:
     multiply_adds: int | None = None
     """Multiply-adds per time step of one stimulus."""
     top1: float | None = None
+    """Share of test sweeps whose class is the network's first answer."""
     top5: float | None = None
+    """Share whose class is among its first five."""
     accuracy_interval: Interval | None = None
+    """Of ``top1``."""
     accuracy_data: str | None = None
     """Content hash of the test data behind the accuracies."""
     collapsed: bool | None = None
+    """Whether it answers everything with one class, or its features fall into one point."""
     twin: str | None = None
     """Registry name of the untrained twin."""
     seed: int | None = None
+    """Of its weights."""
     weights: str | None = None
     """Content hash of the weights that were scored."""
     input: str = ""
@@ -262,6 +290,7 @@ class ModelCard:
     twin_top1: float | None = field(default=None, metadata={"later": True})
     """Top-1 accuracy of the untrained twin, its decoder trained on the same data."""
     twin_interval: Interval | None = field(default=None, metadata={"later": True})
+    """Of ``twin_top1``."""
 
 
 @dataclass(frozen=True)

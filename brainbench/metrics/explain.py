@@ -37,7 +37,7 @@ from brainbench.types import Status
 
 @dataclass(frozen=True)
 class Switches:
-    """Which published faults are on."""
+    """Which published faults are on; the text of this module says what each does."""
 
     best_target: bool = True
     best_layer: bool = True

@@ -52,13 +52,17 @@ class PairTest:
     """Two models on the same animals."""
 
     first: str
+    """Name of a model."""
     second: str
+    """Name of another."""
     difference: float
     """Mean over animals of the first's value minus the second's."""
     interval: Interval | None
+    """Of the difference, over animals."""
     p: float
     """Two-sided, by flipping the signs of the animals' differences."""
     p_corrected: float
+    """Corrected for the number of pairs."""
     reason: str = ""
     """Why there is no p."""
 

@@ -27,14 +27,19 @@ class SubjectRDM:
     halves: Floats = field(repr=False)
     """[S′, 2, P] RDMs of the halves."""
     units: int = 0
+    """Neurons that entered."""
     trials: int = 0
+    """Trials that entered."""
     method: str = "correlation"
+    """Dissimilarity of two stimuli."""
     comparison: str = "pearson"
+    """Comparison of two RDMs."""
     reliability: float = math.nan
     """Spearman-Brown reliability of the mean of ``split_half_r``."""
     spread: Interval | None = None
     """Percentiles over random splits; not a confidence interval."""
     seed: int = 0
+    """Of splits and draws."""
     problem: str | None = None
     """Why the animal has no usable RDM, in words."""
     notes: tuple[str, ...] = ()
