@@ -245,7 +245,8 @@ def test_more_precision_than_there_is_is_refused_in_words():
         Fidelity(precision="quad")
 
 
-def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same():
+@pytest.mark.parametrize("budget", [None, 4])
+def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same(budget):
     from brainbench.stimuli.backends.rod.fast import SweepLauncher
 
     objects = resolve_objects(["torus-1", "gear-0"], surfaces=True)
@@ -254,6 +255,7 @@ def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same():
     results = []
     for sliced in (False, True):
         launcher = SweepLauncher(scenes, COARSE, sliced=sliced)
+        launcher.tuning = {"budget": budget}
         results.append(launcher.launch([(name, grid.sweeps(name)) for name in scenes.objects]))
         assert (launcher.slices > 1) == sliced
     whole, parts = results
