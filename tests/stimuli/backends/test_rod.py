@@ -197,7 +197,7 @@ def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_change
     np.testing.assert_array_equal(finer.wrench[~kept], again.wrench[~kept])
 
 
-def test_whiskers_that_finer_steps_do_not_mend_take_steps_half_as_long_again():
+def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine():
     from brainbench.stimuli.backends.rod.fast import SweepLauncher
 
     objects = resolve_objects(["brick-0"], surfaces=True)
