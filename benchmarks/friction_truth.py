@@ -34,7 +34,7 @@ STIFFNESS, RELAXATION, CREEP = 200.0, 1e-2, 1e-5
 """Of a contact: stiffness (N/m), relaxation time (ms), and the slip (m/s) below which friction is viscous."""
 SCALE = np.repeat([1e-3, 1e-6], 3)
 """Newtons and newton metres of the reference's units (mg, mm, ms)."""
-SLIPPED, FELT, FLICK = 0.2, 5e-3, 60_000
+SLIPPED, FELT, FLICK = 0.2, 5e-3, 200_000
 """A whisker slips off where its contact force falls to this share of the last reading's, if that was above so much
 (mN); or flicks and bounces, where a millisecond needs more evaluations than this."""
 ENGINES = ("rod", 50), ("rod", 100), ("rod", 500), ("mujoco", 50), ("mujoco", 10), ("mujoco", 2), ("bullet", 50)
