@@ -44,7 +44,7 @@ from brainbench.stimuli.backends.rod._structs import structs
 from brainbench.stimuli.backends.rod._tracks import tracks
 
 MAKING = threading.Lock()
-"""To be held while kernels are made and compiled: two threads at once would make their structures twice."""
+"""To be held while kernels are made: two threads at once would make their structures twice."""
 
 
 @cache
@@ -103,7 +103,8 @@ def solver(
     Seen: Any = wp.types.vector(most_seen, real)
     Seen3: Any = wp.types.matrix((most_seen, 3), real)
 
-    options = {"fast_math": cuda and real is wp.float32}
+    # Warp's own flags for a processor inline without bound, which is no faster here and takes longer to compile.
+    options = {"fast_math": cuda and real is wp.float32, "cpu_compiler_flags": "-march=native"}
 
     def settle_all(rank: int, held: int, lanes: int) -> Any:
         """Make the kernel that finds contact forces of the whiskers in one queue."""
@@ -928,6 +929,7 @@ def solver(
         out.load[lane] = load
 
     return SimpleNamespace(
+        loading=threading.Lock(),
         run=run,
         turn_over=turn_over,
         look_all=look_all,
