@@ -85,8 +85,8 @@ def simulate_sweeps(
         backend: name of the physics engine.
         device: ``cpu`` or ``cuda``.
         workers: threads on the CPU; all usable processors when None.
-        retry: divides the time step for whiskers that cannot be trusted, which are then simulated once more; 1 leaves
-            them. Only backends with a fast path do this.
+        retry: divides the time step for whiskers that cannot be trusted, which are then simulated again, and twice as
+            much for those that cannot be trusted even then; 1 leaves them. Only backends with a fast path do this.
 
     Raises:
         UsageError: the backend is unknown or does not run on the device.

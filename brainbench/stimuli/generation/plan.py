@@ -55,8 +55,8 @@ class Settings:
     shard_size: int | None = None
     """Sweeps per shard; by backend and device when None."""
     retry: int = 5
-    """Whiskers that cannot be trusted are simulated again, once, with steps divided by this (backend ``rod``); 1 leaves
-    them as they are."""
+    """Whiskers that cannot be trusted are simulated again with steps divided by this, and those left by twice this
+    (backend ``rod``); 1 leaves them as they are."""
 
     def __post_init__(self) -> None:
         if self.split not in ("object", "sweep"):

@@ -11,12 +11,15 @@ import re
 import sys
 import threading
 from contextlib import contextmanager
-from types import ModuleType, SimpleNamespace
+from types import FunctionType, ModuleType, SimpleNamespace
 
 import numpy as np
 
 WARP = 32
-_MODULES = ("algebra", "contacts", "groups", "looks", "search", "shapes", "structs", "tracks")
+_MODULES = (
+    "algebra", "compliance", "contacts", "coulomb", "grasp", "groups", "looks", "memory", "relax", "search", "shapes",
+    "structs", "tracks",
+)  # fmt: skip
 
 
 class Memory:
@@ -103,19 +106,29 @@ def _language() -> ModuleType:
         return int(np.float32(value).view(np.int32))
 
     def native(code):
-        # Native code is where the processor's minimum and maximum are other than Warp's.
+        # Native code reads memory, or is where the processor's minimum and maximum are other than Warp's.
+        if "extract(memory, index)" in code:
+            return lambda _function: lambda memory, index: memory[index]
         found = re.search(r"#else\nreturn a ([<>]) b \? a : b;", code)
         return lambda _function: min if found[1] == "<" else max
 
     def zeroed(kind):
-        for name in kind.__annotations__:
-            setattr(kind, name, 0)
+        def begin(self):
+            for name, made in kind.__annotations__.items():
+                setattr(self, name, made() if made in (int, np.float64) or isinstance(made, FunctionType) else 0)
+
+        kind.__init__ = begin
         return kind
+
+    class Reference:
+        def __class_getitem__(cls, _kind):
+            return cls
 
     made = {
         "float32": np.float64, "float64": np.float64, "int32": int, "uint64": int,
         "types": SimpleNamespace(vector=vector, matrix=lambda shape, _kind: lambda *_: Memory(np.zeros(shape))),
-        "static": lambda value: value, "func": lambda function: function, "struct": zeroed, "func_native": native,
+        "static": lambda value: value, "func": lambda function=None, **_: function or (lambda same: same),
+        "ref": Reference, "struct": zeroed, "func_native": native,
         **dict.fromkeys(["array", "array2d", "array3d", "array4d"], lambda **_: None),
         "min": min, "max": lambda a, b: max(b, a), "abs": abs, "sqrt": np.sqrt, "sin": np.sin, "cos": np.cos,
         "clamp": lambda x, low, high: min(max(x, low), high), "where": lambda yes, a, b: a if yes else b,
@@ -143,7 +156,8 @@ def thread_warp():
         for module in made.values():
             if hasattr(module, "groups"):
                 module.groups = threads.groups
-        made["contacts"].structs = lambda _real: SimpleNamespace(Grips=object)
+        for name in ("compliance", "contacts"):
+            made[name].structs = lambda _real: SimpleNamespace(Grips=object)
         yield threads, SimpleNamespace(**made)
     finally:
         for name in [name for name in sys.modules if name == "warp" or name.startswith(package)]:

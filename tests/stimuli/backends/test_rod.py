@@ -197,6 +197,44 @@ def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_change
     np.testing.assert_array_equal(finer.wrench[~kept], again.wrench[~kept])
 
 
+def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine():
+    from brainbench.stimuli.backends.rod.fast import SweepLauncher
+
+    objects = resolve_objects(["brick-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
+    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
+    chosen = [("brick-0", [scenes.grid.sweeps("brick-0")[74]])]
+    once = launcher.launch(chosen)
+    five = launcher.launch(chosen, once.unstable, 5)
+    assert five.unstable.any()
+    assert not (five.unstable & ~once.unstable).any()
+    result = launcher.trusted(chosen, 5)
+    assert (result.unstable.any(), result.reasons, result.retried) == (False, ("",), 1)
+    ten = launcher.launch(chosen, five.unstable, 10)
+    whiskers = five.unstable[0]
+    np.testing.assert_array_equal(result.wrench[0][:, whiskers], ten.wrench.numpy()[0][:, whiskers])
+    # All that was computed is counted.
+    assert result.steps == once.steps.sum() + five.steps.sum() + ten.steps.sum()
+
+
+def test_a_whisker_that_cannot_be_trusted_says_why():
+    from brainbench.stimuli.backends.rod.fast import SweepLauncher
+
+    objects = resolve_objects(["brick-0", "chair-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
+    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
+    found = set()
+    for name, index in (("brick-0", 74), ("chair-0", 168)):
+        result = launcher.launch([(name, [scenes.grid.sweeps(name)[index]])])
+        reason = launcher.batch(result).reasons[0]
+        first = int(np.argmax(result.unstable[0]))
+        assert reason.startswith(f"{scenes.array.names[first]}: {result.reason(0, first)}")
+        found |= {result.reason(0, k) for k in np.flatnonzero(result.unstable[0])}
+        bent = {k for k in range(result.status.shape[1]) if result.status[0, k] == 1}
+        assert bent == {k for k in range(result.status.shape[1]) if result.reason(0, k) == "a joint bent too far"}
+    assert len(found) > 1
+
+
 def test_an_unknown_device_is_refused_in_words():
     with pytest.raises(UsageError, match="'cpu' or 'cuda'; received 'tpu'"):
         RodBackend(device="tpu").run([Job(C2, StillFollicle(), (), np.array([1e-3]))], COARSE)
@@ -207,7 +245,8 @@ def test_more_precision_than_there_is_is_refused_in_words():
         Fidelity(precision="quad")
 
 
-def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same():
+@pytest.mark.parametrize("budget", [None, 4])
+def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same(budget):
     from brainbench.stimuli.backends.rod.fast import SweepLauncher
 
     objects = resolve_objects(["torus-1", "gear-0"], surfaces=True)
@@ -216,6 +255,7 @@ def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same():
     results = []
     for sliced in (False, True):
         launcher = SweepLauncher(scenes, COARSE, sliced=sliced)
+        launcher.tuning = {"budget": budget}
         results.append(launcher.launch([(name, grid.sweeps(name)) for name in scenes.objects]))
         assert (launcher.slices > 1) == sliced
     whole, parts = results

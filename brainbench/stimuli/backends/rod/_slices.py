@@ -17,6 +17,9 @@ from brainbench.stimuli.backends.rod._limits import ANYHOW, GRIP_BOUNDS, LOOK_BO
 
 BUDGET = 4
 """Steps of a whisker in one slice."""
+FEW = 2**14
+"""Whiskers below which it is one step: each kernel of a slice then takes as long as its slowest thread, and whiskers in
+contact, which need two slices a step, would wait for others' four."""
 ROUNDS = 8
 """Slices (an even number) between two looks of the host at what is left to do."""
 
@@ -34,7 +37,7 @@ class Slices:
         capacity: int,
         lanes: int,
         device: Any,
-        budget: int = BUDGET,
+        budget: int | None = None,
         recorded: bool | None = None,
     ) -> None:
         wp = warp()
@@ -49,7 +52,7 @@ class Slices:
             return wp.empty(shape, dtype=kind, device=device)
 
         vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
-        on.budget = budget
+        on.budget = budget or (1 if lanes < FEW else BUDGET)
         queue = np.zeros((3, lanes), dtype=np.int32)
         queue[ANYHOW] = np.arange(lanes)
         on.queue = wp.array(queue, device=device)

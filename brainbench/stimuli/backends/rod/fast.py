@@ -20,7 +20,7 @@ from brainbench.errors import UsageError
 from brainbench.stimuli.backends._engines import MILLI
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._kernels import load_kernels
-from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, MESHES
+from brainbench.stimuli.backends.rod._limits import BENT, CROWDED, DOUBTFUL, MESHES, OK
 from brainbench.stimuli.backends.rod._pack import (
     Chains,
     Shapes,
@@ -72,8 +72,20 @@ class SweepResult:
     @property
     def unstable(self) -> NDArray[np.bool_]:
         """[sweep, whisker] whose wrench cannot be trusted."""
-        crowded = self.crowded > CROWDED * np.maximum(self.steps, 1)
-        return (self.status != 0) | crowded | ~(self.doubt <= DOUBTFUL)
+        return (self.status != OK) | self._full | ~(self.doubt <= DOUBTFUL)
+
+    @property
+    def _full(self) -> NDArray[np.bool_]:
+        """[sweep, whisker] with too many steps for some of whose contacts there was no room."""
+        return self.crowded > CROWDED * np.maximum(self.steps, 1)
+
+    def reason(self, sweep: int, whisker: int) -> str:
+        """Why the wrench of a whisker cannot be trusted, in a few words."""
+        if self.status[sweep, whisker] != OK:
+            return "a joint bent too far" if self.status[sweep, whisker] == BENT else "a value is no number"
+        if self._full[sweep, whisker]:
+            return "more contacts than are solved together"
+        return "contact forces not converged"
 
 
 class SweepLauncher:
@@ -236,11 +248,10 @@ class SweepLauncher:
         unstable = result.unstable
         names = [mount.name for mount in self.scenes.array]
         reasons = [""] * len(unstable)
-        for row in np.flatnonzero(unstable.any(axis=1)):
+        for row in np.flatnonzero(unstable.any(axis=1)).tolist():
             first = int(np.argmax(unstable[row]))
-            what = "a joint bent too far or a value was lost" if result.status[row, first] else "contacts not solved"
             more = f" (and {unstable[row].sum() - 1} more whiskers)" if unstable[row].sum() > 1 else ""
-            reasons[row] = f"{names[first]}: {what}{more}"
+            reasons[row] = f"{names[first]}: {result.reason(row, first)}{more}"
         wrench[np.broadcast_to(unstable[:, None, :, None], wrench.shape)] = np.nan
         return SweepBatch(
             wrench=wrench.astype(np.float32, copy=False),
@@ -252,21 +263,31 @@ class SweepLauncher:
         )
 
     def trusted(self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int) -> SweepBatch:
-        """Simulate sweeps, and whiskers that cannot be trusted once more with their steps divided by ``retry``.
+        """Simulate sweeps, and whiskers that cannot be trusted again with finer steps.
+
+        Their steps are divided by ``retry``, and those of the few that cannot be trusted even then by twice that.
 
         Args:
             objects: as for :meth:`launch`.
             retry: 1 leaves such whiskers as they are.
         """
         batch = self.batch(self.launch(objects))
-        rows = np.flatnonzero(batch.unstable.any(axis=1))
-        if retry == 1 or not len(rows):
-            return batch
         flat = [(name, sweep) for name, sweeps in objects for sweep in sweeps]
-        chosen = [flat[row] for row in rows]
-        groups = [(name, [sweep for _, sweep in some]) for name, some in groupby(chosen, key=itemgetter(0))]
+        retried = 0
+        for finer in (retry, 2 * retry) if retry > 1 else ():
+            rows = np.flatnonzero(batch.unstable.any(axis=1))
+            if len(rows):
+                retried = max(retried, len(rows))
+                batch = self._again(batch, rows, [flat[row] for row in rows], finer)
+        return replace(batch, retried=retried)
+
+    def _again(
+        self, batch: SweepBatch, rows: NDArray[np.intp], sweeps: list[tuple[str, Any]], finer: int
+    ) -> SweepBatch:
+        """Return the batch with the whiskers that could not be trusted, of these rows, simulated with finer steps."""
+        groups = [(name, [sweep for _, sweep in some]) for name, some in groupby(sweeps, key=itemgetter(0))]
         only = batch.unstable[rows]
-        again = self.batch(self.launch(groups, only, retry))
+        again = self.batch(self.launch(groups, only, finer))
         wrench, contact, unstable = batch.wrench, batch.contact, batch.unstable
         wrench[rows] = np.where(only[:, None, :, None], again.wrench, wrench[rows])
         contact[rows] = np.where(only, again.contact, contact[rows])
@@ -281,7 +302,6 @@ class SweepLauncher:
             unstable=unstable,
             reasons=tuple(reasons),
             steps=batch.steps + again.steps,
-            retried=len(rows),
         )
 
     def _prepare(self, names: Sequence[str]) -> dict[str, tuple[float, Surface]]:
