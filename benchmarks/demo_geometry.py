@@ -2,10 +2,16 @@
 
 Run ``python benchmarks/demo_geometry.py`` after changing the stimuli or the demo's neurons. Wanted:
 reliable animals (.8 and more) with one harder to read, animals that agree well but not perfectly, raw
-input clearly below that (.2 to .6), and measured RDMs that correlate with their truth above .9.
+input clearly below that (.2 to .6), and measured RDMs that correlate with their truth above .9. The raw
+input of the engine ``rod`` lies above what is wanted (benchmarks/RESULTS.md).
+
+``--engines`` instead compares the stimuli of presets and engines with one another.
 """
 
 from __future__ import annotations
+
+import argparse
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +30,32 @@ def correlate(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     return float(np.corrcoef(first, second)[0, 1])
 
 
+def compare_engines() -> None:
+    """Print a table of how much the forces and RDMs of several settings differ."""
+    found = {}
+    for backend, preset in (("rod", "fast"), ("rod", "balanced"), ("rod", "accurate"), ("mujoco", "balanced")):
+        dataset = load_stimuli("rodgers", backend=backend, fidelity=preset).dataset
+        assert dataset is not None
+        found[f"{backend}, {preset}"] = dataset["wrench"].values.astype(float) / UNITS
+    print("| of | against | forces and moments, rms | RDM, mean over steps | RDM, all frames |")
+    print("|---|---|---|---|---|")
+    for one, other in combinations(found, 2):
+        a, b = found[one], found[other]
+        gap = np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2))
+        mean, whole = (
+            correlate(rdm(view(a)), rdm(view(b)))
+            for view in (lambda x: x.reshape(6, 22, -1).mean(axis=1), lambda x: x.reshape(6, -1))
+        )
+        print(f"| {one} | {other} | {gap:.1%} | {mean:.3f} | {whole:.3f} |")
+
+
 def main() -> None:
     """Print one line per animal and the agreement between animals."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--engines", action="store_true", help="compare presets and engines")
+    if parser.parse_args().engines:
+        compare_engines()
+        return
     stimuli = load_stimuli("rodgers").dataset
     folder = ensure_demo(stimuli)
     truth = read_truth(folder)

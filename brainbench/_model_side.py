@@ -85,7 +85,10 @@ class Candidate:
 
         shown = load_stimuli(stimuli or DEFAULT_STIMULI, whiskers=whiskers, fidelity=fidelity, progress=progress)
         names = ("description", "content_hash", "config_hash")
-        origin = {**self.origin, "stimuli": {name: getattr(shown, name) for name in names}}
+        told: dict[str, Any] = {name: getattr(shown, name) for name in names}
+        if shown.dataset is not None and shown.dataset.attrs.get("backend"):
+            told["backend"] = str(shown.dataset.attrs["backend"])
+        origin = {**self.origin, "stimuli": told}
         if self.module is None:
             given = {
                 layer: _as_steps(layer, item, len(shown.labels)) for layer, item in (self.activations or {}).items()

@@ -171,7 +171,7 @@ def provenance(**extra: Any) -> dict[str, Any]:
     from brainbench import __version__
 
     versions: dict[str, str] = {}
-    for package in ("numpy", "scipy", "xarray", "h5py", "torch", "mujoco-core"):
+    for package in ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
     return {

@@ -120,6 +120,7 @@ def score_record(
     started = clock.perf_counter()
     if time not in ("mean", "concatenate"):
         raise UsageError(f"Unknown time rule {time!r}; allowed: 'mean', 'concatenate'.")
+    _prepare(model, stimuli, recordings, whiskers=whiskers, fidelity=fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     chosen = metrics.find_metric(metric) if isinstance(metric, str) else metric
     metrics.check_metric(chosen)
@@ -186,6 +187,18 @@ def score_record(
         card=network.card,
         synthetic=brain.synthetic,
     )
+
+
+def _prepare(model: Any, stimuli: Any, recordings: Any, *, progress: Progress | None, **options: Any) -> None:
+    """Let the simulation get ready beside loading the network, if any will be needed."""
+    from brainbench._brain_side import DEMO_STIMULI
+    from brainbench._model_side import DEFAULT_STIMULI
+    from brainbench.stimuli.sets import prepare_stimuli
+
+    if isinstance(recordings, str) and recordings == "demo":
+        prepare_stimuli(DEMO_STIMULI, progress=progress)
+    elif not isinstance(model, Mapping):
+        prepare_stimuli(stimuli or DEFAULT_STIMULI, progress=progress, **options)
 
 
 def _with_origin(item: Score, origin: Mapping[str, Any]) -> Score:

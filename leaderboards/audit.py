@@ -102,8 +102,8 @@ def _stale(record: ResultRecord, schema: int, newest: dict[tuple[Any, ...], tupl
     latest = newest.get(_shown(record), ("", ""))[1]
     if latest and latest != _origin.stimuli_hash(score):
         reasons.append(
-            f"its stimuli ({_origin.stimuli_hash(score)}) were made by an earlier definition of fidelity "
-            f"{settings.get('fidelity')!r} than the newest records' ({latest})"
+            f"its stimuli ({_origin.stimuli_hash(score)}) were made by another engine or an earlier definition of "
+            f"fidelity {settings.get('fidelity')!r} than the newest records' ({latest})"
         )
     return reasons
 

@@ -11,6 +11,7 @@ from brainbench.cli._shared import JsonOption, emit, table
 
 REQUIRED = (
     "torch",
+    "warp-lang",
     "mujoco-core",
     "numpy",
     "scipy",
@@ -30,7 +31,6 @@ OPTIONAL = {
     "pybullet": ("bullet", "the whisker engine of WHISKiT as a second backend (Python < 3.12)"),
     "coacd": ("mesh", "convex decomposition of concave objects"),
     "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),
-    "warp-lang": ("rod", "the rod backend and all tactile sensors of robot hands, on CPU and GPU"),
     "mujoco-warp": ("gpu", "simulation of robot hands on CUDA"),
     "rsl-rl-lib": ("policies", "training of teachers and students (brainbench policy train | distill)"),
     "gymnasium": ("policies", "the dexterous tasks as gymnasium environments"),

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from brainbench.errors import UsageError, unknown_name
 from brainbench.fidelity import TradeoffPoint, cheapest
+from brainbench.stimuli.backends import DEFAULT_BACKEND
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Fidelity:
         return replace(cls.preset(preset), **values)
 
     @classmethod
-    def auto(cls, *, error: float = 0.05, backend: str = "mujoco") -> Fidelity:
+    def auto(cls, *, error: float = 0.05, backend: str = DEFAULT_BACKEND) -> Fidelity:
         """Return the cheapest measured setting of a backend whose relative error is at most ``error``.
 
         The error is the worst over bench tests of mouse whiskers: pegs against the elastica, ring-downs, and whisking
@@ -154,7 +155,7 @@ def list_presets() -> tuple[str, ...]:
 
 
 @cache
-def measured(backend: str = "mujoco") -> tuple[TradeoffPoint, ...]:
+def measured(backend: str = DEFAULT_BACKEND) -> tuple[TradeoffPoint, ...]:
     """Return the measured settings of a backend: error as the table states, cost in processor s per whisker-second.
 
     Raises:

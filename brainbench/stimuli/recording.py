@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError
-from brainbench.stimuli.backends import get_backend
+from brainbench.stimuli.backends import DEFAULT_BACKEND, get_backend
 from brainbench.stimuli.fidelity import Fidelity
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def record(
     times: ArrayLike,
     *,
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = "mujoco",
+    backend: Backend | str = DEFAULT_BACKEND,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> Recording:
@@ -131,7 +131,7 @@ def _simulate(
     shapes: list[Any] = [trace.link_positions for trace in traces]
     if any(shape is None for shape in shapes):
         raise UsageError(
-            f"The backend {engine.name!r} reports no whisker shapes, so nothing can be drawn; use 'mujoco'."
+            f"The backend {engine.name!r} reports no whisker shapes, so nothing can be drawn; use 'rod' or 'mujoco'."
         )
     return shapes
 

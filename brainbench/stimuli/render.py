@@ -20,6 +20,7 @@ from brainbench.stimuli._film import require_writer, write_film
 from brainbench.stimuli._raster import Layer, Triangles, draw
 from brainbench.stimuli._shading import floor, lamp, paint, shade
 from brainbench.stimuli._surfaces import Surface, ball, object_surface, smoothed, tube
+from brainbench.stimuli.backends import DEFAULT_BACKEND
 from brainbench.stimuli.camera import Camera
 from brainbench.stimuli.motion import Whisking
 from brainbench.stimuli.recording import Recording, record
@@ -212,7 +213,7 @@ def render(
     camera: Camera | None = None,
     style: Style | None = None,
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = "mujoco",
+    backend: Backend | str = DEFAULT_BACKEND,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
+from brainbench.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, listing, unknown_name
 from brainbench.files import content_hash
+from brainbench.stimuli.backends import DEFAULT_BACKEND
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.recipes import get_recipe, is_recipe, list_recipes
 from brainbench.stimuli.selection import match_whiskers
@@ -56,7 +58,7 @@ def load_stimuli(
     *,
     whiskers: str = "all",
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = "mujoco",
+    backend: Backend | str = DEFAULT_BACKEND,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> Stimuli:
@@ -90,6 +92,27 @@ def load_stimuli(
         return _from_hdf5(path, whiskers)
     hint = f"Or a path: a scene file (.toml), or a stimulus-set or array file ({', '.join(_HDF5)})."
     raise unknown_name("stimuli", os.fspath(source), list_recipes(), hint=hint)
+
+
+def prepare_stimuli(
+    source: object,
+    *,
+    whiskers: str = "all",
+    fidelity: Fidelity | str | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Begin, in a thread, what :func:`load_stimuli` will wait for (:func:`brainbench.stimuli.simulation.prepare`).
+
+    Whatever does not have to be simulated is left alone, and so is what cannot be: ``load_stimuli`` says why.
+    """
+    from brainbench.stimuli.scene_files import load_scene
+    from brainbench.stimuli.simulation import prepare
+
+    with contextlib.suppress(BrainbenchError, OSError):
+        if isinstance(source, str) and is_recipe(source):
+            prepare(get_recipe(source, whiskers=whiskers).scenes, fidelity=fidelity, progress=progress)
+        elif isinstance(source, (str, os.PathLike)) and Path(source).suffix == ".toml":
+            prepare(load_scene(Path(source), whiskers=whiskers).scenes, fidelity=fidelity, progress=progress)
 
 
 def _from_recipe(

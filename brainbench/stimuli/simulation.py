@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import math
+import threading
 import time
 from collections.abc import Iterable, Sequence
 from importlib import resources
@@ -13,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench import __version__
-from brainbench.errors import DataError, UsageError
+from brainbench.errors import BrainbenchError, DataError, UsageError
 from brainbench.files import cache_dir, content_hash, to_json
 from brainbench.stimuli._plan import plan
-from brainbench.stimuli.backends import get_backend
+from brainbench.stimuli.backends import DEFAULT_BACKEND, get_backend
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.frames import clip_wrenches
@@ -35,14 +37,14 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-_PACKAGES = {"bullet": "pybullet", "mujoco": "mujoco-core"}
+_PACKAGES = {"bullet": "pybullet", "mujoco": "mujoco-core", "rod": "warp-lang"}
 
 
 def simulate(
     scenes: Scene | Iterable[Scene],
     *,
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = "mujoco",
+    backend: Backend | str = DEFAULT_BACKEND,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> xr.Dataset:
@@ -94,6 +96,44 @@ def simulate(
     return dataset
 
 
+def prepare(
+    scenes: Iterable[Scene],
+    *,
+    fidelity: Fidelity | str | None = None,
+    backend: str = DEFAULT_BACKEND,
+    progress: Progress | None = None,
+) -> None:
+    """Begin, in a thread, what simulating these scenes will wait for, unless the cache holds their simulation.
+
+    An engine that compiles at first use does so beside whatever the caller does before :func:`simulate`, which needs no
+    such call: it takes the same arguments, and waits for the rest.
+    """
+    chosen = list(scenes)
+    fidelity = Fidelity.parse(fidelity or "balanced") if not isinstance(fidelity, Fidelity) else fidelity
+    engine = get_backend(backend)
+    if not cache_path(chosen, fidelity, engine.name).exists():
+        _begin(engine, chosen, fidelity, progress)
+
+
+def _begin(
+    engine: Backend, scenes: Sequence[Scene], fidelity: Fidelity, progress: Progress | None
+) -> threading.Thread | None:
+    """Let an engine get ready in a thread, if it has anything to do for that."""
+    get_ready = getattr(engine, "prepare", None)
+    if get_ready is None:
+        return None
+    lengths = {mount.whisker.arc_length for scene in scenes for mount in scene.mounts}
+
+    def work() -> None:
+        # What is wrong here is wrong again in the simulation, which says so.
+        with contextlib.suppress(BrainbenchError):
+            get_ready(lengths, fidelity, progress=progress)
+
+    thread = threading.Thread(target=work, name="brainbench-prepare")
+    thread.start()
+    return thread
+
+
 def _checked(scenes: Scene | Iterable[Scene]) -> list[Scene]:
     chosen = [scenes] if isinstance(scenes, Scene) else list(scenes)
     if not chosen:
@@ -113,8 +153,11 @@ def _checked(scenes: Scene | Iterable[Scene]) -> list[Scene]:
 def _simulate(scenes: Sequence[Scene], fidelity: Fidelity, engine: Backend, progress: Progress | None) -> xr.Dataset:
     """Simulate every distinct job once; put the traces together and say what was done."""
     clock = [time.perf_counter()]
+    making = _begin(engine, scenes, fidelity, progress)
     planned = plan(scenes, surfaces=getattr(engine, "surfaces", False))
     clock.append(time.perf_counter())
+    if making is not None:
+        making.join()
     report = None if progress is None else lambda done, total: progress(done, total, "simulating whiskers")
     traces = engine.run(planned.jobs, fidelity, progress=report)
     clock.append(time.perf_counter())

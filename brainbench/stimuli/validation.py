@@ -15,7 +15,7 @@ import numpy as np
 
 from brainbench.errors import DataError, UsageError
 from brainbench.stimuli import references
-from brainbench.stimuli.backends import get_backend
+from brainbench.stimuli.backends import DEFAULT_BACKEND, get_backend
 from brainbench.stimuli.backends.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.chain import build_chain
 from brainbench.stimuli.fidelity import Fidelity
@@ -121,7 +121,7 @@ def point_load(
     force: float,
     at: float,
     *,
-    backend: str = "mujoco",
+    backend: str = DEFAULT_BACKEND,
     fidelity: Fidelity | str = "balanced",
 ) -> PointLoad:
     """Load a straight whisker with ``force`` (N, along +y) at arc length ``at`` (m) and wait until it is at rest.
@@ -160,7 +160,7 @@ def peg(
     offset: float,
     *,
     peg_radius: float = 2.5e-4,
-    backend: str = "mujoco",
+    backend: str = DEFAULT_BACKEND,
     fidelity: Fidelity | str = "balanced",
 ) -> BenchTest:
     """Press a frictionless round peg against a straight whisker and compare with the elastica.
@@ -203,7 +203,7 @@ def slip_off(
     at: float,
     *,
     peg_radius: float = 2.5e-4,
-    backend: str = "mujoco",
+    backend: str = DEFAULT_BACKEND,
     fidelity: Fidelity | str = "balanced",
 ) -> SlipOff:
     """Raise a frictionless round peg at distance ``at`` (m) from the base until the whisker slips off it.
@@ -253,7 +253,7 @@ def ringdown(
     modes: int = 3,
     deflection: float = 1e-3,
     own_step: bool = False,
-    backend: str = "mujoco",
+    backend: str = DEFAULT_BACKEND,
     fidelity: Fidelity | str = "accurate",
 ) -> Ringdown:
     """Let a bent whisker go and fit its lowest modes.

@@ -68,14 +68,15 @@ def test_simulate_explains_what_it_left_out_and_show_reads_the_file(run, scene, 
     result = run("stimuli", "simulate", scene, "--fidelity", "fast", "--out", str(file), "--explain", "--json")
     assert result.status == 0, result.err
     data = json.loads(result.out)
-    assert data["explanation"]["simulated"] == 4
+    # Whiskers at rest are not stepped.
+    assert (data["explanation"]["simulated"], data["explanation"]["silent"]) == (2, 2)
     assert data["explanation"]["out_of_reach"] == {"still": [], "whisking": []}
     assert [item["stimulus"] for item in data["stimuli"]] == ["whisking", "still"]
     text = run("stimuli", "simulate", scene, "--fidelity", "fast", "--explain").out
     assert "2 stimuli × 2 whiskers = 4 runs of " in text
     assert "earlier, read from" in text
     shown = run("stimuli", "show", str(file)).out
-    assert "simulated by mujoco" in shown
+    assert "simulated by rod" in shown
     assert "whisking" in shown
 
 

@@ -71,7 +71,18 @@ def test_what_cannot_be_swept_is_named(run, arguments, message):
 
 
 def test_a_device_that_the_backend_does_not_have_is_refused_before_anything_is_made(run, tmp_path):
-    result = run("stimuli", "sweep", "thesis-low", "torus", "--out", str(tmp_path / "set"), "--device", "cuda")
+    result = run(
+        "stimuli",
+        "sweep",
+        "thesis-low",
+        "torus",
+        "--out",
+        str(tmp_path / "set"),
+        "--device",
+        "cuda",
+        "--backend",
+        "mujoco",
+    )
     assert result.status == 2
     assert "'mujoco' does not run on 'cuda'" in result.err
     assert not (tmp_path / "set").exists()

@@ -41,7 +41,9 @@ def test_a_batch_is_the_grid_of_the_simulated_sweeps(plan, folder):
     scenes = SweepScenes(GRID, {name: item.load for name, item in plan.objects.items()}, whiskers=plan.whiskers)
     order = data.order(0)
     x, y = next(iter(data))
-    expected = simulate([scenes[int(data.indices[i])] for i in order[:5]], fidelity="fast", cache=False)
+    expected = simulate(
+        [scenes[int(data.indices[i])] for i in order[:5]], fidelity="fast", backend="mujoco", cache=False
+    )
     np.testing.assert_array_equal(x.numpy(), to_grid(expected))
     assert x.shape == (5, 2, 30, 5, 7)
     assert np.abs(x.numpy()).max() > 0

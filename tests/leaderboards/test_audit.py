@@ -51,7 +51,7 @@ def test_stimuli_of_an_earlier_definition_of_a_fidelity_are_stale(make_record, t
     )
     found = remarks([_stored(record, tmp_path) for record in (old, new, coarse)])
     assert list(found) == [old.identity]
-    assert "earlier definition of fidelity 'balanced'" in found[old.identity][0]
+    assert "another engine or an earlier definition of fidelity 'balanced'" in found[old.identity][0]
 
 
 def test_the_same_computation_with_other_numbers_is_a_conflict_on_both_sides(make_record, tmp_path):

@@ -43,7 +43,7 @@ def in_full(monkeypatch):
 
 def test_runs_are_counted_as_simulated_shared_or_silent():
     scenes = [_scene("near", NEAR), _scene("far", FAR), _scene("nothing")]
-    told = Explanation.of(simulate(scenes, fidelity=FAST, cache=False))
+    told = Explanation.of(simulate(scenes, fidelity=FAST, backend="mujoco", cache=False))
     # C1 and C2 reach the ball; all three whisk through air once, for both other scenes and D6 for all.
     assert (told.runs, told.simulated, told.shared, told.silent) == (9, 5, 4, 0)
     assert told.out_of_reach == {"near": ("D6",), "far": ("C1", "C2", "D6"), "nothing": ("C1", "C2", "D6")}
@@ -53,9 +53,9 @@ def test_runs_are_counted_as_simulated_shared_or_silent():
 
 def test_whiskers_without_motion_or_object_are_silent_and_a_full_simulation_feels_nothing_either(in_full, monkeypatch):
     scene = _scene("far", FAR, NEAR, whisking=Still(), array=ARRAY.select("C1,D6"))
-    full = simulate(scene, fidelity=FAST, cache=False)
+    full = simulate(scene, fidelity=FAST, backend="mujoco", cache=False)
     monkeypatch.setattr(mujoco, "reachable", _reach.reachable)
-    pruned = simulate(scene, fidelity=FAST, cache=False)
+    pruned = simulate(scene, fidelity=FAST, backend="mujoco", cache=False)
     told = Explanation.of(pruned)
     assert told.silent == 1
     assert told.out_of_reach == {"far": ("D6",)}
@@ -74,9 +74,9 @@ def test_whiskers_that_the_rodgers_solid_cannot_touch_feel_the_same_in_a_full_si
     short = Scene(
         label, scene.array.select(",".join(out)), scene.objects, scene.whisking, scene.head, Frames(0, 2e-3, 30)
     )
-    full = simulate(short, fidelity=FAST, cache=False)
+    full = simulate(short, fidelity=FAST, backend="mujoco", cache=False)
     monkeypatch.setattr(mujoco, "reachable", _reach.reachable)
-    pruned = simulate(short, fidelity=FAST, cache=False)
+    pruned = simulate(short, fidelity=FAST, backend="mujoco", cache=False)
     assert not full["contact"].any()
     scale = np.abs(pruned["wrench"].values).max(axis=(0, 1, 2))
     np.testing.assert_allclose(full["wrench"] / scale, pruned["wrench"] / scale, atol=1e-6)
@@ -87,7 +87,7 @@ def test_the_pairs_told_are_the_pairs_the_engine_builds():
     scene = Scene(
         "solid", ARRAY, (PlacedObject(rodgers_solid(0.055), position=(0.0137, 0.0045, 0.003)),), frames=FRAMES
     )
-    dataset = simulate(scene, fidelity=FAST, cache=False)
+    dataset = simulate(scene, fidelity=FAST, backend="mujoco", cache=False)
     built = 0
     for job in scene.jobs():
         chain = build_chain(job.whisker, FAST.links)
@@ -177,7 +177,11 @@ def test_the_same_simulation_is_explained_in_the_same_words_and_survives_the_cac
 
 
 def test_the_text_says_what_was_saved():
-    text = str(Explanation.of(simulate([_scene("near", NEAR), _scene("far", FAR)], fidelity=FAST, cache=False)))
+    text = str(
+        Explanation.of(
+            simulate([_scene("near", NEAR), _scene("far", FAR)], fidelity=FAST, backend="mujoco", cache=False)
+        )
+    )
     assert "2 stimuli × 3 whiskers = 6 runs of 6 links" in text
     assert "saved          17 % of the steps" in text
     assert "near: D6" in text

@@ -1,5 +1,6 @@
 import dataclasses
 import logging
+import threading
 
 import numpy as np
 import pytest
@@ -113,6 +114,35 @@ def test_progress_counts_the_whiskers_simulated():
     calls = []
     _simulate(_scene(), progress=lambda *call: calls.append(call))
     assert calls == [(1, 3, "simulating whiskers"), (2, 3, "simulating whiskers"), (3, 3, "simulating whiskers")]
+
+
+class Preparing(FakeBackend):
+    """An engine with something to do before it runs."""
+
+    def __init__(self):
+        super().__init__()
+        self.ready = []
+
+    def prepare(self, lengths, fidelity, *, progress=None):
+        self.ready.append((sorted(lengths), fidelity, len(self.jobs)))
+        raise UsageError("what is wrong is said by run")
+
+
+def test_an_engine_gets_ready_before_it_runs_and_not_for_what_is_in_the_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    engine, fidelity = Preparing(), Fidelity.preset("fast")
+    monkeypatch.setattr(simulation, "get_backend", lambda name: engine)
+    scene = _scene()
+    simulation.prepare([scene], fidelity="fast", backend="fake")
+    for thread in threading.enumerate():
+        if thread.name == "brainbench-prepare":
+            thread.join()
+    simulate(scene, fidelity=fidelity, backend="fake")
+    lengths = sorted({mount.whisker.arc_length for mount in scene.mounts})
+    assert engine.ready == [(lengths, fidelity, 0)] * 2
+    simulation.prepare([scene], fidelity=fidelity, backend="fake")
+    simulate(scene, fidelity=fidelity, backend="fake")
+    assert len(engine.ready) == 2
 
 
 def test_a_second_request_comes_from_the_cache(engine):

@@ -16,12 +16,13 @@ from brainbench.stimuli.tradeoff import Setting
 @pytest.fixture
 def quick(monkeypatch):
     """A coarse reference and one peg, so that a point takes a moment."""
-    monkeypatch.setattr(tradeoff, "CONVERGED", Fidelity(links=8, time_step=2e-4, steps_per_period=10))
+    coarse = Setting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
+    monkeypatch.setattr(tradeoff, "REFERENCE", coarse)
     monkeypatch.setattr(tradeoff, "PEGS", ((0.5, 0.1),))
 
 
-COARSE = Setting(Fidelity(links=6, time_step=2e-4, steps_per_period=10))
-FINE = Setting(Fidelity(links=8, time_step=2e-4, steps_per_period=10))
+COARSE = Setting(Fidelity(links=6, time_step=2e-4, steps_per_period=10), "mujoco")
+FINE = Setting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
 
 
 def test_a_setting_is_measured_once_and_the_reference_differs_from_itself_by_nothing(quick, tmp_path):

@@ -10,6 +10,7 @@ import typer
 from brainbench.cli._shared import JsonOption, emit, progress_bar, table
 from brainbench.cli.stimuli._options import BackendOption, FidelityOption, WhiskersOption
 from brainbench.errors import UsageError
+from brainbench.stimuli.backends import DEFAULT_BACKEND
 
 
 def simulate(
@@ -17,7 +18,7 @@ def simulate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Stimulus-set file to write (.h5).")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
-    backend: BackendOption = "mujoco",
+    backend: BackendOption = DEFAULT_BACKEND,
     explain: Annotated[
         bool, typer.Option("--explain", help="Tell what was simulated, shared and left out, and what that saved.")
     ] = False,

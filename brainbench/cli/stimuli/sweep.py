@@ -11,6 +11,7 @@ import typer
 from brainbench.cli._shared import JsonOption, emit, progress_bar, table
 from brainbench.cli.stimuli._options import BackendOption, FidelityOption, WhiskersOption
 from brainbench.errors import UsageError, unknown_name
+from brainbench.stimuli.backends import DEFAULT_BACKEND
 
 if TYPE_CHECKING:
     from brainbench.stimuli.generation.plan import GenerationPlan
@@ -55,7 +56,7 @@ def sweep(
     collision: Annotated[str | None, typer.Option(help="What whiskers touch: hull, exact, decomposition, …")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
-    backend: BackendOption = "mujoco",
+    backend: BackendOption = DEFAULT_BACKEND,
     as_json: JsonOption = False,
 ) -> None:
     """Count the sweeps of a grid beside the published counts; with --out make a data set of them.

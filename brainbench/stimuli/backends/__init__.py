@@ -10,6 +10,9 @@ from brainbench.errors import unknown_name
 if TYPE_CHECKING:
     from brainbench.stimuli.backends.protocol import Backend
 
+DEFAULT_BACKEND = "rod"
+"""Engine of whatever does not ask for one; it needs no GPU."""
+
 _BACKENDS = {
     "bullet": ("brainbench.stimuli.backends.bullet", "BulletBackend"),
     "mujoco": ("brainbench.stimuli.backends.mujoco", "MujocoBackend"),

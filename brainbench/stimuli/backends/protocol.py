@@ -133,7 +133,9 @@ class Backend(Protocol):
     """A physics engine that runs jobs.
 
     An engine that collides the exact surface of obstacles that have one says so by an attribute ``surfaces = True``;
-    others collide the convex parts.
+    others collide the convex parts. One that has something to compile at first use may do it in a method
+    ``prepare(lengths, fidelity, *, progress=None)``, which is called in a thread before ``run`` with the arc lengths of
+    the whiskers [m].
     """
 
     @property

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.errors import UsageError, listing
-from brainbench.stimuli.backends import get_backend
+from brainbench.stimuli.backends import DEFAULT_BACKEND, get_backend
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.simulation import simulate
 
@@ -71,7 +71,7 @@ def simulate_sweeps(
     indices: Sequence[int],
     *,
     fidelity: Fidelity,
-    backend: str = "mujoco",
+    backend: str = DEFAULT_BACKEND,
     device: str = "cpu",
     workers: int | None = None,
     retry: int = 1,
@@ -92,7 +92,7 @@ def simulate_sweeps(
         UsageError: the backend is unknown or does not run on the device.
     """
     engine = check_device(backend, device)
-    if backend in FAST_PATHS:
+    if backend in FAST_PATHS and scenes.grid.mover == "object":
         module, symbol = FAST_PATHS[backend]
         run = getattr(import_module(module), symbol)
         return run(scenes, indices, fidelity=fidelity, device=device, workers=workers, retry=retry)

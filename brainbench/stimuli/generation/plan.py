@@ -13,6 +13,7 @@ import numpy as np
 from brainbench import __version__
 from brainbench.errors import UsageError, unknown_name
 from brainbench.files import content_hash, to_plain
+from brainbench.stimuli.backends import DEFAULT_BACKEND
 from brainbench.stimuli.fidelity import Fidelity
 from brainbench.stimuli.generation.split import SPLITS, SplitBy, split_objects, split_sweeps
 from brainbench.stimuli.simulation import _PACKAGES
@@ -42,7 +43,7 @@ class Settings:
     """
 
     fidelity: Fidelity
-    backend: str = "mujoco"
+    backend: str = DEFAULT_BACKEND
     device: str = "cpu"
     split: SplitBy = "object"
     seed: int = 0

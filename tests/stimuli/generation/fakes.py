@@ -31,7 +31,8 @@ def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):
 
 def small_plan(objects=("brick:2", "cone:2"), *, whiskers="C3", grid=GRID, fidelity=None, **settings):
     found = resolve_objects(objects, collision="hull")
-    chosen = Settings(fidelity or Fidelity.preset("fast"), **settings)
+    # An engine that takes sweeps as any other scenes, and refuses none of these.
+    chosen = Settings(fidelity or Fidelity.preset("fast"), **{"backend": "mujoco", **settings})
     return GenerationPlan("small", grid, found, chosen, whiskers)
 
 

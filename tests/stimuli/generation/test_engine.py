@@ -1,11 +1,14 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from brainbench.errors import UsageError
 from brainbench.stimuli import Fidelity, simulate
+from brainbench.stimuli.backends import DEFAULT_BACKEND
 from brainbench.stimuli.generation.engine import SweepBatch, join_batches, simulate_sweeps
 from tests.stimuli.fakes import FakeBackend
-from tests.stimuli.generation.fakes import small_scenes
+from tests.stimuli.generation.fakes import GRID, small_scenes
 
 FAST = Fidelity.preset("fast")
 
@@ -13,8 +16,8 @@ FAST = Fidelity.preset("fast")
 def test_a_batch_holds_what_simulating_its_scenes_gives():
     scenes = small_scenes(whiskers="C2,C3")
     indices = [9, 2, 3]
-    batch = simulate_sweeps(scenes, indices, fidelity=FAST)
-    dataset = simulate([scenes[index] for index in indices], fidelity=FAST, cache=False)
+    batch = simulate_sweeps(scenes, indices, fidelity=FAST, backend="mujoco")
+    dataset = simulate([scenes[index] for index in indices], fidelity=FAST, backend="mujoco", cache=False)
     np.testing.assert_array_equal(batch.wrench, dataset["wrench"].values)
     np.testing.assert_array_equal(batch.contact, dataset["contact"].values.mean(axis=1).astype(np.float32))
     assert batch.contact.max() > 0
@@ -33,6 +36,14 @@ def test_neither_batch_nor_order_nor_threads_change_a_number():
     np.testing.assert_array_equal(together.contact, alone.contact)
 
 
+def test_sweeps_that_move_the_head_go_through_the_default_engine_scene_by_scene():
+    scenes = small_scenes(grid=dataclasses.replace(GRID, mover="head"))
+    batch = simulate_sweeps(scenes, [1, 2], fidelity=FAST)
+    dataset = simulate([scenes[index] for index in (1, 2)], fidelity=FAST, cache=False)
+    assert dataset.attrs["backend"] == DEFAULT_BACKEND
+    np.testing.assert_array_equal(batch.wrench, dataset["wrench"].values)
+
+
 def test_an_unstable_whisker_is_marked_with_its_reason(monkeypatch):
     engine = FakeBackend(unstable={1: "joint 3 bent too far"})
     monkeypatch.setattr("brainbench.stimuli.generation.engine.get_backend", lambda name: engine)
@@ -46,7 +57,7 @@ def test_an_unstable_whisker_is_marked_with_its_reason(monkeypatch):
 
 def test_a_device_that_the_engine_does_not_have_is_refused():
     with pytest.raises(UsageError, match="'mujoco' does not run on 'cuda'; it runs on 'cpu'"):
-        simulate_sweeps(small_scenes(), [0], fidelity=FAST, device="cuda")
+        simulate_sweeps(small_scenes(), [0], fidelity=FAST, backend="mujoco", device="cuda")
 
 
 def test_a_batch_that_hides_instability_cannot_be_made():

@@ -32,7 +32,7 @@ def test_a_shard_holds_the_simulated_forces_and_what_they_belong_to(tmp_path):
     scenes = SweepScenes(GRID, {name: item.load for name, item in plan.objects.items()}, whiskers="C2,C3")
     with h5py.File(tmp_path / task.name) as file:
         for row, index in enumerate(file["sweep"][:].tolist()):
-            dataset = simulate(scenes[index], fidelity="fast", cache=False)
+            dataset = simulate(scenes[index], fidelity="fast", backend="mujoco", cache=False)
             np.testing.assert_array_equal(file["wrench"][row], dataset["wrench"].values[0])
             name = file["object"].asstr()[file["owner"][row]]
             assert file["class"].asstr()[file["label"][row]] == name.split("-")[0]

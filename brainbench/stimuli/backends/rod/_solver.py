@@ -27,7 +27,7 @@ from brainbench.stimuli.backends.rod._structs import structs
 from brainbench.stimuli.backends.rod._tracks import tracks
 
 MAKING = threading.Lock()
-"""To be held while kernels are made and compiled: two threads at once would make their structures twice."""
+"""To be held while kernels are made: two threads at once would make their structures twice."""
 
 
 @cache
@@ -67,6 +67,8 @@ def solver(
     if sliced and cuda:
         classes = (*GROUPS, (most_held, 8 if most_held <= 8 else 16))
     fast_math = cuda and real is wp.float32
+    # Warp's own flags for a processor inline without bound, which is no faster here and takes longer to compile.
+    options = {"fast_math": fast_math, "cpu_compiler_flags": "-march=native"}
     chain, near_by = passes(real, capacity), candidates(real, capacity, against, sliced)
     place, articulate, accelerate, advance = chain.place, chain.articulate, chain.accelerate, chain.advance
     sight, nearby, ask, gather = near_by.sight, near_by.nearby, near_by.ask, near_by.gather
@@ -143,7 +145,7 @@ def solver(
                 out.pressed[reading, 0, lane] = gp.answer[lane, 5] * real(1e-3)
                 out.pressed[reading, 1, lane] = gp.answer[lane, 6] * real(1e-6)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": fast_math}, launch_bounds=bounds)
+    @wp.kernel(enable_backward=False, module="unique", module_options=options, launch_bounds=bounds)
     def run(
         ch: Chains,
         tr: Tracks,
@@ -341,6 +343,7 @@ def solver(
 
     further = queues(real, capacity, against, classes if sliced else (), sliced and cuda, fast_math)
     return SimpleNamespace(
+        loading=threading.Lock(),
         run=run,
         turn_over=further.turn_over,
         look_all=further.look_all,

@@ -16,19 +16,21 @@ from brainbench.stimuli.backends._engines import MILLI, step_travel, strongest_f
 from brainbench.stimuli.backends._reach import Reach, reachable
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
+from brainbench.stimuli.backends.rod._kernels import load_kernels
 from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, FINEST, LIGHT, LOST, OK, WIDEST
 from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
 from brainbench.stimuli.backends.rod._slices import make_grips
 from brainbench.stimuli.chain import build_chain
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from brainbench.stimuli.backends.protocol import Job, Progress
     from brainbench.stimuli.chain import Chain
     from brainbench.stimuli.fidelity import Fidelity
+    from brainbench.types import Progress as NamedProgress
 
 SLICE = 65_536
 """Whiskers of one launch on a GPU: bounds the memory of a run."""
@@ -43,12 +45,38 @@ class RodBackend:
         MissingDependencyError: warp-lang is not installed.
     """
 
-    device: str = "cpu"
-    """``cpu`` or ``cuda``."""
+    device: str = "auto"
+    """``cpu`` or ``cuda``; ``auto``: ``cpu``, or ``cuda`` where Warp cannot compile for processors."""
 
     name = "rod"
     surfaces = True
     devices = ("cpu", "cuda")
+
+    def prepare(self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None) -> None:
+        """Load the kernels for whiskers of these arc lengths [m]; all that this machine has not compiled yet at once.
+
+        :meth:`run` does so itself. Called in a thread some time before, the compiler works beside everything else.
+
+        Args:
+            lengths: arc lengths of the whiskers [m].
+            fidelity: as for :meth:`run`.
+            progress: called as ``progress(done, total, what)`` when something must be compiled.
+        """
+        device = pick_device(self.device)
+        if device.is_cuda:  # which kernels are needed depends on what there is to touch
+            return
+        sizes = sorted({capacity_for(fidelity.link_count(length)) for length in lengths})
+
+        def load(capacity: int) -> None:
+            def tell(begins: bool) -> None:
+                if progress is not None:
+                    what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
+                    progress(0 if begins else 1, 1, what)
+
+            load_kernels(device, _real(fidelity), capacity, compiling=tell)
+
+        with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:
+            list(pool.map(load, sizes))
 
     def run(
         self,
@@ -94,6 +122,11 @@ class RodBackend:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
         return [trace for trace in traces if trace is not None]
+
+
+def _real(fidelity: Fidelity) -> type:
+    """Warp's type of the numbers that a simulation calculates with."""
+    return warp().float32 if fidelity.precision == "single" else warp().float64
 
 
 def _processors() -> int:
@@ -155,8 +188,6 @@ def _simulate(
     jobs: Sequence[Job], indices: Sequence[int], fidelity: Fidelity, device: Any, capacity: int, record_shape: bool
 ) -> list[tuple[int, Trace]]:
     """Run jobs that share their readings in one launch."""
-    from brainbench.stimuli.backends.rod._solver import MAKING, solver
-
     started = time.thread_time()
     wp = warp()
     first = jobs[0]
@@ -174,12 +205,10 @@ def _simulate(
             found.append((index, _silent(job, fidelity, record_shape, started)))
     if not lanes:
         return found
-    real = wp.float32 if fidelity.precision == "single" else wp.float64
+    real = _real(fidelity)
     # Compiling is once; it is no cost of a whisker.
     paused = time.thread_time()
-    with MAKING:
-        kernels = solver(real, capacity, batch.shapes.needs, cuda=device.is_cuda)
-        kernels.run.module.load(device, block_dim=1 if device.is_cpu else None)
+    kernels = load_kernels(device, real, capacity, batch.shapes.needs)
     started += time.thread_time() - paused
     readings = first.times * MILLI
     count, frames = len(lanes), len(readings)
@@ -292,7 +321,8 @@ def _too_fast(
     """When (s) an object first moves further against the whisker than the finest step looks, and that in words."""
     chain = build_chain(job.whisker, 8)
     finest = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi)) / FINEST
-    share = finest / np.diff(times)
+    spans = np.diff(times)
+    share = np.divide(finest, spans, out=np.zeros_like(spans), where=spans > 0)
     for obstacle in reach.obstacles:
         travel = step_travel(job.whisker, position, euler, obstacle, times) * share
         if (travel > WIDEST / MILLI).any():

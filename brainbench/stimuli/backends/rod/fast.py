@@ -19,6 +19,7 @@ import numpy as np
 from brainbench.errors import UsageError
 from brainbench.stimuli.backends._engines import MILLI
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
+from brainbench.stimuli.backends.rod._kernels import load_kernels
 from brainbench.stimuli.backends.rod._limits import BENT, CROWDED, DOUBTFUL, MESHES, OK
 from brainbench.stimuli.backends.rod._pack import (
     Chains,
@@ -103,8 +104,6 @@ class SweepLauncher:
         bounds: tuple[int, int] | None = None,
         sliced: bool | None = None,
     ) -> None:
-        from brainbench.stimuli.backends.rod._solver import MAKING, solver
-
         against = MESHES if against is None else against
 
         grid = scenes.grid
@@ -126,15 +125,8 @@ class SweepLauncher:
         chains = [build_chain(m.whisker, fidelity.link_count(m.whisker.arc_length)) for m in mounts]
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.real = wp.float32 if fidelity.precision == "single" else wp.float64
-        with MAKING:
-            self.kernels = solver(
-                self.real,
-                self.capacity,
-                against,
-                bounds or (SLICED_BOUNDS if self.sliced else BOUNDS),
-                sliced=self.sliced,
-                cuda=self.device.is_cuda,
-            )
+        bounds = bounds or (SLICED_BOUNDS if self.sliced else BOUNDS)
+        self.kernels = load_kernels(self.device, self.real, self.capacity, against, bounds=bounds, sliced=self.sliced)
         self._chains = to_struct(
             self.kernels.Chains, Chains(self.capacity, chains, self.quasistatic).arrays(), self.device
         )
@@ -324,7 +316,7 @@ class SweepLauncher:
                 solid = self.scenes.solid(name)
                 if solid.surface is None:
                     raise UsageError(
-                        f"The object {solid.name!r} has no exact surface to sweep over; use the mujoco backend."
+                        f"The object {solid.name!r} has no exact surface to sweep over; use the backend 'mujoco'."
                     )
                 new.append((name, solid.diagonal, solid.surface))
 
