@@ -6,7 +6,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -86,7 +86,7 @@ def simulate_sweeps(
         device: ``cpu`` or ``cuda``.
         workers: threads on the CPU; all usable processors when None.
         retry: divides the time step for whiskers that cannot be trusted, which are then simulated again, and twice as
-            much for those that cannot be trusted even then; 1 leaves them. Only backends with a fast path do this.
+            much for those that cannot be trusted even then; 1 leaves them. Only ``rod`` does this.
 
     Raises:
         UsageError: the backend is unknown or does not run on the device.
@@ -96,6 +96,8 @@ def simulate_sweeps(
         module, symbol = FAST_PATHS[backend]
         run = getattr(import_module(module), symbol)
         return run(scenes, indices, fidelity=fidelity, device=device, workers=workers, retry=retry)
+    if hasattr(engine, "retry"):
+        engine = replace(engine, retry=retry)  # type: ignore[type-var]
     parts = [
         _one_by_one(scenes, indices[first : first + _TOGETHER], fidelity, _Threads(engine, workers))
         for first in range(0, len(indices), _TOGETHER)

@@ -197,6 +197,22 @@ def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_change
     np.testing.assert_array_equal(finer.wrench[~kept], again.wrench[~kept])
 
 
+def test_whiskers_of_a_scene_that_cannot_be_trusted_are_simulated_again_and_no_other_changes():
+    from brainbench.stimuli import simulate
+
+    objects = resolve_objects(["chair-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
+    some, fidelity = [scenes[0], scenes[140]], Fidelity(links=10, time_step=5e-4)
+    once = simulate(some, fidelity=fidelity, backend=RodBackend(retry=1), cache=False)
+    again = simulate(some, fidelity=fidelity, backend="rod", cache=False)
+    bad = once["status"].values != "ok"
+    assert 0 < bad.sum() < 10
+    assert (again["status"].values == "ok").all()
+    kept = np.broadcast_to(~bad[:, None, :, None], once["wrench"].shape)
+    np.testing.assert_array_equal(once["wrench"].values[kept], again["wrench"].values[kept])
+    assert np.isfinite(again["wrench"].values).all()
+
+
 def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine():
     from brainbench.stimuli.backends.rod.fast import SweepLauncher
 

@@ -17,7 +17,7 @@ from brainbench.stimuli.backends._reach import Reach, reachable
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._kernels import load_kernels
-from brainbench.stimuli.backends.rod._limits import CROWDED, DOUBTFUL, FINEST, LIGHT, LOST, OK, WIDEST
+from brainbench.stimuli.backends.rod._limits import BENT, CROWDED, DOUBTFUL, FINEST, LIGHT, LOST, OK, WIDEST
 from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
 from brainbench.stimuli.backends.rod._slices import make_grips
 from brainbench.stimuli.chain import build_chain
@@ -47,6 +47,9 @@ class RodBackend:
 
     device: str = "auto"
     """``cpu`` or ``cuda``; ``auto``: ``cpu``, or ``cuda`` where Warp cannot compile for processors."""
+    retry: int = 5
+    """Whiskers that bent too far, or whose contact forces were not found, are simulated again with steps divided by
+    this, and those left with steps divided by twice this; 1 leaves them ``unstable``."""
 
     name = "rod"
     surfaces = True
@@ -107,13 +110,13 @@ class RodBackend:
         threads = 1 if device.is_cuda else workers or _processors()
         with ThreadPoolExecutor(max_workers=threads) as pool:
             futures = [
-                pool.submit(_simulate, [jobs[i] for i in some], some, fidelity, device, capacity, record_shape)
+                pool.submit(_trusted, {i: jobs[i] for i in some}, self.retry, fidelity, device, capacity, record_shape)
                 for capacity, some in slices
             ]
             done = 0
             try:
                 for future in as_completed(futures):
-                    for index, trace in future.result():
+                    for index, trace in future.result().items():
                         traces[index] = trace
                         done += 1
                         if progress is not None:
@@ -148,6 +151,8 @@ class _Batch:
     capacity: int
     start: float
     stop: float
+    finer: int = 1
+    """Divides the time steps."""
     tracks: Tracks = field(default_factory=Tracks)
     chains: list[Chain] = field(default_factory=list)
     lanes: list[tuple[int, int, int, float]] = field(default_factory=list)
@@ -175,7 +180,7 @@ class _Batch:
         knots, spacing = follicle_knots(job.follicle, self.start, self.stop)
         base = self.tracks.add(knots, self.start * MILLI, spacing)
         step = self.fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi)) * MILLI
-        self.lanes.append((which, self._scenes[seen], base, step))
+        self.lanes.append((which, self._scenes[seen], base, step / self.finer))
         for load in job.loads:
             link = min(max(int(np.searchsorted(chain.nodes, load.arc)) - 1, 0), chain.links - 1)
             share = (load.arc - chain.nodes[link]) / (chain.nodes[link + 1] - chain.nodes[link])
@@ -184,25 +189,41 @@ class _Batch:
         return chain
 
 
+def _trusted(
+    jobs: dict[int, Job], retry: int, fidelity: Fidelity, device: Any, capacity: int, record_shape: bool
+) -> dict[int, Trace]:
+    """Run jobs that share their readings; those that finer steps may mend once more, and once more."""
+    found = _simulate(jobs, fidelity, device, capacity, record_shape)
+    for finer in (retry, 2 * retry) if retry > 1 else ():
+        left = {index: jobs[index] for index, (_, mendable) in found.items() if mendable}
+        if not left:
+            break
+        for index, (trace, mendable) in _simulate(left, fidelity, device, capacity, record_shape, finer).items():
+            before = found[index][0]
+            cost = {"steps": before.steps + trace.steps, "seconds": before.seconds + trace.seconds}
+            found[index] = replace(trace, **cost), mendable
+    return {index: trace for index, (trace, _) in found.items()}
+
+
 def _simulate(
-    jobs: Sequence[Job], indices: Sequence[int], fidelity: Fidelity, device: Any, capacity: int, record_shape: bool
-) -> list[tuple[int, Trace]]:
-    """Run jobs that share their readings in one launch."""
+    jobs: dict[int, Job], fidelity: Fidelity, device: Any, capacity: int, record_shape: bool, finer: int = 1
+) -> dict[int, tuple[Trace, bool]]:
+    """Run jobs that share their readings in one launch; return their traces, and whether finer steps may mend them."""
     started = time.thread_time()
     wp = warp()
-    first = jobs[0]
-    batch = _Batch(device, fidelity, capacity, first.start, float(first.times[-1]))
-    found: list[tuple[int, Trace]] = []
+    first = next(iter(jobs.values()))
+    batch = _Batch(device, fidelity, capacity, first.start, float(first.times[-1]), finer)
+    found: dict[int, tuple[Trace, bool]] = {}
     lanes: list[tuple[int, Job, Chain, tuple[float, str]]] = []
     seen = np.linspace(first.start, first.times[-1], max(2, math.ceil((first.times[-1] - first.start) / KNOT)))
-    for index, job in zip(indices, jobs, strict=True):
+    for index, job in jobs.items():
         position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
         reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
         moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
         if reach or moves or job.loads or np.any(job.gravity):
             lanes.append((index, job, batch.add(job, reach), _too_fast(job, reach, position, euler, seen, fidelity)))
         else:
-            found.append((index, _silent(job, fidelity, record_shape, started)))
+            found[index] = _silent(job, fidelity, record_shape, started), False
     if not lanes:
         return found
     real = _real(fidelity)
@@ -238,12 +259,12 @@ def _simulate(
     points, pressed = (out.points.numpy(), out.pressed.numpy()) if record_shape else (None, None)
     for lane, (index, job, chain, missed) in enumerate(lanes):
         shape = None if points is None else points[:, : chain.links + 1, lane].astype(float) / MILLI
-        trace = _trace(results, lane, job, shape, missed, spent / count)
+        trace, mendable = _trace(results, lane, job, shape, missed, spent / count)
         if pressed is not None:
             sound = np.isfinite(trace.wrench).all(axis=1, keepdims=True)
             felt = pressed[:, :, lane].reshape(frames, 6).astype(float)
             trace = replace(trace, contact_wrench=np.where(sound, felt, np.nan))
-        found.append((index, trace))
+        found[index] = trace, mendable
     return found
 
 
@@ -341,7 +362,8 @@ def _trace(
     shape: NDArray | None,
     missed: tuple[float, str],
     seconds: float,
-) -> Trace:
+) -> tuple[Trace, bool]:
+    """Return the trace of a lane, and whether what is wrong with it is a matter of too long a step."""
     steps, crowded = (int(results[name][lane]) for name in ("steps", "crowded"))
     wrench = results["wrench"][lane, :, 0].astype(float)
     arc = results["contact"][lane, :, 0].astype(float)
@@ -354,17 +376,19 @@ def _trace(
             float(job.times[first]),
             f"at {job.times[first]:.6g} s " + too_strong(strength[first], job.whisker),
         )
+    mendable = bool(reason) and int(results["status"][lane]) == BENT
     if missed[0] < end:
-        end, reason = missed
+        end, reason, mendable = *missed, False
     doubt = float(np.sqrt(results["miss"][lane] / max(float(results["load"][lane]), 1e-30)))
     if not reason and not doubt <= DOUBTFUL:
         end = -np.inf
-        reason = f"contact forces missed by {doubt:.0%} (root mean square); choose a smaller time step"
+        reason, mendable = f"contact forces missed by {doubt:.0%} (root mean square); choose a smaller time step", True
     if not reason and crowded > CROWDED * steps:
-        end, reason = -np.inf, f"more contacts than can be solved together in {crowded} of {steps} steps"
+        end, mendable = -np.inf, True
+        reason = f"more contacts than can be solved together in {crowded} of {steps} steps"
     good = job.times < end - 1e-9
     touching = (arc >= 0) & good
-    return Trace(
+    trace = Trace(
         wrench=np.where(good[:, None], wrench, np.nan),
         contact=touching,
         contact_arc=np.where(touching, arc, np.nan),
@@ -375,6 +399,7 @@ def _trace(
         seconds=seconds,
         link_positions=None if shape is None else np.where(good[:, None, None], shape, np.nan),
     )
+    return trace, mendable
 
 
 def _end(status: int, failed: float) -> tuple[float, str]:
