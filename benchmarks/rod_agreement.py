@@ -1,9 +1,9 @@
 """How far ``rod`` and ``mujoco`` agree on whole scenes: random sweeps over ten shapes, whisker by whisker.
 
-PYTHONPATH=. python benchmarks/rod_agreement.py [--sweeps 50] [--whiskers 6] [--write]
+PYTHONPATH=. python benchmarks/rod_agreement.py [--sweeps 50] [--whiskers 6] [--bullet] [--write]
 
-Both engines touch the same convex hulls, at preset ``accurate``. Of every whisker that either engine bends, readings at
-1 kHz give three numbers, of that whisker's own peak (force and moment apart): how much the peaks differ; the median
+All touch the same convex hulls, at preset ``accurate``. Of every whisker that one of two engines bends, readings
+at 1 kHz give three numbers, of that whisker's own peak (force and moment apart): how much the peaks differ; the median
 difference of a reading in contact; and the root mean square over the whole sweep, in which a slip that comes a few
 milliseconds sooner counts as full error. Each engine is held against itself at steps of 10 µs as well, which tells
 whose error a difference is.
@@ -82,6 +82,7 @@ def main() -> None:
     parser.add_argument("--sweeps", type=int, default=50)
     parser.add_argument("--whiskers", type=int, default=6)
     parser.add_argument("--shapes", default=SHAPES)
+    parser.add_argument("--bullet", action="store_true", help="a third engine, which takes some 17 minutes")
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     objects = resolve_objects(args.shapes.split(","), collision="hull")
@@ -102,6 +103,10 @@ def main() -> None:
         fine = wrenches(scenes[: len(scenes) // 5], FINER, "mujoco")
         row(f"mujoco at 10 µs and at `accurate`, a fifth of them, friction {friction:g}", fine, mujoco[few])
         row(f"rod and mujoco at 10 µs, a fifth of them, friction {friction:g}", fine_rod[few], fine)
+        if args.bullet:
+            bullet = wrenches(scenes[: len(scenes) // 5], ACCURATE, "bullet")
+            row(f"**rod and bullet**, a fifth of them, friction {friction:g}", rod[few], bullet)
+            row(f"mujoco and bullet, a fifth of them, friction {friction:g}", mujoco[few], bullet)
         slow = draw(objects, args.sweeps, args.whiskers, SLOW, friction)
         balance = wrenches(slow, still, "rod")
         moving = wrenches(slow, ACCURATE, "rod")

@@ -34,11 +34,14 @@ def _start(folder: Path, workers: int) -> subprocess.Popen:
     )
 
 
-def _kill_after(process: subprocess.Popen, seconds: float) -> bool:
-    """Kill a process so long after it is ready; return whether it still ran."""
+def _kill_after(process: subprocess.Popen, seconds: float, shard_in: Path | None = None) -> bool:
+    """Kill a process so long after it is ready, or after its next shard; return whether it still ran."""
     with process:
         assert process.stdout is not None
+        before = len(list(shard_in.glob("*.h5"))) if shard_in else 0
         process.stdout.readline()
+        while shard_in and process.poll() is None and len(list(shard_in.glob("*.h5"))) == before:
+            time.sleep(0.005)
         time.sleep(seconds)
         running = process.poll() is None
         process.send_signal(signal.SIGKILL)
@@ -68,7 +71,8 @@ def test_a_run_killed_at_many_instants_ends_with_the_same_bytes(unbroken, tmp_pa
     cut = 0
     for _ in range(12):
         # Often within a moment of starting and of a shard's end; between two kills at least a little is done.
-        if not _kill_after(_start(folder, workers), draw.uniform(*(0.0, 0.6) if workers == 1 else (1.5, 4.5))):
+        wait, after = (draw.uniform(0.0, 0.6), None) if workers == 1 else (draw.uniform(0.0, 0.2), folder)
+        if not _kill_after(_start(folder, workers), wait, after):
             break
         cut += 1
     assert cut >= 3
