@@ -53,9 +53,9 @@ class Explanation:
     silent: int
     """Runs without any motion, load or object within reach: their wrench is exactly zero, without simulation."""
     steps: int
-    """Time steps of all whiskers that were computed."""
+    """Time steps of all whiskers that were computed, the shorter ones of contacts that need them (``rod``) included."""
     steps_in_full: int
-    """Time steps that all runs together would take."""
+    """Time steps of the asked for length that all runs together would take."""
     pairs: int
     """Contact pairs of the simulated runs that lie within reach; no others were built."""
     pairs_in_full: int
@@ -115,12 +115,17 @@ class Explanation:
             ("shared", f"{self.shared} runs equal to another stimulus's"),
             ("silent", f"{self.silent} runs that can feel nothing: exactly zero without simulation"),
             ("contact pairs", f"{self.pairs:,} of {self.pairs_in_full:,} (links × {self.bodies}) can ever meet"),
-            ("saved", f"{_share(self.steps, self.steps_in_full)} of the steps, {_share(self.pairs, self.pairs_in_full)}"
-             " of the contact pairs"),
+            ("saved", f"{self._saved_steps()}, {_share(self.pairs, self.pairs_in_full)} of the contact pairs"),
             ("time", elapsed or "not known: made by another process"),
             ("made", "now" if self.source is None else f"earlier, read from {self.source}"),
         ]  # fmt: skip
         return rows
+
+    def _saved_steps(self) -> str:
+        if self.steps <= self.steps_in_full:
+            return f"{_share(self.steps, self.steps_in_full)} of the steps"
+        more = self.steps / max(1, self.steps_in_full) - 1
+        return f"none of the steps ({100 * more:.0f} % more: some contacts needed shorter ones)"
 
     def __str__(self) -> str:
         width = max(len(name) for name, _ in self.lines())

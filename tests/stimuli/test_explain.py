@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -185,6 +186,12 @@ def test_the_text_says_what_was_saved():
     assert "2 stimuli × 3 whiskers = 6 runs of 6 links" in text
     assert "saved          17 % of the steps" in text
     assert "near: D6" in text
+
+
+def test_steps_that_had_to_be_shorter_are_no_saving():
+    told = Explanation.of(simulate(_scene("near", NEAR), fidelity=FAST, backend=FakeBackend()))
+    more = dataclasses.replace(told, steps=told.steps_in_full * 106 // 100)
+    assert "saved          none of the steps (6 % more: some contacts needed shorter ones)" in str(more)
 
 
 def test_a_set_without_or_with_a_damaged_explanation_is_refused_in_words():
