@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results import table, write_section
+from benchmarks.rod_agreement import HOW, differences
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.backends import get_backend
 from brainbench.stimuli.backends._mujoco_model import build_model, engine
@@ -208,13 +209,10 @@ def solve(penalty: Penalty, duration: float, tolerance: float = 1e-5) -> tuple[n
 
 def misses(found: np.ndarray, truth: np.ndarray) -> list[float]:
     """Per cent of the peak, of force and moment: difference of the peaks, median reading, root mean square."""
-    values = []
-    for part in (slice(0, 3), slice(3, 6)):
-        size = np.linalg.norm(truth[:, part], axis=1)
-        miss = np.linalg.norm((found - truth)[:, part], axis=1) / size.max()
-        peak = abs(np.linalg.norm(found[:, part], axis=1).max() / size.max() - 1)
-        values += [peak, float(np.median(miss[size > 0.05 * size.max()])), float(np.sqrt((miss**2).mean()))]
-    return [100 * value for value in values]
+    parts = slice(0, 3), slice(3, 6)
+    return [
+        100 * float(value[0]) for part in parts for value in differences(found[None, :, part], truth[None, :, part])
+    ]
 
 
 def main() -> None:
@@ -252,8 +250,7 @@ def main() -> None:
             cells = [f"{a:.2g} ({b:.2g})" for a, b in zip(middle, worst, strict=True)]
             rows.append([key, f"{friction:g}", *cells])
             print(rows[-1], flush=True)
-    how = ("peak", "reading", "rms")
-    head = ["", "friction", *(f"{what} {one}" for what in ("force", "moment") for one in how)]
+    head = ["", "friction", *(f"{what} {one}" for what in ("force", "moment") for one in HOW)]
     text = (
         f"Mouse whiskers {args.whiskers} of {args.links} links; a tilted peg (radius .5 mm) or a ball (3 mm) passes at "
         f"{1e3 * SPEED:g} mm/s, until the whisker slips off. Per cent of the whisker's own peak, median of the "

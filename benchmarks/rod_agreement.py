@@ -58,22 +58,33 @@ def wrenches(scenes: Sequence[Scene], fidelity: Fidelity, backend: str, *, cache
     return np.concatenate([np.moveaxis(wrench, 1, 0) for wrench in found]).astype(float)
 
 
+def differences(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each whisker's own peak [whisker]: of the peaks, of the median reading in contact, root mean square.
+
+    Args:
+        found, truth: forces or moments [whisker, reading, 3].
+    """
+    size, other = (np.linalg.norm(values, axis=-1) for values in (truth, found))
+    peak = np.maximum(size.max(axis=1), 1e-30)
+    miss = np.linalg.norm(found - truth, axis=-1) / peak[:, None]
+    touching = size > 0.05 * peak[:, None]
+    touching |= ~touching.any(axis=1, keepdims=True)
+    readings = np.array([np.median(row[row_on]) for row, row_on in zip(miss, touching, strict=True)])
+    return np.abs(other.max(axis=1) / peak - 1), readings, np.sqrt((miss**2).mean(axis=1))
+
+
 def compare(found: np.ndarray, truth: np.ndarray) -> list[str]:
     """A row of the table: whiskers, left out, and of force and moment peaks, readings in contact, root mean square."""
     bad = ~(np.isfinite(found).all(axis=(1, 2)) & np.isfinite(truth).all(axis=(1, 2)))
     cells: list[str] = []
     felt = np.zeros(len(found), dtype=bool)
     for part, least in zip((slice(0, 3), slice(3, 6)), FELT, strict=True):
-        size, other = (np.linalg.norm(values[..., part], axis=-1) for values in (truth, found))
-        peak = np.maximum(size.max(axis=1), 1e-30)
-        on = (peak > least) & ~bad
+        on = (np.linalg.norm(truth[..., part], axis=-1).max(axis=1) > least) & ~bad
         felt |= on
-        miss = np.linalg.norm((found - truth)[..., part], axis=-1) / peak[:, None]
-        touching = size > 0.05 * peak[:, None]
-        readings = np.array([np.median(row[row_on]) for row, row_on in zip(miss, touching | ~on[:, None], strict=True)])
-        for values in (np.abs(other.max(axis=1) / peak - 1), readings, np.sqrt((miss**2).mean(axis=1))):
-            some = values[on]
-            cells.append(f"{100 * np.median(some):.2g} ({np.mean(some <= GOAL):.0%})" if on.any() else "")
+        cells += [
+            f"{100 * np.median(some):.2g} ({np.mean(some <= GOAL):.0%})" if on.any() else ""
+            for some in differences(found[on][..., part], truth[on][..., part])
+        ]
     return [f"{felt.sum()}", f"{bad.sum()}", *cells]
 
 

@@ -65,3 +65,8 @@ NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 
 OK, BENT, LOST = 0, 1, 2
 """How a whisker ended: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
+
+
+def finer_steps(retry: int) -> tuple[int, ...]:
+    """Return by what the steps of whiskers that cannot be trusted are divided, one time after the other."""
+    return (retry, 2 * retry) if retry > 1 else ()

@@ -17,7 +17,17 @@ from brainbench.stimuli.backends._reach import Reach, reachable
 from brainbench.stimuli.backends.protocol import Trace, base_rotation
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._kernels import load_kernels
-from brainbench.stimuli.backends.rod._limits import BENT, CROWDED, DOUBTFUL, FINEST, LIGHT, LOST, OK, WIDEST
+from brainbench.stimuli.backends.rod._limits import (
+    BENT,
+    CROWDED,
+    DOUBTFUL,
+    FINEST,
+    LIGHT,
+    LOST,
+    OK,
+    WIDEST,
+    finer_steps,
+)
 from brainbench.stimuli.backends.rod._pack import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
 from brainbench.stimuli.backends.rod._slices import make_grips
 from brainbench.stimuli.chain import build_chain
@@ -194,7 +204,7 @@ def _trusted(
 ) -> dict[int, Trace]:
     """Run jobs that share their readings; those that finer steps may mend once more, and once more."""
     found = _simulate(jobs, fidelity, device, capacity, record_shape)
-    for finer in (retry, 2 * retry) if retry > 1 else ():
+    for finer in finer_steps(retry):
         left = {index: jobs[index] for index, (_, mendable) in found.items() if mendable}
         if not left:
             break

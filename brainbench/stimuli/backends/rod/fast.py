@@ -20,7 +20,7 @@ from brainbench.errors import UsageError
 from brainbench.stimuli.backends._engines import MILLI
 from brainbench.stimuli.backends.rod._device import pick_device, to_struct, warp
 from brainbench.stimuli.backends.rod._kernels import load_kernels
-from brainbench.stimuli.backends.rod._limits import BENT, CROWDED, DOUBTFUL, MESHES, OK
+from brainbench.stimuli.backends.rod._limits import BENT, CROWDED, DOUBTFUL, MESHES, OK, finer_steps
 from brainbench.stimuli.backends.rod._pack import (
     Chains,
     Shapes,
@@ -274,7 +274,7 @@ class SweepLauncher:
         batch = self.batch(self.launch(objects))
         flat = [(name, sweep) for name, sweeps in objects for sweep in sweeps]
         retried = 0
-        for finer in (retry, 2 * retry) if retry > 1 else ():
+        for finer in finer_steps(retry):
             rows = np.flatnonzero(batch.unstable.any(axis=1))
             if len(rows):
                 retried = max(retried, len(rows))
