@@ -26,8 +26,8 @@ from brainbench.stimuli import (
     get_backend,
     get_recipe,
 )
-from brainbench.stimuli.backends.protocol import Trace
-from brainbench.stimuli.objects import box, cylinder, sphere
+from brainbench.stimuli.engines.protocol import Trace
+from brainbench.stimuli.objects.placed_object import box, cylinder, sphere
 
 DURATION = 0.2
 FRAMES = Frames(0.001, 0.001, round(DURATION * 1e3) - 1)

@@ -26,12 +26,12 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.stimuli import references, validation
-from brainbench.stimuli.backends._bullet_model import FOLLICLE, BulletWorld
-from brainbench.stimuli.chain import build_chain
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.obstacle import Capsule, Obstacle
-from brainbench.stimuli.whisker import Whisker
+from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
+from brainbench.stimuli.validation import bench_tests, references
+from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=1.0)
 AT, OFFSET, RADIUS, LINKS = 0.5 * C2.arc_length, 0.1 * C2.arc_length, 2.5e-4, 10
@@ -86,7 +86,7 @@ class Native:
             return math.nan
         expected = float(references.natural_frequencies(C2, 1)[0])
         times = self.h / 1e3 * np.arange(1, len(moments) + 1)
-        return validation._fit_decay(times, moments, expected, 0.15)[0] / expected - 1
+        return bench_tests._fit_decay(times, moments, expected, 0.15)[0] / expected - 1
 
     def _run(
         self, obstacles: list[Obstacle], q: np.ndarray, end: float, place: Callable[[float], np.ndarray] | None
@@ -173,8 +173,8 @@ def main() -> None:
         show(method, step, static, Native(method, step, 0.15).ring(), seconds / END)
     for step in (1e-4, 1e-5):
         fidelity = Fidelity(LINKS, time_step=step)
-        static = validation.peg(C2, AT, OFFSET, backend="bullet", fidelity=fidelity)
-        ringing = validation.ringdown(replace(C2, damping_ratio=0.15), backend="bullet", fidelity=fidelity)
+        static = bench_tests.peg(C2, AT, OFFSET, backend="bullet", fidelity=fidelity)
+        ringing = bench_tests.ringdown(replace(C2, damping_ratio=0.15), backend="bullet", fidelity=fidelity)
         cost = static.trace.seconds / (static.trace.steps * step)
         show("implicit", step, static.wrench[5] / static.reference[5] - 1, ringing.frequency_error, cost)
 

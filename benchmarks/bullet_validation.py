@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from brainbench.stimuli import Fidelity, Whisker, WhiskerArray, validation
-from brainbench.stimuli.fidelity import list_presets
+from brainbench.stimuli import Fidelity, Whisker, WhiskerArray
+from brainbench.stimuli.engines.fidelity import list_presets
+from brainbench.stimuli.validation import bench_tests
 
 PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2))
 
@@ -23,11 +24,11 @@ def subjects() -> dict[str, Whisker]:
 
 def row(name: str, whisker: Whisker, preset: str) -> str:
     length = whisker.arc_length
-    pegs = [validation.peg(whisker, a * length, d * length, backend="bullet", fidelity=preset) for a, d in PEGS]
+    pegs = [bench_tests.peg(whisker, a * length, d * length, backend="bullet", fidelity=preset) for a, d in PEGS]
     at = 0.7 * length
-    weak = 1e-3 * at / validation.references.point_load_deflection(whisker, 1.0, at)
-    load = validation.point_load(whisker, weak, at, backend="bullet", fidelity=preset)
-    ringing = validation.ringdown(whisker, backend="bullet", fidelity=preset)
+    weak = 1e-3 * at / bench_tests.references.point_load_deflection(whisker, 1.0, at)
+    load = bench_tests.point_load(whisker, weak, at, backend="bullet", fidelity=preset)
+    ringing = bench_tests.ringdown(whisker, backend="bullet", fidelity=preset)
     seconds = sum(peg.trace.seconds for peg in pegs) / sum(peg.trace.steps for peg in pegs)
     return (
         f"| {name} | {preset}, {Fidelity.preset(preset).link_count(length)} links | "

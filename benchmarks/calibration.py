@@ -20,15 +20,15 @@ from scipy import stats
 
 from benchmarks.results import table, write_section
 from brainbench.metrics import TrialBlock, compare, equivalence_test, rdm, score_animals, subject_rdm
-from brainbench.metrics._pairs import permuted_pairs
-from brainbench.metrics.bootstrap import _factors, _scores, animal_counts, ceilings
-from brainbench.metrics.compare import compare_all, features
-from brainbench.metrics.inference import label_orders
-from brainbench.metrics.intervals import bca_interval, percentile_interval, t_interval
+from brainbench.metrics.inference.bootstrap import _factors, _scores, animal_counts, ceilings
+from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
+from brainbench.metrics.inference.multiple import sign_flip_p, step_down
+from brainbench.metrics.inference.permutation import label_orders
+from brainbench.metrics.inference.power import Design, _experiments
 from brainbench.metrics.layers import held_out
-from brainbench.metrics.multiple import sign_flip_p, step_down
-from brainbench.metrics.power import Design, _experiments
-from brainbench.metrics.subject import SubjectRDM
+from brainbench.metrics.rdms.comparison import compare_all, features
+from brainbench.metrics.rdms.pairs import permuted_pairs
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 PAIRS = permuted_pairs(np.concatenate(list(label_orders(6, 1000, 0))))
@@ -405,8 +405,8 @@ def equivalence(simulations: int) -> Result:
 
 
 def faults(simulations: int) -> Result:
-    from brainbench.datasets.synthetic import Design as Recordings
-    from brainbench.datasets.synthetic import Geometry, simulate
+    from brainbench.datasets.synthetic.animals import Design as Recordings
+    from brainbench.datasets.synthetic.animals import Geometry, simulate
 
     rows = []
     for imbalance in (0.0, 0.5):

@@ -20,14 +20,14 @@ import numpy as np
 from benchmarks.results import table, write_section
 from benchmarks.rod_agreement import HOW, differences
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.backends import get_backend
-from brainbench.stimuli.backends._mujoco_model import build_model, engine
-from brainbench.stimuli.backends._reach import Reach
-from brainbench.stimuli.backends.protocol import Job, StillFollicle
-from brainbench.stimuli.chain import build_chain
-from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.obstacle import Cylinder, Obstacle, Sphere
-from brainbench.stimuli.whisker import Whisker
+from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines.mujoco.model import build_model, engine
+from brainbench.stimuli.engines.protocol import Job, StillFollicle
+from brainbench.stimuli.engines.reach import Reach
+from brainbench.stimuli.objects.obstacle import Cylinder, Obstacle, Sphere
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 SPEED = 0.03
 """Of the object (m/s), a brisk sweep of the recipes."""

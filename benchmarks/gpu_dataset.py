@@ -14,12 +14,12 @@ import time
 from pathlib import Path
 
 from brainbench.datasets import WhiskingDataset
-from brainbench.datasets.separability import separability
+from brainbench.datasets.whisking.separability import separability
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.collections import resolve_objects
-from brainbench.stimuli.generation.plan import GenerationPlan, Settings
-from brainbench.stimuli.generation.run import generate
-from brainbench.stimuli.sweeps import GRIDS
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.sweeps.generation import generate
+from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from brainbench import load_model
 from brainbench.cli.stimuli.hand import objects_of
 from brainbench.metrics import compare, rdm
 from brainbench.stimuli import load_stimuli
-from brainbench.stimuli.storage import hash_stimulus_set
+from brainbench.stimuli.stimulus_set import hash_stimulus_set
 from robotics_bridge.exploration.procedures import PROCEDURES
 from robotics_bridge.exploration.record import record_exploration
 

@@ -127,7 +127,7 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
 
 def draw(records: list[dict[str, Any]], step: float) -> None:
     """Draw the warmest cell of the fingers over time, per law."""
-    from brainbench.cli.tactile._figures import _pyplot, _save
+    from brainbench.cli.tactile.figures import _pyplot, _save
 
     pyplot = _pyplot()
     figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout="constrained")

@@ -15,10 +15,10 @@ import torch
 from policy_encoder import cast, copy_into
 from training_step import clock, sweeps, training_step
 
-from brainbench.models._gpu import plain
-from brainbench.models.extract import evaluating
+from brainbench.models.activations import evaluating
+from brainbench.models.ops.dispatch import plain
 from brainbench.models.registry import load_model
-from brainbench.models.training.captured import captured
+from brainbench.models.training.cuda_graphs import captured
 
 DEVICE = torch.device("cuda")
 
@@ -139,8 +139,8 @@ def stream(options: argparse.Namespace) -> None:
 
 
 def front(options: argparse.Namespace) -> None:
-    from robotics_bridge.policies.front_end import FrontEnd
-    from robotics_bridge.policies.taxel_grid import TaxelGrid
+    from robotics_bridge.policies.encoders.front_end import FrontEnd
+    from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
     grid = TaxelGrid("xhand1")
     module = FrontEnd("zhuang-intersection-ln-small", grid).to(DEVICE).eval()

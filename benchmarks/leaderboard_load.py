@@ -20,7 +20,7 @@ from pathlib import Path
 
 from results import write_section
 
-from brainbench.types import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
+from brainbench.core.records import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
 from leaderboards import build_leaderboard
 
 COMPARED = """\

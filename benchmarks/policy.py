@@ -29,9 +29,9 @@ import torch
 from benchmarks.results import table, write_section
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.policies import teacher
 from robotics_bridge.policies.evaluate import agent, evaluate
-from robotics_bridge.tasks.changes import changed
+from robotics_bridge.policies.training import teacher
+from robotics_bridge.tasks.overrides import changed
 
 SENSES = ("none", "force_torque", "encoder-small", "encoder")
 ENCODERS = {"encoder-small": "zhuang-intersection-ln-small", "encoder": "zhuang-intersection-ln"}
@@ -108,8 +108,8 @@ def front_end(sense: str, env: Env) -> Callable[[torch.Tensor], None] | None:
     """Return one streaming step of an encoder on the group ``tactile``."""
     if sense not in ENCODERS:
         return None
-    from robotics_bridge.policies.front_end import FrontEnd
-    from robotics_bridge.policies.taxel_grid import TaxelGrid
+    from robotics_bridge.policies.encoders.front_end import FrontEnd
+    from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
     assert env.tactile is not None
     module = FrontEnd(ENCODERS[sense], TaxelGrid(env.hand, placement="hand", resolution="med")).to(env.device).eval()
@@ -192,8 +192,8 @@ def student(options: argparse.Namespace, out: Path) -> None:
 
 
 def one_student(felt: str, env: Env, options: argparse.Namespace, *, precision: str, graphs: bool) -> dict[str, Any]:
-    from robotics_bridge.policies.distill import _Run
-    from robotics_bridge.policies.distill_config import DistillConfig
+    from robotics_bridge.policies.training.distill import _Run
+    from robotics_bridge.policies.training.distill_config import DistillConfig
 
     settings: dict[str, Any] = FELT[felt]
     config = DistillConfig(task=env.task.name, num_envs=env.num_envs, precision=precision, **settings)
@@ -339,7 +339,7 @@ def main() -> None:
     parser.add_argument("--resume", type=Path, help="folder teacher-<task> of an earlier machine")
     parser.add_argument("--start", type=Path, help="another run or model, whose networks a new teacher begins with")
     parser.add_argument("--start-std", type=float, help="standard deviation of its actions to begin with")
-    parser.add_argument("--change", nargs="*", default=[], help="name=value, see robotics_bridge.tasks.changes")
+    parser.add_argument("--change", nargs="*", default=[], help="name=value, see robotics_bridge.tasks.overrides")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     options.envs = options.envs or ([1024, 8192] if options.device != "cpu" else [16, 64])

@@ -17,10 +17,10 @@ from results import table, write_section
 from tensordict import TensorDict
 
 from robotics_bridge import hands
-from robotics_bridge.policies.deploy.realtime import realtime
-from robotics_bridge.policies.deploy.session import read_deployed
-from robotics_bridge.policies.deploy.sim_hand import Faults, simulated_hand
-from robotics_bridge.policies.deploy.udp import UdpDriver
+from robotics_bridge.deploy.realtime import realtime
+from robotics_bridge.deploy.session import read_deployed
+from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
+from robotics_bridge.deploy.udp import UdpDriver
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.student import TactilePolicy
 

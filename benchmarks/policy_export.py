@@ -16,7 +16,7 @@ import torch
 from results import table, write_section
 from tensordict import TensorDict
 
-from robotics_bridge.policies.encoders import ARMS, EncoderConfig
+from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.export import STEPS, SUFFIXES, TOLERANCE, export_policy, read_policy
 from robotics_bridge.policies.student import TactilePolicy
 

@@ -30,8 +30,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robotics_bridge.policies.distill_config import DistillConfig
     from robotics_bridge.policies.report import StudentResult
+    from robotics_bridge.policies.training.distill_config import DistillConfig
 
 NETWORK = "zhuang-intersection-ln-small"
 ARMS: dict[str, dict[str, Any]] = {
@@ -68,8 +68,8 @@ def put(out: Path, row: dict[str, Any]) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Train and evaluate one student in this process."""
-    from robotics_bridge.policies.distill_config import DistillConfig
-    from robotics_bridge.policies.students import train_student
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+    from robotics_bridge.policies.training.students import train_student
 
     settings = dict(ARMS[options.arm])
     if "encoder" in settings:
@@ -109,11 +109,11 @@ def train(options: argparse.Namespace) -> None:
 
 def others(options: argparse.Namespace) -> None:
     """Evaluate the teacher, zero and random over the students' evaluation seeds."""
-    from brainbench.files import write_json
+    from brainbench.core.files import write_json
     from robotics_bridge import tasks
     from robotics_bridge.policies.evaluate import agent, evaluate
-    from robotics_bridge.policies.students import SEEDS
-    from robotics_bridge.policies.teacher import load_teacher
+    from robotics_bridge.policies.training.students import SEEDS
+    from robotics_bridge.policies.training.teacher import load_teacher
 
     env = tasks.make(options.task, config=options.config, num_envs=options.envs, device=options.device, seed=1)
     found = []
@@ -226,8 +226,8 @@ def arm_of(config: DistillConfig) -> str | None:
 
 def found_logs(folders: list[Path], named: dict[str, StudentResult]) -> dict[tuple[str, int], list[dict[str, Any]]]:
     """Return the log of every student that counts, by arm and training seed."""
-    from brainbench.files import read_json
-    from robotics_bridge.policies.distill_config import DistillConfig
+    from brainbench.core.files import read_json
+    from robotics_bridge.policies.training.distill_config import DistillConfig
 
     logs = {}
     for path in (path for folder in folders for path in sorted(folder.rglob("log.jsonl"))):
@@ -267,7 +267,7 @@ def every_student(named: dict[str, StudentResult], logs: dict[tuple[str, int], l
 def differences(named: dict[str, StudentResult]) -> str:
     """Return the table of :data:`CONTRASTS`, and of what spread they were held against."""
     from benchmarks.results import table
-    from brainbench.metrics.multiple import adjust
+    from brainbench.metrics.inference.multiple import adjust
     from robotics_bridge.policies.contrasts import contrast, pooled_spread
 
     spread, freedom = pooled_spread([result.success for result in named.values()])

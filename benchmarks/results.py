@@ -6,7 +6,7 @@ import os
 import platform
 from pathlib import Path
 
-from brainbench.files import write_text
+from brainbench.core.files import write_text
 
 RESULTS = Path(__file__).parent / "RESULTS.md"
 HEAD = "# Benchmark results\n\nEach section is written by the command it names.\n"

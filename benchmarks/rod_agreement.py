@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.results import table, write_section
 from brainbench.stimuli import Fidelity, Frames, Scene, simulate
-from brainbench.stimuli.collections import resolve_objects
-from brainbench.stimuli.sweeps import GRIDS, SweepScenes
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
 SHAPES = "ellipsoid-1,brick-2,torus-3,cone-1,bumpy-1,cylinder-1,superquadric-1,pyramid-1,vase-1,wedge-1"
 ACCURATE = Fidelity.preset("accurate")

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.results import table, write_section
 from benchmarks.rod_agreement import FELT, FINER, SHAPES, draw, wrenches
 from brainbench.stimuli import Fidelity, simulate
-from brainbench.stimuli.collections import resolve_objects
+from brainbench.stimuli.objects.collections import resolve_objects
 
 SETTINGS = {
     "rod": (

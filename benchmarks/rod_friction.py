@@ -20,9 +20,9 @@ import numpy as np
 
 from benchmarks.results import table, write_section
 from benchmarks.rod_agreement import ACCURATE, FINER, HOW, SHAPES, compare, draw, wrenches
-from brainbench.stimuli.backends import mujoco as backend
-from brainbench.stimuli.backends._mujoco_model import FRICTION_STIFFNESS, engine
-from brainbench.stimuli.collections import resolve_objects
+from brainbench.stimuli.engines.mujoco import engine as backend
+from brainbench.stimuli.engines.mujoco.model import FRICTION_STIFFNESS, engine
+from brainbench.stimuli.objects.collections import resolve_objects
 
 FRICTIONS = "elliptic:0.02:0", "elliptic:1:0", "elliptic:100:0", "elliptic:0.02:10"
 SETTINGS = ",".join(f"{step}:{words}" for words in FRICTIONS for step in ("accurate", "10"))

@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.results import table, write_section
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.backends.rod.fast import SweepLauncher
-from brainbench.stimuli.collections import resolve_objects
-from brainbench.stimuli.sweeps import GRIDS, SweepScenes
+from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
 STEPS = (5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
 FELT = 2e-7

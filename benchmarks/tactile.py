@@ -45,7 +45,7 @@ from benchmarks.tactile_scene import (
     write_input,
 )
 from benchmarks.tactile_tables import plot_scaling, tables
-from robotics_bridge._device import pick_device, warp
+from brainbench.core.devices import pick_device, warp
 from robotics_bridge.physics import HandState, Scene
 from robotics_bridge.sensors import ContactDepthProbe, ElastomerTaxel, KinematicTaxel, Probes, SensorSuite
 

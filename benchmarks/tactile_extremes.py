@@ -17,7 +17,7 @@ from scipy.integrate import dblquad
 
 from benchmarks.results import table, write_section
 from benchmarks.tactile_scene import bumpy_box
-from brainbench.cli.tactile._checks import CHECKS
+from brainbench.cli.tactile.checks import CHECKS
 from robotics_bridge.physics import Geometry, HandState, Scene
 from robotics_bridge.sensors import (
     ContactDepthProbe,

@@ -35,7 +35,7 @@ from robotics_bridge.sensors import (
     SurfaceDistanceProbe,
     TemperatureGrid,
 )
-from robotics_bridge.sensors.audio_materials import Modes
+from robotics_bridge.sensors.audio.materials import Modes
 
 FULL = Noise.preset("published-force")
 CLASSES = ("kinematic", "depth", "contact", "distance", "proximity", "elastomer", "temperature", "audio")

@@ -24,10 +24,10 @@ from robotics_bridge.sensors import (
     ThermalMaterial,
     find_modes,
 )
-from robotics_bridge.sensors.audio_materials import ElasticMaterial
-from robotics_bridge.sensors.calibrate import Log, calibrate
-from robotics_bridge.sensors.noise import simulate
-from robotics_bridge.sensors.thermal_materials import material
+from robotics_bridge.sensors.audio.materials import ElasticMaterial
+from robotics_bridge.sensors.calibration.calibrate import Log, calibrate
+from robotics_bridge.sensors.noise.model import simulate
+from robotics_bridge.sensors.temperature.materials import material
 
 STEEL = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)

@@ -230,9 +230,9 @@ def environment(gpu: int | None) -> dict[str, str]:
 
 def make_plan(args: argparse.Namespace, gpus: int) -> Any:
     from brainbench.stimuli import Fidelity
-    from brainbench.stimuli.collections import resolve_objects
-    from brainbench.stimuli.generation.plan import GenerationPlan, Settings
-    from brainbench.stimuli.sweeps import GRIDS
+    from brainbench.stimuli.objects.collections import resolve_objects
+    from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+    from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
     settings = Settings(
         fidelity=Fidelity(links=args.links, time_step=args.step),
@@ -248,8 +248,8 @@ def make_plan(args: argparse.Namespace, gpus: int) -> Any:
 
 def make_data(args: argparse.Namespace, gpus: int) -> Path:
     """Generate the sweeps, every GPU its share of the shards; return their folder."""
-    from brainbench.files import to_plain, write_json
-    from brainbench.stimuli.generation.run import CONFIG, generate
+    from brainbench.core.files import to_plain, write_json
+    from brainbench.stimuli.sweeps.generation import CONFIG, generate
 
     folder = args.work / "data"
     folder.mkdir(parents=True, exist_ok=True)
@@ -268,8 +268,8 @@ def make_data(args: argparse.Namespace, gpus: int) -> Path:
 
 def make_shards(args: argparse.Namespace) -> None:
     """Make every n-th shard of the data set."""
-    from brainbench.stimuli.generation.local import run_here
-    from brainbench.stimuli.generation.manifest import is_whole
+    from brainbench.stimuli.sweeps.local_pool import run_here
+    from brainbench.stimuli.sweeps.manifest import is_whole
 
     index, count = map(int, args.shards.split("/"))
     folder = args.work / "data"
@@ -378,8 +378,8 @@ def chosen_jobs(args: argparse.Namespace) -> list[Job]:
 
 def score(folder: Path) -> None:
     """Score a job's network on the demo recordings; without a job, only make the stimuli."""
-    from brainbench.files import read_json, write_text
-    from brainbench.scoring import score_record
+    from brainbench.core.files import read_json, write_text
+    from brainbench.scoring.scores import score_record
 
     if (folder / "record.json").is_file():
         return
@@ -403,7 +403,7 @@ def score(folder: Path) -> None:
 
 def pack(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Write what comes back, the most valuable first; return the results."""
-    from brainbench.files import read_json, write_text
+    from brainbench.core.files import read_json, write_text
 
     work = args.work
     args.out.mkdir(parents=True, exist_ok=True)
@@ -448,7 +448,7 @@ def row(result: dict[str, Any]) -> str:
 
 def fill(args: argparse.Namespace, paths: list[Path]) -> None:
     """Put files into tar files of limited size, as many as fit, in order."""
-    from brainbench.files import atomic_path
+    from brainbench.core.files import atomic_path
 
     out, work = args.out, args.work
     room = [TAR_BYTES] * args.tars
@@ -485,10 +485,10 @@ def install(folder: Path, *, weights: bool = True) -> None:
     Where the one that is there was evaluated on the same sweeps, the better one in validation stays. Records of all
     other trained networks go to the leaderboard.
     """
-    from brainbench.files import read_json, write_json, write_text
+    from brainbench.core.files import read_json, write_json, write_text
+    from brainbench.core.records import ResultRecord
     from brainbench.models.training.card import model_card
     from brainbench.models.training.config import TrainingConfig
-    from brainbench.types import ResultRecord
     from leaderboards.store import write_record
 
     work = folder / "unpacked"

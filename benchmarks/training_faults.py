@@ -24,10 +24,10 @@ from safetensors.torch import load_file
 from zoo_jobs import SMALL
 
 from brainbench.datasets import WhiskingDataset
-from brainbench.models._seeding import seeded
-from brainbench.models.objectives import make_learner
+from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
-from brainbench.models.training.start import draw_silent_biases
+from brainbench.models.training.initial_state import draw_silent_biases
+from brainbench.models.training.objectives import make_learner
 
 BATCH = 24
 MODEL = "resnet18-small"

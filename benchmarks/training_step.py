@@ -27,14 +27,14 @@ import numpy as np
 import torch
 from results import table, write_section
 
-from brainbench.models._gpu import plain
+from brainbench.models.activations import evaluating
 from brainbench.models.export import export_model, read_onnx
-from brainbench.models.extract import evaluating
-from brainbench.models.packing import packed
+from brainbench.models.ops.dispatch import plain
+from brainbench.models.ops.packing import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
-from brainbench.models.training.captured import captured, fuse, make_capturable
-from brainbench.models.training.run import compiled
+from brainbench.models.training.cuda_graphs import captured, fuse, make_capturable
+from brainbench.models.training.trainer import compiled
 
 STEPS = 22
 

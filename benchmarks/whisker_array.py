@@ -17,13 +17,14 @@ from xml.etree import ElementTree
 import numpy as np
 from results import table, write_section
 
-from brainbench.stimuli.backends import _mujoco_model, get_backend
-from brainbench.stimuli.backends._engines import MILLI
-from brainbench.stimuli.backends._mujoco_drive import ARMATURE
-from brainbench.stimuli.backends.protocol import Job
-from brainbench.stimuli.chain import build_chain
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.recipes import get_recipe
+from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.mujoco import model as _mujoco_model
+from brainbench.stimuli.engines.mujoco.drive import ARMATURE
+from brainbench.stimuli.engines.protocol import Job
+from brainbench.stimuli.engines.trust import MILLI
+from brainbench.stimuli.scenes.recipes import get_recipe
+from brainbench.stimuli.whiskers.chain import build_chain
 
 FIDELITY = Fidelity(links=20, time_step=5e-5)
 """Preset ``accurate`` with one step for all whiskers, as one model of all of them must have."""

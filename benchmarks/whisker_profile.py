@@ -13,10 +13,11 @@ import numpy as np
 from results import table, write_section
 from whisker_array import FIDELITY, jobs
 
-from brainbench.stimuli.backends import _mujoco_model, mujoco
-from brainbench.stimuli.backends._reach import reachable
-from brainbench.stimuli.backends.protocol import Job
-from brainbench.stimuli.chain import build_chain
+from brainbench.stimuli.engines.mujoco import engine as mujoco
+from brainbench.stimuli.engines.mujoco import model as _mujoco_model
+from brainbench.stimuli.engines.protocol import Job
+from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.whiskers.chain import build_chain
 
 STAGES = {
     "kinematics": "POS_KINEMATICS",

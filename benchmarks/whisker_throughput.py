@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.backends.rod._device import to_struct, warp
-from brainbench.stimuli.backends.rod._limits import DOUBTFUL
-from brainbench.stimuli.backends.rod._pack import Shapes, Tracks, still_knots
-from brainbench.stimuli.backends.rod.fast import BLOCK, SweepLauncher
-from brainbench.stimuli.collections import resolve_objects
-from brainbench.stimuli.sweeps import GRIDS, SweepScenes
+from brainbench.stimuli.engines.rod.limits import DOUBTFUL
+from brainbench.stimuli.engines.rod.packing import Shapes, Tracks, still_knots
+from brainbench.stimuli.engines.rod.sweeps import BLOCK, SweepLauncher
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.collections import NamedObject
-    from brainbench.stimuli.objects import Solid
+    from brainbench.stimuli.objects.collections import NamedObject
+    from brainbench.stimuli.objects.placed_object import Solid
 
 
 def timed(wp: Any, device: Any, run: Callable[[], None], repeats: int = 3) -> float:
@@ -121,11 +121,11 @@ def peer(device_name: str, worlds: int, links: int, steps: int) -> None:
     import mujoco
     import mujoco_warp
 
-    from brainbench.stimuli.backends._mujoco_model import build_model
-    from brainbench.stimuli.backends._reach import reachable
-    from brainbench.stimuli.backends.protocol import Job, StillFollicle
-    from brainbench.stimuli.chain import build_chain
-    from brainbench.stimuli.sweep_grid import default_array
+    from brainbench.stimuli.engines.mujoco.model import build_model
+    from brainbench.stimuli.engines.protocol import Job, StillFollicle
+    from brainbench.stimuli.engines.reach import reachable
+    from brainbench.stimuli.sweeps.grid import default_array
+    from brainbench.stimuli.whiskers.chain import build_chain
 
     wp = warp()
     whisker = next(mount.whisker for mount in default_array("mouse") if mount.name == "C2")

@@ -15,12 +15,12 @@ from functools import partial
 import numpy as np
 from results import table, write_section
 
-from brainbench.errors import BrainbenchError
-from brainbench.stimuli import references, validation
-from brainbench.stimuli.backends import list_backends
-from brainbench.stimuli.fidelity import Fidelity, list_presets
-from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.whisker import Whisker
+from brainbench.core.errors import BrainbenchError
+from brainbench.stimuli.engines import list_backends
+from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
+from brainbench.stimuli.validation import bench_tests, references
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 ARCS = (0.3, 0.5, 0.7, 0.8)
 OFFSETS = (0.02, 0.1, 0.2, 0.3)
@@ -59,7 +59,7 @@ def measure(name: str, backend: str) -> dict[str, dict[str, object]]:
             gated = abs(contact.slope) <= math.radians(60) and offset * length <= 0.9 * limit
             for preset, out in result.items():
                 try:
-                    test = validation.peg(whisker, at * length, offset * length, backend=backend, fidelity=preset)
+                    test = bench_tests.peg(whisker, at * length, offset * length, backend=backend, fidelity=preset)
                     cell = (test.moment_error, test.force_error, gated)
                     out["seconds"] += test.trace.seconds
                     out["time"] += test.trace.steps * step(whisker, preset)
@@ -69,12 +69,14 @@ def measure(name: str, backend: str) -> dict[str, dict[str, object]]:
         for preset, out in result.items():
             if at in SLIPS:
                 try:
-                    out["slips"][at] = validation.slip_off(whisker, at * length, backend=backend, fidelity=preset).error
+                    out["slips"][at] = bench_tests.slip_off(
+                        whisker, at * length, backend=backend, fidelity=preset
+                    ).error
                 except BrainbenchError:
                     out["slips"][at] = math.inf
     for preset, out in result.items():
-        out["ring"] = validation.ringdown(whisker, backend=backend, fidelity=preset)
-        out["own"] = validation.ringdown(whisker, own_step=True, backend=backend, fidelity=preset).frequency_errors
+        out["ring"] = bench_tests.ringdown(whisker, backend=backend, fidelity=preset)
+        out["own"] = bench_tests.ringdown(whisker, own_step=True, backend=backend, fidelity=preset).frequency_errors
     return result
 
 

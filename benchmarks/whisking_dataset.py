@@ -20,17 +20,17 @@ import numpy as np
 import torch
 from results import table, write_section
 
-from brainbench.datasets.whisking import WhiskingDataset
-from brainbench.files import hash_arrays
+from brainbench.core.files import hash_arrays
+from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.collections import NamedObject, resolve_objects
-from brainbench.stimuli.generation import engine, local
-from brainbench.stimuli.generation.engine import SweepBatch
-from brainbench.stimuli.generation.plan import GenerationPlan, Settings
-from brainbench.stimuli.generation.run import generate
-from brainbench.stimuli.generation.shard import _write_all, prepare_shard
-from brainbench.stimuli.objects import box
-from brainbench.stimuli.sweeps import GRIDS
+from brainbench.stimuli.objects.collections import NamedObject, resolve_objects
+from brainbench.stimuli.objects.placed_object import box
+from brainbench.stimuli.sweeps import local_pool, simulation
+from brainbench.stimuli.sweeps.generation import generate
+from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.shards import _write_all, prepare_shard
+from brainbench.stimuli.sweeps.simulation import SweepBatch
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
 WHISKERS, FRAMES = 30, 110
 BLOCK = np.random.default_rng(0).normal(size=(64, FRAMES, WHISKERS, 6)).astype(np.float32)
@@ -105,26 +105,27 @@ def write_parts(folder: Path) -> list[list[str]]:
 
 def write_set(folder: Path, sweeps: int) -> list[list[str]]:
     """Write a data set through the path that a GPU takes, its objects built before."""
-    engine.FAST_PATHS["mujoco"] = (__name__, "made_up")
+    simulation.FAST_PATHS["mujoco"] = (__name__, "made_up")
     objects = {
         name: NamedObject(name, "box", "made up", partial(box, (1.0, 1.0, 1.0)))
         for name in (f"box-{index}" for index in range(sweeps // 16))
     }
     plan = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, Settings(Fidelity(), shard_size=2048))
-    run, local.run_here = local.run_here, lambda tasks, where, workers, done: local.run_pipelined(tasks, where, 1, done)
+    run, local_pool.run_here = (
+        local_pool.run_here,
+        lambda tasks, where, workers, done: local_pool.run_pipelined(tasks, where, 1, done),
+    )
     # What other processes do while the GPU works is measured by itself.
     each = [seconds(lambda task=task: prepare_shard(task), 1) for task in plan.shards]
     ready = [(task, prepare_shard(task)) for task in plan.shards]
-    ahead, local._built_ahead = local._built_ahead, lambda tasks, pool, ahead: iter(ready)
-    pool, local._pool = local._pool, ThreadPoolExecutor  # type: ignore[assignment]
+    ahead, local_pool._built_ahead = local_pool._built_ahead, lambda tasks, pool, ahead: iter(ready)
+    pool, local_pool._pool = local_pool._pool, ThreadPoolExecutor  # type: ignore[assignment]
     try:
         took = seconds(lambda: generate(plan, folder), 1)
     finally:
-        local.run_here, local._pool, local._built_ahead = run, pool, ahead
+        local_pool.run_here, local_pool._pool, local_pool._built_ahead = run, pool, ahead
     means = [sum(item) / plan.sweeps * 2048 * 1e3 for item in zip(*each, strict=True)]
-    what = (
-        f"{plan.sweeps:,} sweeps in {len(plan.shards)} shards: {local.WRITERS} threads hash, write, wait for the disk"
-    )
+    what = f"{plan.sweeps:,} sweeps in {len(plan.shards)} shards: {local_pool.WRITERS} threads hash, write, wait"
     prepare = [
         "prepare a shard of 2048 sweeps of 128 objects, beside building them",
         *(f"{one:.0f} ms" for one in means),

@@ -19,20 +19,20 @@ from typing import Any
 import torch
 from zoo_jobs import Job
 
+from brainbench.core.files import read_json, write_json
 from brainbench.datasets import WhiskingDataset
-from brainbench.files import read_json, write_json
-from brainbench.models._seeding import seeded
-from brainbench.models.augment import Augmentation
-from brainbench.models.checkpoints import WEIGHTS, load_weights, save_checkpoint
-from brainbench.models.evaluation import evaluate
 from brainbench.models.normaliser import Normaliser
-from brainbench.models.objectives import make_learner
-from brainbench.models.optimizers import make_optimizer, rate_factor
+from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
-from brainbench.models.training.captured import captured, copy_state, fuse, make_capturable, reset_optimizer
+from brainbench.models.training.augmentation import Augmentation
 from brainbench.models.training.card import checkpoint_info, model_card
+from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
+from brainbench.models.training.cuda_graphs import captured, copy_state, fuse, make_capturable, reset_optimizer
+from brainbench.models.training.evaluation import evaluate
+from brainbench.models.training.initial_state import draw_silent_biases
+from brainbench.models.training.objectives import make_learner
+from brainbench.models.training.optimizers import make_optimizer, rate_factor
 from brainbench.models.training.probe import fit_probe
-from brainbench.models.training.start import draw_silent_biases
 from brainbench.models.training.state import load_state, save_state
 
 STATE, BEST, RESULT, LOG = "state.safetensors", "best", "result.json", "log.jsonl"

@@ -14,12 +14,12 @@ _LAZY = {
     "list_models": "brainbench.models.registry",
     "load_model": "brainbench.models.registry",
     "register_model": "brainbench.models.registry",
-    "extract": "brainbench.models.extract",
+    "extract": "brainbench.models.activations",
     "score": "brainbench.scoring",
     "open_recordings": "brainbench.datasets",
-    "Score": "brainbench.types",
-    "ResultRecord": "brainbench.types",
-    "BrainbenchError": "brainbench.errors",
+    "Score": "brainbench.core.records",
+    "ResultRecord": "brainbench.core.records",
+    "BrainbenchError": "brainbench.core.errors",
 }
 
 __all__ = [
@@ -36,12 +36,12 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from brainbench.core.errors import BrainbenchError
+    from brainbench.core.records import ResultRecord, Score
     from brainbench.datasets import open_recordings
-    from brainbench.errors import BrainbenchError
-    from brainbench.models.extract import extract
+    from brainbench.models.activations import extract
     from brainbench.models.registry import list_models, load_model, register_model
-    from brainbench.scoring import score
-    from brainbench.types import ResultRecord, Score
+    from brainbench.scoring.scores import score
 
 
 def __getattr__(name: str) -> Any:

@@ -13,8 +13,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from brainbench import __version__
-from brainbench.types import ESTIMATOR_VERSION, RECORD_SCHEMA, ResultRecord
-from leaderboards import _origin
+from brainbench.core.records import ESTIMATOR_VERSION, RECORD_SCHEMA, ResultRecord
+from leaderboards import provenance
 from leaderboards.store import StoredRecord
 
 TOLERANCE = 1e-3
@@ -54,18 +54,18 @@ def conflicting(record: ResultRecord, others: Iterable[ResultRecord]) -> list[Re
 def computation(record: ResultRecord) -> tuple[Any, ...]:
     """Return what was computed from what, as a key: equal keys must have equal numbers."""
     score, card = record.score, record.card
-    settings = _origin.settings(score)
+    settings = provenance.settings(score)
     return (
-        _origin.recordings_hash(score),
-        _origin.stimuli_hash(score),
+        provenance.recordings_hash(score),
+        provenance.stimuli_hash(score),
         score.stimuli,
         score.estimator,
         score.metric,
         score.name,
         card.weights if card else None,
-        _origin.version(score),
+        provenance.version(score),
         *(str(settings.get(name)) for name in ("time", "seed", "layers", "normalize", "whiskers", "estimator_version")),
-        *(str(_origin.recordings_part(score, name)) for name in ("window", "selection")),
+        *(str(provenance.recordings_part(score, name)) for name in ("window", "selection")),
     )
 
 
@@ -89,20 +89,20 @@ def _numbers(version: str) -> tuple[int, ...] | None:
 
 def _stale(record: ResultRecord, schema: int, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
     score = record.score
-    settings = _origin.settings(score)
+    settings = provenance.settings(score)
     reasons = []
     if schema < RECORD_SCHEMA:
         reasons.append(f"the file has the layout of version {schema}, now {RECORD_SCHEMA}")
-    version = _origin.version(score)
+    version = provenance.version(score)
     if older(version, __version__):
         reasons.append(f"made by brainbench {version}, this is {__version__}")
     estimator = settings.get("estimator_version")
     if score.estimator == "default" and isinstance(estimator, int) and estimator < ESTIMATOR_VERSION:
         reasons.append(f"version {estimator} of the default estimator, now {ESTIMATOR_VERSION}")
     latest = newest.get(_shown(record), ("", ""))[1]
-    if latest and latest != _origin.stimuli_hash(score):
+    if latest and latest != provenance.stimuli_hash(score):
         reasons.append(
-            f"its stimuli ({_origin.stimuli_hash(score)}) were made by another engine or an earlier definition of "
+            f"its stimuli ({provenance.stimuli_hash(score)}) were made by another engine or an earlier definition of "
             f"fidelity {settings.get('fidelity')!r} than the newest records' ({latest})"
         )
     return reasons
@@ -110,21 +110,21 @@ def _stale(record: ResultRecord, schema: int, newest: dict[tuple[Any, ...], tupl
 
 def _shown(record: ResultRecord) -> tuple[Any, ...]:
     """Return by which words the stimuli were asked for: the same words may mean others in another version."""
-    settings = _origin.settings(record.score)
+    settings = provenance.settings(record.score)
     named = tuple(str(settings.get(name)) for name in ("stimuli", "whiskers", "fidelity"))
-    return (_origin.stimuli_name(record.score), *named)
+    return (provenance.stimuli_name(record.score), *named)
 
 
 def _newest_stimuli(stored: list[StoredRecord]) -> dict[tuple[Any, ...], tuple[str, str]]:
     """Return for each wording of the stimuli the time and the hash of the newest record."""
     newest: dict[tuple[Any, ...], tuple[str, str]] = {}
     for item in stored:
-        if item.record is None or not (shown := _origin.stimuli_hash(item.record.score)):
+        if item.record is None or not (shown := provenance.stimuli_hash(item.record.score)):
             continue
-        if not _origin.settings(item.record.score).get("fidelity"):
+        if not provenance.settings(item.record.score).get("fidelity"):
             continue
         key = _shown(item.record)
-        newest[key] = max(newest.get(key, ("", "")), (_origin.made_at(item.record.score), shown))
+        newest[key] = max(newest.get(key, ("", "")), (provenance.made_at(item.record.score), shown))
     return newest
 
 

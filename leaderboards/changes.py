@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from brainbench.errors import DataError
-from brainbench.files import to_plain
-from brainbench.types import ResultRecord, Score
-from leaderboards import _origin
+from brainbench.core.errors import DataError
+from brainbench.core.files import to_plain
+from brainbench.core.records import ResultRecord, Score
+from leaderboards import provenance
 from leaderboards.audit import TOLERANCE
 from leaderboards.ranking import rank
 from leaderboards.store import StoredRecord, read_records
@@ -62,9 +62,9 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
     """
     found = []
     for what, of in (
-        ("recordings", _origin.recordings_hash),
-        ("stimuli", _origin.stimuli_hash),
-        ("brainbench version", _origin.version),
+        ("recordings", provenance.recordings_hash),
+        ("stimuli", provenance.stimuli_hash),
+        ("brainbench version", provenance.version),
     ):
         before, after = of(record.score), of(again.score)
         if before != after:

@@ -16,10 +16,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from brainbench.files import content_hash
-from brainbench.types import Interval, ModelCard, Score, Status
-from leaderboards import _origin
-from leaderboards._figures import known
+from brainbench.core.files import content_hash
+from brainbench.core.records import Interval, ModelCard, Score, Status
+from leaderboards import provenance
+from leaderboards.figures.marks import known
 from leaderboards.ranking import Board, RankedRecord, animals_of, rank_ranges
 from leaderboards.store import record_name
 
@@ -114,7 +114,9 @@ def entries_of(board: Board, remarks: Mapping[str, Sequence[str]] | None = None)
     groups: dict[tuple[object, ...], list[RankedRecord]] = defaultdict(list)
     taken: dict[tuple[object, ...], int] = defaultdict(int)
     # Of the same model and seed the newest is the entry's; older ones stay visible as entries of their own.
-    newest_first = sorted(board.rows, key=lambda row: (_origin.made_at(row.record.score), row.identity), reverse=True)
+    newest_first = sorted(
+        board.rows, key=lambda row: (provenance.made_at(row.record.score), row.identity), reverse=True
+    )
     for row in newest_first:
         kind = _kind(row)
         seed = row.record.card.seed if row.record.card else None

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.types import Interval, ResultRecord, Score
-from leaderboards import _origin
-from leaderboards._figures import known
+from brainbench.core.records import Interval, ResultRecord, Score
+from leaderboards import provenance
+from leaderboards.figures.marks import known
 from leaderboards.store import record_name
 
 if TYPE_CHECKING:
@@ -105,8 +105,8 @@ def rank(records: Iterable[ResultRecord]) -> list[Board]:
     groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
     for record in records:
         score = record.score
-        brain, shown = _origin.recordings_hash(score), _origin.stimuli_hash(score)
-        groups[brain, shown, score.stimuli, _origin.time_rule(score), score.estimator, score.metric].append(record)
+        brain, shown = provenance.recordings_hash(score), provenance.stimuli_hash(score)
+        groups[brain, shown, score.stimuli, provenance.time_rule(score), score.estimator, score.metric].append(record)
     boards = [_board(key, group) for key, group in groups.items()]
     return sorted(boards, key=lambda board: (-len(board.rows), board.recordings, board.estimator, board.metric))
 
@@ -216,9 +216,9 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
         rows.append(RankedRecord(record, record_name(record), first, last, reason, notes))
     rows.sort(key=_order)
     return Board(
-        recordings=_most_common(_origin.recordings_name(record.score) for record in records),
+        recordings=_most_common(provenance.recordings_name(record.score) for record in records),
         recordings_hash=recordings_hash,
-        stimuli=_most_common(_origin.stimuli_name(record.score) for record in records),
+        stimuli=_most_common(provenance.stimuli_name(record.score) for record in records),
         stimuli_hash=stimuli_hash,
         conditions=conditions,
         time=time,

@@ -1,4 +1,4 @@
-"""The JSON Schema of a result record, derived from the dataclasses of :mod:`brainbench.types`.
+"""The JSON Schema of a result record, derived from the dataclasses of :mod:`brainbench.core.records`.
 
 The published file ``leaderboards/record.schema.json`` is :func:`record_schema` written out; a test
 keeps the two in step. :func:`first_fault` checks a record against it without the ``jsonschema``
@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from brainbench.types import RECORD_SCHEMA, ResultRecord
+from brainbench.core.records import RECORD_SCHEMA, ResultRecord
 
 SCHEMA_PATH = Path(__file__).with_name("record.schema.json")
 """The published schema, shipped with the package."""

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from brainbench.errors import DataError, DataFileNotFoundError
-from brainbench.files import write_text
-from brainbench.types import RECORD_SCHEMA, Interval, ResultRecord, Score, migrate_record, record_identity
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.files import write_text
+from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, migrate_record, record_identity
 from leaderboards.schema import first_fault
 
 

@@ -28,7 +28,7 @@ from brainbench.cli import (
     tradeoff,
     train,
 )
-from brainbench.errors import BrainbenchError
+from brainbench.core.errors import BrainbenchError
 
 app = typer.Typer(
     name="brainbench",

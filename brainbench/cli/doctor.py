@@ -7,7 +7,7 @@ import platform
 from importlib import metadata
 from typing import Any
 
-from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, table
 
 REQUIRED = (
     "torch",
@@ -64,7 +64,7 @@ def doctor(as_json: JsonOption = False) -> None:
 def diagnose() -> dict[str, Any]:
     """Collect what :func:`doctor` shows."""
     from brainbench import __version__
-    from brainbench.files import cache_dir
+    from brainbench.core.files import cache_dir
 
     cache = cache_dir()
     return {

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit
 
 
 def export(
@@ -18,9 +18,9 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Export one step, obs and h_in to features and h_out, with its contract, and check the written file."""
-    from brainbench.models.checkpoints import PREFIXES, find_folder
     from brainbench.models.export import SUFFIXES, export_model
     from brainbench.models.registry import load_model
+    from brainbench.models.training.checkpoints import PREFIXES, find_folder
 
     loaded = load_model(model, seed=seed)
     name = find_folder(model).resolve().name if model.startswith(PREFIXES) else model

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, table
-from brainbench.files import to_plain
+from brainbench.cli.output import JsonOption, emit, table
+from brainbench.core.files import to_plain
 
 app = typer.Typer(no_args_is_help=True, help="List and describe the registered models.")
 
@@ -19,9 +19,9 @@ def list_(
     """List the registered models with their sizes and the objectives that were published for them."""
     from fnmatch import fnmatchcase
 
-    from brainbench.models.checkpoints import shipped
     from brainbench.models.recipes import list_recipes
     from brainbench.models.registry import describe_model, list_models
+    from brainbench.models.training.checkpoints import shipped
 
     names = [*list_models(pattern), *(name for name in shipped() if fnmatchcase(name, pattern))]
     records = [describe_model(name) for name in names]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 _EFFECTS = (0.0, 0.3, 0.5, 0.7)
 
@@ -31,8 +31,8 @@ def power(
     Correlation, consistency and reliability of your own recordings: 'brainbench score' and
     'brainbench recordings rdm'.
     """
-    from brainbench.metrics.power import Design, needed
-    from brainbench.metrics.power import power as power_of
+    from brainbench.metrics.inference.power import Design, needed
+    from brainbench.metrics.inference.power import power as power_of
 
     effects = _EFFECTS if effect is None else (effect,)
     designs = [Design(stimuli, animals, item, consistency, reliability, layers, alpha) for item in effects]
@@ -66,6 +66,6 @@ def power(
 
 
 def _plain(result: object) -> dict[str, object]:
-    from brainbench.files import to_plain
+    from brainbench.core.files import to_plain
 
     return to_plain(result)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,8 +48,8 @@ def rdm(
     """Compute every animal's RDM (correlation distance) and its split-half reliability."""
     from dataclasses import replace
 
-    from brainbench._brain_side import brain_side
     from brainbench.datasets import pooled
+    from brainbench.scoring.neural_responses import brain_side
 
     with progress_bar() as progress:
         brain = brain_side(source, conditions=conditions, select=select, window=window, progress=progress)
@@ -147,7 +147,7 @@ def _found(source: str) -> str:
     """Return a source as the files' readers take it: the demo recordings by their folder."""
     if source != "demo":
         return source
-    from brainbench._brain_side import demo_recordings
+    from brainbench.scoring.neural_responses import demo_recordings
 
     with progress_bar() as progress:
         return str(demo_recordings(progress=progress))

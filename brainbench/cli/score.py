@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
 
 if TYPE_CHECKING:
-    from brainbench.types import ResultRecord, Score
+    from brainbench.core.records import ResultRecord, Score
 
 
 _RELIABILITY = {
@@ -91,8 +91,8 @@ def score(
     as_json: JsonOption = False,
 ) -> None:
     """Score a model against neural recordings and write a result record and an HTML report."""
-    from brainbench.scoring import score_record
-    from leaderboards.report import write_report
+    from brainbench.scoring.scores import score_record
+    from leaderboards.report.score_report import write_report
     from leaderboards.store import write_record
 
     if explain_estimator and Path(model).suffix == ".npz":
@@ -126,7 +126,7 @@ def score(
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
     text = f"{_text(record)}\n\nrecord  {path}\nreport  {report}"
     if report_file is not None:
-        from leaderboards.paper import write_paper
+        from leaderboards.report.paper import write_paper
 
         data["paper_paths"] = write_paper([record], report_file, title=f"{record.score.name}: brainbench score")
         text += f"\npaper   {', '.join(map(str, data['paper_paths'][:2]))}"
@@ -144,8 +144,8 @@ def _explain_splits(path: Path, *, as_json: bool) -> None:
     """Print the walk through stored split halves."""
     import numpy as np
 
-    from brainbench.errors import DataError, DataFileNotFoundError
-    from brainbench.files import to_plain
+    from brainbench.core.errors import DataError, DataFileNotFoundError
+    from brainbench.core.files import to_plain
     from brainbench.metrics.explain import explain_splits
 
     if not path.is_file():

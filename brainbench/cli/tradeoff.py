@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
-from brainbench.stimuli.backends import DEFAULT_BACKEND
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.stimuli.engines import DEFAULT_BACKEND
 
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
 
@@ -35,7 +35,7 @@ def whisker(
 
     The table that ships with the package (brainbench/stimuli/fidelity_table.json) is made by this command.
     """
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
     from brainbench.stimuli import tradeoff
 
     try:
@@ -153,7 +153,7 @@ def model(
     as_json: JsonOption = False,
 ) -> None:
     """Measure error, latency, score and accuracy of a network over precision, unrolling and number of steps."""
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
     from brainbench.models import tradeoff
     from brainbench.stimuli import load_stimuli
 
@@ -227,7 +227,7 @@ def _items(text: str) -> list[str]:
 
 def _accuracy(reduced: Any, data: Path) -> dict[str, float]:
     from brainbench.datasets import WhiskingDataset
-    from brainbench.models.evaluation import evaluate
+    from brainbench.models.training.evaluation import evaluate
 
     found = evaluate(reduced, WhiskingDataset(data, split="test", shuffle=False))
     return {"top1": found.top1, "top5": found.top5}

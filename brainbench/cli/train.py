@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 if TYPE_CHECKING:
     import torch
 
+    from brainbench.core.progress import Progress
     from brainbench.datasets import WhiskingDataset
-    from brainbench.models.training.run import TrainingResult
-    from brainbench.types import Progress
+    from brainbench.models.training.trainer import TrainingResult
 
 
 def train(
@@ -58,10 +58,10 @@ def train(
 
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
     """
-    from brainbench.errors import DataError, UsageError
+    from brainbench.core.errors import DataError, UsageError
     from brainbench.models.training.config import TrainingConfig, read_options
-    from brainbench.models.training.run import train as run
-    from brainbench.models.training.sweep import SweepRun, best_run, sweep_runs
+    from brainbench.models.training.search_space import SweepRun, best_run, sweep_runs
+    from brainbench.models.training.trainer import train as run
 
     options = read_options(config) if config is not None else {}
     given = {
@@ -150,7 +150,7 @@ class SweepFolder:
 
 
 def _job(text: str) -> tuple[int, int]:
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
 
     if text == "all":
         return 0, 1

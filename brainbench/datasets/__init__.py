@@ -4,20 +4,20 @@
 >>> open_recordings("sessions/*.nwb", conditions="trials:stimulus")  # doctest: +SKIP
 """
 
-from brainbench.datasets.blocks import SessionBlock, block_covariates, blocks
-from brainbench.datasets.checks import Checkup, check
-from brainbench.datasets.conditions import Conditions
+from brainbench.datasets.checks.checkup import Checkup, check
 from brainbench.datasets.exports import export
 from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import Inspection, inspect
-from brainbench.datasets.pooling import pooled
-from brainbench.datasets.recipes import Recipe, get_recipe, list_recipes, register_recipe
+from brainbench.datasets.layouts.registry import Recipe, get_recipe, list_recipes, register_recipe
 from brainbench.datasets.recordings import open_recordings
-from brainbench.datasets.selection import Rule, Selection
 from brainbench.datasets.sessions import Session, make_session
-from brainbench.datasets.whisking import WhiskingDataset
-from brainbench.datasets.window import Window
+from brainbench.datasets.trials.blocks import SessionBlock, block_covariates, blocks
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.pooling import pooled
+from brainbench.datasets.trials.selection import Rule, Selection
+from brainbench.datasets.trials.windows import Window
+from brainbench.datasets.whisking.dataset import WhiskingDataset
 
 __all__ = [
     "Checkup",

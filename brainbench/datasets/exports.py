@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets._extract import has_units, read_spikes, recorded_span
-from brainbench.datasets._nwb_writer import NwbWriter
-from brainbench.datasets.covariates import LICKS, lick_times
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.files import atomic_path
 from brainbench.datasets.hdf5 import write_recordings
+from brainbench.datasets.layouts.registry import resolve_selection
 from brainbench.datasets.reading import Source, each_session, find_recordings
-from brainbench.datasets.recipes import resolve_selection
-from brainbench.datasets.selection import EVERYTHING, Selection, Tally
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, Table, as_labels, decode, ragged
 from brainbench.datasets.sources import open_file
-from brainbench.errors import DataError, UsageError, unknown_name
-from brainbench.files import atomic_path
+from brainbench.datasets.synthetic.nwb_writer import NwbWriter
+from brainbench.datasets.trials.counting import has_units, read_spikes, recorded_span
+from brainbench.datasets.trials.covariates import LICKS, lick_times
+from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally
 
 _NO_START = "1970-01-01T00:00:00+00:00"
 

@@ -8,8 +8,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from brainbench.datasets.recipes import get_recipe, list_recipes
-from brainbench.errors import DataError, MissingDependencyError, UsageError, unknown_name
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError, unknown_name
+from brainbench.datasets.layouts.registry import get_recipe, list_recipes
 
 
 def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None = None) -> Path:

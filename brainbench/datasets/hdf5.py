@@ -16,7 +16,7 @@ The root carries the attributes ``format`` = "brainbench-recordings", ``version`
             id                  optional, [rows]
             <column>            [rows]: numbers, booleans or UTF-8 text
 
-``kind`` = "counts": one recordings data set (:func:`brainbench.types.check_recordings`)::
+``kind`` = "counts": one recordings data set (:func:`brainbench.core.contracts.check_recordings`)::
 
     /counts, /duration, /time   [trial, time, unit], [trial, time] and [time]
     /trial/<coordinate>         [trial]: stimulus, subject, session, trial_id, …
@@ -36,10 +36,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.contracts import check_recordings
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import atomic_path, to_json
 from brainbench.datasets.sessions import SPIKES, Session, Table, decode, text
-from brainbench.errors import DataError, UsageError
-from brainbench.files import atomic_path, to_json
-from brainbench.types import check_recordings
 
 if TYPE_CHECKING:
     import h5py

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from brainbench.core.errors import DataError
+from brainbench.core.files import to_json
 from brainbench.datasets import hdf5
-from brainbench.datasets._extract import has_units, no_units, read_spikes, recorded_span
-from brainbench.datasets.proposals import EXAMPLES, ColumnSummary, Proposal, propose, summarise_columns
 from brainbench.datasets.reading import each_session
 from brainbench.datasets.sessions import SPIKES, Session, Table, natural_order
 from brainbench.datasets.sources import find_files, open_file
-from brainbench.errors import DataError
-from brainbench.files import to_json
+from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
+from brainbench.datasets.trials.proposals import EXAMPLES, ColumnSummary, Proposal, propose, summarise_columns
 
 
 @dataclass(frozen=True)

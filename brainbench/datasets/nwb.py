@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.datasets.covariates import LICKS
+from brainbench.core.errors import DataError
 from brainbench.datasets.sessions import Series, Session, Table, decode, text
-from brainbench.errors import DataError
+from brainbench.datasets.trials.covariates import LICKS
 
 if TYPE_CHECKING:
     import h5py

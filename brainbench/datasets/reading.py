@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brainbench.datasets.recipes import Recipe, detect_recipe, get_recipe, split_source
+from brainbench.datasets.layouts.registry import Recipe, detect_recipe, get_recipe, split_source
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.sources import find_files, read_file
 

@@ -1,6 +1,6 @@
 """Open recordings: files → sessions → one data set of counted trials.
 
-The result (contract: :func:`brainbench.types.check_recordings`) depends on the content of the files
+The result (contract: :func:`brainbench.core.contracts.check_recordings`) depends on the content of the files
 only: trials are sorted by subject, session, start time and id, units by subject, session and id.
 """
 
@@ -10,19 +10,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from brainbench.core.contracts import check_recordings
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.datasets import hdf5
-from brainbench.datasets._extract import Part, Plan, extract, has_units, no_units
-from brainbench.datasets._join import join
-from brainbench.datasets.conditions import Conditions
-from brainbench.datasets.proposals import propose
+from brainbench.datasets.layouts.registry import Recipe, list_recipes, resolve_selection
 from brainbench.datasets.reading import Source, each_session, find_recordings
-from brainbench.datasets.recipes import Recipe, list_recipes, resolve_selection
-from brainbench.datasets.selection import DEFAULT, Selection
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.sources import open_file
-from brainbench.datasets.window import WHOLE, Window, resolve_window
-from brainbench.errors import DataError, UsageError, listing, unknown_name
-from brainbench.types import check_recordings
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.counting import Part, Plan, extract, has_units, no_units
+from brainbench.datasets.trials.joining import join
+from brainbench.datasets.trials.proposals import propose
+from brainbench.datasets.trials.selection import DEFAULT, Selection
+from brainbench.datasets.trials.windows import WHOLE, Window, resolve_window
 
 if TYPE_CHECKING:
     import xarray as xr

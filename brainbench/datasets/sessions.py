@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.errors import DataError, unknown_name
+from brainbench.core.errors import DataError, unknown_name
 
 SPIKES = "spike_times"
 OBSERVED = "obs_intervals"

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, nearest
 from brainbench.datasets import hdf5, nwb
 from brainbench.datasets.sessions import Session
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError, nearest
 
 if TYPE_CHECKING:
     import h5py
@@ -56,7 +56,7 @@ def _expand(source: str) -> list[Path]:
     if source == "demo":
         raise UsageError(
             "The demo recordings are made from simulated stimuli on first use: ask for recordings='demo' in "
-            "brainbench.score, or pass the folder that brainbench.datasets.demo.ensure_demo returns."
+            "brainbench.score, or pass the folder that brainbench.datasets.synthetic.demo.ensure_demo returns."
         )
     siblings = [item.name for item in path.parent.iterdir()] if path.parent.is_dir() else []
     guess = nearest(path.name, siblings)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from brainbench.geometry._decomposition import Decomposition, DecompositionSettings, decompose
-from brainbench.geometry._distance import Deviation, deviation, hausdorff, winding_number
-from brainbench.geometry._mesh import UNITS, Diagnosis, Mesh, convex_hull, load_mesh, save_mesh
-from brainbench.geometry._repair import Repair, repair
+from brainbench.geometry.decomposition import Decomposition, DecompositionSettings, decompose
+from brainbench.geometry.distance import Deviation, deviation, hausdorff, winding_number
+from brainbench.geometry.mesh import UNITS, Diagnosis, Mesh, convex_hull, load_mesh, save_mesh
+from brainbench.geometry.mesh_repair import Repair, repair
 
 __all__ = [
     "UNITS",

@@ -10,23 +10,42 @@ The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`spli
 from __future__ import annotations
 
 from brainbench.metrics.animal_to_animal import pairwise_consistency, score_animals
-from brainbench.metrics.bootstrap import DRAWS, Bootstrap, bootstrap_ceiling, bootstrap_comparisons, bootstrap_score
-from brainbench.metrics.ceiling import NoiseCeiling, noise_ceiling
-from brainbench.metrics.compare import COMPARISONS, compare
-from brainbench.metrics.display import RDM
-from brainbench.metrics.equivalence import EquivalenceTest, equivalence_test, turing_test
-from brainbench.metrics.inference import PermutationTest, permutation_test
-from brainbench.metrics.movies import rdm_movie
-from brainbench.metrics.multiple import LayerTest, ModelComparison, compare_models, layer_tests
-from brainbench.metrics.noise import ESTIMATORS, RELIABILITY_GATE, Corrected, noise_corrected, spearman_brown
-from brainbench.metrics.patterns import PatternMetric
-from brainbench.metrics.precision import noise_precision
-from brainbench.metrics.protocol import Metric, check_metric, find_metric, get_metric, list_metrics, register_metric
-from brainbench.metrics.rdm import RDM_METHODS, rdm, rdm_problem
-from brainbench.metrics.reliability import SUBJECT_METHODS, SplitHalf, TrialBlock, split_half
+from brainbench.metrics.inference.bootstrap import (
+    DRAWS,
+    Bootstrap,
+    bootstrap_ceiling,
+    bootstrap_comparisons,
+    bootstrap_score,
+)
+from brainbench.metrics.inference.equivalence import EquivalenceTest, equivalence_test, turing_test
+from brainbench.metrics.inference.multiple import LayerTest, ModelComparison, compare_models, layer_tests
+from brainbench.metrics.inference.permutation import PermutationTest, permutation_test
+from brainbench.metrics.measures.patterns import PatternMetric
+from brainbench.metrics.measures.registry import (
+    Metric,
+    check_metric,
+    find_metric,
+    get_metric,
+    list_metrics,
+    register_metric,
+)
+from brainbench.metrics.rdms.comparison import COMPARISONS, compare
+from brainbench.metrics.rdms.display import RDM
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm, rdm_problem
+from brainbench.metrics.rdms.movies import rdm_movie
+from brainbench.metrics.rdms.precision import noise_precision
+from brainbench.metrics.reliability.ceiling import NoiseCeiling, noise_ceiling
+from brainbench.metrics.reliability.noise_correction import (
+    ESTIMATORS,
+    RELIABILITY_GATE,
+    Corrected,
+    noise_corrected,
+    spearman_brown,
+)
+from brainbench.metrics.reliability.split_half import SUBJECT_METHODS, SplitHalf, TrialBlock, split_half
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
+from brainbench.metrics.reliability.units import reliable_units, unit_reliability
 from brainbench.metrics.score import score_rdms
-from brainbench.metrics.subject import SubjectRDM, subject_rdm
-from brainbench.metrics.units import reliable_units, unit_reliability
 
 __all__ = [
     "COMPARISONS",

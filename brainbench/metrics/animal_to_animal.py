@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from brainbench.metrics._animals import (
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Interval, Score, Status, SubjectScore
+from brainbench.metrics.animals import (
     Animals,
     ceiling_of,
     gather,
@@ -17,15 +18,14 @@ from brainbench.metrics._animals import (
     mean_rdm,
     mean_reliability,
 )
-from brainbench.metrics._pairs import Floats, permuted_pairs, stimulus_count
-from brainbench.metrics.compare import check_comparison
-from brainbench.metrics.compare import compare as compare_rdms
-from brainbench.metrics.inference import RANDOM_PERMUTATIONS, SMALLEST_STIMULI, TIE, canonical_order
-from brainbench.metrics.intervals import t_interval
-from brainbench.metrics.noise import RELIABILITY_GATE, Corrected, noise_corrected
+from brainbench.metrics.inference.intervals import t_interval
+from brainbench.metrics.inference.permutation import RANDOM_PERMUTATIONS, SMALLEST_STIMULI, TIE, canonical_order
+from brainbench.metrics.rdms.comparison import check_comparison
+from brainbench.metrics.rdms.comparison import compare as compare_rdms
+from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, stimulus_count
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected, noise_corrected
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.metrics.score import metric_name
-from brainbench.metrics.subject import SubjectRDM
-from brainbench.types import Interval, Score, Status, SubjectScore
 
 _CHUNK_ELEMENTS = 1 << 22
 

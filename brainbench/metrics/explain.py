@@ -13,7 +13,7 @@ Faults of the published estimator (each a field of :class:`Switches`; True is as
 ``no_gate``          animals are averaged however unreliable they are
 
 Faults that happen before the estimator (other stimuli filled with zeros, stimuli numbered by first
-appearance) are in ``brainbench.datasets.synthetic`` and their damage is in docs/statistics.md.
+appearance) are in ``brainbench.datasets.synthetic.animals`` and their damage is in docs/statistics.md.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.errors import UsageError
-from brainbench.metrics._animals import gather
-from brainbench.metrics._pairs import Floats, rdm_stack
-from brainbench.metrics.compare import compare as compare_rdms
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Status
+from brainbench.metrics.animals import gather
 from brainbench.metrics.layers import held_out
-from brainbench.metrics.noise import RELIABILITY_GATE, THESIS_FILTER, spearman_brown
-from brainbench.metrics.subject import SubjectRDM, is_flat
-from brainbench.types import Status
+from brainbench.metrics.rdms.comparison import compare as compare_rdms
+from brainbench.metrics.rdms.pairs import Floats, rdm_stack
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, THESIS_FILTER, spearman_brown
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
 
 @dataclass(frozen=True)

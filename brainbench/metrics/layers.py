@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.metrics._pairs import Floats, Ints
+from brainbench.metrics.rdms.pairs import Floats, Ints
 
 _TIE = 1e-12
 

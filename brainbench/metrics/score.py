@@ -1,4 +1,4 @@
-"""From RDMs of a model's layers and of animals to a :class:`brainbench.types.Score`."""
+"""From RDMs of a model's layers and of animals to a :class:`brainbench.core.records.Score`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.errors import UsageError
-from brainbench.files import to_plain
-from brainbench.metrics._animals import (
+from brainbench.core.errors import UsageError
+from brainbench.core.files import to_plain
+from brainbench.core.records import LayerScore, Score, Status, SubjectScore
+from brainbench.metrics.animals import (
     Animals,
     ceiling_of,
     gather,
@@ -20,15 +21,20 @@ from brainbench.metrics._animals import (
     mean_rdm,
     mean_reliability,
 )
-from brainbench.metrics._pairs import Floats, rdm_stack
-from brainbench.metrics.bootstrap import bootstrap_animals
-from brainbench.metrics.compare import check_comparison, compare_all
-from brainbench.metrics.inference import SMALLEST_STIMULI, PermutationTest, layer_p, permuted_statistic, smallest_p
-from brainbench.metrics.intervals import t_interval
+from brainbench.metrics.inference.bootstrap import bootstrap_animals
+from brainbench.metrics.inference.intervals import t_interval
+from brainbench.metrics.inference.permutation import (
+    SMALLEST_STIMULI,
+    PermutationTest,
+    layer_p,
+    permuted_statistic,
+    smallest_p,
+)
 from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
-from brainbench.metrics.noise import RELIABILITY_GATE
-from brainbench.metrics.subject import SubjectRDM, is_flat
-from brainbench.types import LayerScore, Score, Status, SubjectScore
+from brainbench.metrics.rdms.comparison import check_comparison, compare_all
+from brainbench.metrics.rdms.pairs import Floats, rdm_stack
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
 _HALVES_IN_PERMUTATIONS = 100
 """Splits of a single animal that every permutation repeats; more only cost time."""
@@ -76,7 +82,7 @@ def score_rdms(
         name: Name of the model.
         stimuli: Names of the K stimuli, in the order of the RDMs.
         estimator: See :func:`noise_corrected`.
-        compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
+        compare: Comparison of RDMs, see :func:`brainbench.metrics.rdms.comparison`.
         seed: Seed of random permutations (more than 8 stimuli).
         device: Torch device for the permutations, which pays from some hundred stimuli on; numpy by default.
 

@@ -14,15 +14,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from brainbench.metrics._pairs import Floats, permuted_pairs
-from brainbench.metrics.bootstrap import bootstrap_score
-from brainbench.metrics.compare import compare
-from brainbench.metrics.rdm import rdm
-from brainbench.metrics.reliability import TrialBlock
+from brainbench.core.errors import UsageError
+from brainbench.core.progress import Progress
+from brainbench.metrics.inference.bootstrap import bootstrap_score
+from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.rdms.dissimilarity import rdm
+from brainbench.metrics.rdms.pairs import Floats, permuted_pairs
+from brainbench.metrics.reliability.split_half import TrialBlock
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 from brainbench.metrics.score import score_rdms
-from brainbench.metrics.subject import SubjectRDM, subject_rdm
-from brainbench.types import Progress
 
 SPLITS = (10, 30, 100, 300, 1000, 3000)
 DRAWS = (30, 100, 300, 1000, 3000)

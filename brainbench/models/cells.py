@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import torch
 from torch import nn
 
-from brainbench.errors import UsageError
-from brainbench.models._layers import Conv2d, pair
-from brainbench.models._tnn_state import load_named
+from brainbench.core.errors import UsageError
+from brainbench.models.graph.tnn_state import load_named
+from brainbench.models.ops.layers import Conv2d, pair
 
 if TYPE_CHECKING:
-    from brainbench.models._gpu.gates import GateTape
+    from brainbench.models.ops.gates import GateTape
 
 FORGET_BIAS = 1.0
 
@@ -188,7 +188,8 @@ class GatedCell(Cell):
     def project(self, x: torch.Tensor) -> Projected:
         """Return the input's share of the fused convolution, biases included, for inputs [N, C, H, W].
 
-        Nothing where kernels of our own join input and memory without a copy of either (:mod:`brainbench.models._gpu`).
+        Nothing where kernels of our own join input and memory without a copy of either
+        (:mod:`brainbench.models.ops.dispatch`).
         """
         if self.conv.joins(x):
             return ()
@@ -279,7 +280,7 @@ class IntersectionRNN(GatedCell):
         state = self._check(x, state)
         fused = self._fused(self.conv, x, state, projected[:1])
         if self.tape is not None or (not projected and self.conv.joins(x)):
-            from brainbench.models._gpu.gates import settle
+            from brainbench.models.ops.gates import settle
 
             return settle(self, fused, x, state)
         return self.settle(fused, x, state)

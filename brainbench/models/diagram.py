@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from brainbench.models.graph_spec import Convolution, Dense, Memory, Node
-from brainbench.types import GraphEdge, GraphNode, ModelGraph
+from brainbench.core.records import GraphEdge, GraphNode, ModelGraph
+from brainbench.models.graph.spec import Convolution, Dense, Memory, Node
 
 if TYPE_CHECKING:
     from torch import nn
 
-    from brainbench.models.graph import TemporalGraph
+    from brainbench.models.graph.temporal_graph import TemporalGraph
 
 _CELLS = {
     "time-decay": "time decay",
@@ -34,13 +34,13 @@ _BLOCKS = {
 
 
 def graph_of(module: nn.Module) -> ModelGraph | None:
-    """Return the graph of one of our networks (:class:`brainbench.models.ead.EAD`); None for any other module.
+    """Return the graph of one of our networks (:class:`brainbench.models.network.EAD`); None for any other module.
 
     Node names are the names of the layers, so that scores can be shown beside them. A node's shape is that
     of its output at one time step, without the batch.
     """
-    from brainbench.models.ead import EAD
-    from brainbench.models.graph import TemporalGraph
+    from brainbench.models.graph.temporal_graph import TemporalGraph
+    from brainbench.models.network import EAD
 
     if not isinstance(module, EAD):
         return None

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.errors import DataError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, missing_dependency, unknown_name
 
 if TYPE_CHECKING:
     import torch
@@ -48,7 +48,7 @@ def export_model(
     """Export a network's streaming step and check the exported file against the network.
 
     Args:
-        model: A network of :class:`~brainbench.models.ead.EAD`'s kind; exported in evaluation mode, on the CPU.
+        model: A network of :class:`~brainbench.models.network.EAD`'s kind; exported in evaluation mode, on the CPU.
         path: File to write; the suffix of the format is added when there is none.
         format: ``onnx`` or ``torch``.
         name: What the contract calls the network.
@@ -61,7 +61,7 @@ def export_model(
     """
     import copy
 
-    from brainbench.files import atomic_path, content_hash, provenance, write_json
+    from brainbench.core.files import atomic_path, content_hash, provenance, write_json
     from brainbench.models.streaming import StreamingStep
 
     if format not in SUFFIXES:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.errors import DataError, DataFileNotFoundError, listing
+from brainbench.core.errors import DataError, DataFileNotFoundError, listing
 
 if TYPE_CHECKING:
     import h5py
@@ -38,7 +38,7 @@ def write_features(path: str | Path, labels: Sequence[str], activations: Mapping
     """
     import h5py
 
-    from brainbench.files import atomic_path
+    from brainbench.core.files import atomic_path
 
     for layer, values in activations.items():
         _check_shape(layer, np.shape(values), len(labels), str(path))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from brainbench.types import CHANNELS
+from brainbench.core.contracts import CHANNELS
 
 FORCE_SCALE = 1e-4
 """N that become 1: the order of a whisker's base force in contact."""

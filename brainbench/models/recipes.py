@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from itertools import product
 
-from brainbench.errors import unknown_name
+from brainbench.core.errors import unknown_name
 
 SOURCE = "thesis, tables 3.2-3.5"
 EPOCHS = 100
@@ -28,9 +28,9 @@ class Setting:
     """One point of a search space."""
 
     optimizer: str
-    """A name of :data:`brainbench.models.optimizers.OPTIMIZERS`."""
+    """A name of :data:`brainbench.models.training.optimizers.OPTIMIZERS`."""
     schedule: str
-    """A name of :data:`brainbench.models.optimizers.SCHEDULES`."""
+    """A name of :data:`brainbench.models.training.optimizers.SCHEDULES`."""
     learning_rate: float
     """Initial (highest) learning rate."""
     warmup_epochs: int = 0

@@ -2,7 +2,7 @@
 
 A name is ``<encoder>[-<cell>][-ln][-small][+<attender>][.<tag>]``. Without a tag the model is untrained;
 its weights follow from the seed alone. ``local-dir:PATH`` and ``hf-hub:OWNER/NAME`` name a folder of trained
-weights (:mod:`~brainbench.models.checkpoints`). Other packages add models through the entry point group
+weights (:mod:`~brainbench.models.training.checkpoints`). Other packages add models through the entry point group
 ``brainbench.models``: an entry point names a module (or an object in it) whose import runs
 :func:`register_model`. Importing this module imports no framework.
 """
@@ -19,8 +19,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from brainbench.errors import UsageError, unknown_name
-from brainbench.models.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
 
 if TYPE_CHECKING:
     from torch import nn
@@ -176,7 +176,7 @@ def load_model(
     if folder is not None:
         config = read_config(folder)
         options, pretrained = {**config["options"], **options}, folder / WEIGHTS
-    from brainbench.models._seeding import seeded
+    from brainbench.models.ops.seeding import seeded
 
     with seeded(seed):
         model = _build(architecture, options)
@@ -193,7 +193,7 @@ def describe_model(name: str) -> ModelDescription:
     """
     import torch
 
-    from brainbench.models._seeding import seeded
+    from brainbench.models.ops.seeding import seeded
 
     folder = find_folder(name) if name.startswith(PREFIXES) else shipped().get(name)
     trained = read_config(folder) if folder is not None else None

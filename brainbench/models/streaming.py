@@ -14,12 +14,12 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.models.attenders.gpt import GPTAttender, GPTBlock
 from brainbench.models.attenders.mamba import MambaAttender, MambaMemory
-from brainbench.models.ead import EAD
 from brainbench.models.encoders.s4 import S4Encoder
-from brainbench.models.graph import GraphState, TemporalGraph
+from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
+from brainbench.models.network import EAD
 
 
 class StreamingStep(nn.Module):
@@ -39,7 +39,7 @@ class StreamingStep(nn.Module):
         super().__init__()
         if not isinstance(model, EAD):
             raise UsageError(
-                f"Streaming and export need an encoder-attender-decoder network (brainbench.models.ead.EAD); "
+                f"Streaming and export need an encoder-attender-decoder network (brainbench.models.network.EAD); "
                 f"received {type(model).__name__}."
             )
         self.model = model

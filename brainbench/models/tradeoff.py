@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from brainbench.errors import UsageError, unknown_name
-from brainbench.fidelity import TradeoffPoint
-from brainbench.models.ead import EAD
-from brainbench.models.graph import TemporalGraph
-from brainbench.models.graph_spec import UNROLLS, Unroll
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.tradeoffs import TradeoffPoint
+from brainbench.models.graph.spec import UNROLLS, Unroll
+from brainbench.models.graph.temporal_graph import TemporalGraph
+from brainbench.models.network import EAD
 from brainbench.models.registry import load_model
 
 PRECISIONS = ("float32", "bf16", "int8")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from brainbench.models.registry import register_model
 
 if TYPE_CHECKING:
-    from brainbench.models.ead import EAD
-    from brainbench.models.graph_spec import Unroll
+    from brainbench.models.graph.spec import Unroll
+    from brainbench.models.network import EAD
     from brainbench.models.parts import Attender, Encoder
 
 LICENCE = "MIT"
@@ -94,8 +94,8 @@ class Architecture:
         Raises:
             UsageError: an option does not exist or does not fit.
         """
-        from brainbench.models.decoders import make_decoder
-        from brainbench.models.ead import EAD
+        from brainbench.models.heads.decoders import make_decoder
+        from brainbench.models.network import EAD
 
         encoder = self._encoder()
         attender = self._attender(encoder.features)
@@ -112,7 +112,7 @@ class Architecture:
 
             return S4Encoder(small=self.small)
         from brainbench.models.encoders.zhuang import ZhuangEncoder
-        from brainbench.models.graph import TemporalGraph
+        from brainbench.models.graph.temporal_graph import TemporalGraph
 
         feedforward = self.cell == "-feedforward"
         cell = "time-decay" if feedforward else CELLS[self.cell][0]

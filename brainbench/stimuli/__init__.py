@@ -9,37 +9,37 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _LAZY = {
-    "Animal": "scene",
-    "Fidelity": "fidelity",
-    "Frames": "frames",
-    "Head": "scene",
-    "Path": "motion",
-    "PlacedObject": "objects",
-    "Recipe": "scene_files",
-    "Recorded": "trajectory",
-    "Scene": "scene",
-    "Solid": "objects",
-    "Spin": "motion",
-    "Still": "motion",
-    "Stimuli": "sets",
-    "SweepGrid": "sweep_grid",
-    "Translation": "motion",
-    "Whisker": "whisker",
-    "WhiskerArray": "morphology",
-    "Whisking": "motion",
-    "describe_recipe": "recipes",
-    "get_backend": "backends",
-    "get_recipe": "recipes",
-    "list_recipes": "recipes",
-    "load_scene": "scene_files",
-    "load_shapenet": "shapenet",
-    "load_stimuli": "sets",
-    "load_trajectory": "trajectory",
-    "read_stimulus_set": "storage",
+    "Animal": "scenes.scene",
+    "Fidelity": "engines.fidelity",
+    "Frames": "scenes.frames",
+    "Head": "scenes.scene",
+    "Path": "motion.trajectories",
+    "PlacedObject": "objects.placed_object",
+    "Recipe": "scenes.scene_files",
+    "Recorded": "motion.recorded",
+    "Scene": "scenes.scene",
+    "Solid": "objects.placed_object",
+    "Spin": "motion.trajectories",
+    "Still": "motion.trajectories",
+    "Stimuli": "sources",
+    "SweepGrid": "sweeps.grid",
+    "Translation": "motion.trajectories",
+    "Whisker": "whiskers.whisker",
+    "WhiskerArray": "whiskers.array",
+    "Whisking": "motion.trajectories",
+    "describe_recipe": "scenes.recipes",
+    "get_backend": "engines",
+    "get_recipe": "scenes.recipes",
+    "list_recipes": "scenes.recipes",
+    "load_scene": "scenes.scene_files",
+    "load_shapenet": "objects.shapenet",
+    "load_stimuli": "sources",
+    "load_trajectory": "motion.recorded",
+    "read_stimulus_set": "stimulus_set",
     "simulate": "simulation",
     "to_frame": "readout",
     "to_grid": "readout",
-    "write_stimulus_set": "storage",
+    "write_stimulus_set": "stimulus_set",
 }
 
 __all__ = [
@@ -77,23 +77,23 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.backends import get_backend
-    from brainbench.stimuli.fidelity import Fidelity
-    from brainbench.stimuli.frames import Frames
-    from brainbench.stimuli.morphology import WhiskerArray
-    from brainbench.stimuli.motion import Path, Spin, Still, Translation, Whisking
-    from brainbench.stimuli.objects import PlacedObject, Solid
+    from brainbench.stimuli.engines import get_backend
+    from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.motion.recorded import Recorded, load_trajectory
+    from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation, Whisking
+    from brainbench.stimuli.objects.placed_object import PlacedObject, Solid
+    from brainbench.stimuli.objects.shapenet import load_shapenet
     from brainbench.stimuli.readout import to_frame, to_grid
-    from brainbench.stimuli.recipes import describe_recipe, get_recipe, list_recipes
-    from brainbench.stimuli.scene import Animal, Head, Scene
-    from brainbench.stimuli.scene_files import Recipe, load_scene
-    from brainbench.stimuli.sets import Stimuli, load_stimuli
-    from brainbench.stimuli.shapenet import load_shapenet
+    from brainbench.stimuli.scenes.frames import Frames
+    from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, list_recipes
+    from brainbench.stimuli.scenes.scene import Animal, Head, Scene
+    from brainbench.stimuli.scenes.scene_files import Recipe, load_scene
     from brainbench.stimuli.simulation import simulate
-    from brainbench.stimuli.storage import read_stimulus_set, write_stimulus_set
-    from brainbench.stimuli.sweep_grid import SweepGrid
-    from brainbench.stimuli.trajectory import Recorded, load_trajectory
-    from brainbench.stimuli.whisker import Whisker
+    from brainbench.stimuli.sources import Stimuli, load_stimuli
+    from brainbench.stimuli.stimulus_set import read_stimulus_set, write_stimulus_set
+    from brainbench.stimuli.sweeps.grid import SweepGrid
+    from brainbench.stimuli.whiskers.array import WhiskerArray
+    from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 def __getattr__(name: str) -> Any:

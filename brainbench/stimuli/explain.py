@@ -13,16 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
-from brainbench.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.stimuli._plan import Plan
-    from brainbench.stimuli.backends.protocol import Trace
-    from brainbench.stimuli.fidelity import Fidelity
-    from brainbench.stimuli.objects import Solid
-    from brainbench.stimuli.scene import Scene
+    from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.job_schedule import Plan
+    from brainbench.stimuli.engines.protocol import Trace
+    from brainbench.stimuli.objects.placed_object import Solid
+    from brainbench.stimuli.scenes.scene import Scene
 
 ATTRIBUTE = "explanation"
 """Attribute of a stimulus set that holds the explanation as JSON."""
@@ -100,7 +100,7 @@ class Explanation:
 
     def to_attribute(self) -> str:
         """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""
-        from brainbench.files import to_json, to_plain
+        from brainbench.core.files import to_json, to_plain
 
         return to_json({key: item for key, item in to_plain(self).items() if key not in _PASSING}, indent=None)
 
@@ -151,7 +151,7 @@ def explain(
         traces: one per job of the plan.
         fidelity: links and time step.
     """
-    from brainbench.stimuli.chain import build_chain
+    from brainbench.stimuli.whiskers.chain import build_chain
 
     chains = {
         whisker: build_chain(whisker, fidelity.link_count(whisker.arc_length))

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from brainbench.errors import DataError, UsageError, listing, unknown_name
-from brainbench.files import content_hash
-from brainbench.stimuli.frames import Axes
-from brainbench.stimuli.storage import hash_stimulus_set
-from brainbench.types import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.files import content_hash
+from brainbench.stimuli.scenes.frames import Axes
+from brainbench.stimuli.stimulus_set import hash_stimulus_set
 
 if TYPE_CHECKING:
     import pandas as pd

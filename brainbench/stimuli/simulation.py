@@ -15,17 +15,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench import __version__
-from brainbench.errors import BrainbenchError, DataError, UsageError
-from brainbench.files import cache_dir, content_hash, to_json
-from brainbench.stimuli._plan import plan
-from brainbench.stimuli.backends import DEFAULT_BACKEND, get_backend
+from brainbench.core.contracts import CHANNELS, check_stimulus_set
+from brainbench.core.errors import BrainbenchError, DataError, UsageError
+from brainbench.core.files import cache_dir, content_hash, to_json
+from brainbench.core.progress import Progress
+from brainbench.stimuli.engines import DEFAULT_BACKEND, get_backend
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.job_schedule import plan
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.frames import clip_wrenches
 from brainbench.stimuli.readout import ORIENTATION, turn
-from brainbench.stimuli.scene import Scene
-from brainbench.stimuli.storage import hash_stimulus_set, read_stimulus_set, write_stimulus_set
-from brainbench.types import CHANNELS, Progress, check_stimulus_set
+from brainbench.stimuli.scenes.frames import clip_wrenches
+from brainbench.stimuli.scenes.scene import Scene
+from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set, write_stimulus_set
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from brainbench.stimuli.backends.protocol import Backend, Trace
+    from brainbench.stimuli.engines.protocol import Backend, Trace
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,10 +56,10 @@ def simulate(
         fidelity: how finely; a preset's name or a :class:`Fidelity`; ``balanced`` when None.
         backend: a backend's name, or any object that follows the backend protocol (never cached).
         progress: called as ``progress(done, total, what)`` after each simulated whisker.
-        cache: read and keep results under ``brainbench.files.cache_dir("stimuli")``.
+        cache: read and keep results under ``brainbench.core.files.cache_dir("stimuli")``.
 
     Returns:
-        The data set of :func:`brainbench.types.check_stimulus_set`: ``wrench`` [stimulus, time,
+        The data set of :func:`brainbench.core.contracts.check_stimulus_set`: ``wrench`` [stimulus, time,
         whisker, channel] (float32; N, N·m; action of the whisker on its base, about the base point,
         world axes or the follicle's, as the frames say) with ``contact`` [stimulus, time, whisker],
         ``contact_arc`` (m along the whisker, NaN without contact), ``first_contact`` (s, when the first

@@ -34,27 +34,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import BrainbenchError, DataError, missing_dependency, unknown_name
-from brainbench.fidelity import TradeoffPoint, pareto_front
-from brainbench.files import atomic_path, read_json, write_json, write_text
+from brainbench.core.errors import BrainbenchError, DataError, missing_dependency, unknown_name
+from brainbench.core.files import atomic_path, read_json, write_json, write_text
+from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
-from brainbench.stimuli._mesh_solids import touchable
-from brainbench.stimuli._tradeoff_figure import draw_bench, draw_collisions
-from brainbench.stimuli.backends import DEFAULT_BACKEND, get_backend
-from brainbench.stimuli.backends._reach import touched
-from brainbench.stimuli.backends.protocol import Job
-from brainbench.stimuli.fidelity import SOLVERS, Fidelity, list_presets
-from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.objects import PlacedObject, rodgers_solid
-from brainbench.stimuli.obstacle import Capsule, Obstacle
-from brainbench.stimuli.validation import peg, ringdown
+from brainbench.stimuli.engines import DEFAULT_BACKEND, get_backend
+from brainbench.stimuli.engines.fidelity import SOLVERS, Fidelity, list_presets
+from brainbench.stimuli.engines.protocol import Job
+from brainbench.stimuli.engines.reach import touched
+from brainbench.stimuli.figures.tradeoff import draw_bench, draw_collisions
+from brainbench.stimuli.objects.mesh_solids import touchable
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
+from brainbench.stimuli.objects.placed_object import PlacedObject, rodgers_solid
+from brainbench.stimuli.validation.bench_tests import peg, ringdown
+from brainbench.stimuli.whiskers.array import WhiskerArray
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from brainbench.stimuli.backends.protocol import Trace
-    from brainbench.stimuli.whisker import Whisker
-    from brainbench.types import Progress
+    from brainbench.core.progress import Progress
+    from brainbench.stimuli.engines.protocol import Trace
+    from brainbench.stimuli.whiskers.whisker import Whisker
 
 PROTOCOL = 3
 """Counts up when the experiments change, so that points of different experiments never share a table."""

@@ -24,11 +24,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
-from brainbench.files import write_text
-from brainbench.stimuli.morphology import MountedWhisker, WhiskerArray, published_whisker
-from brainbench.stimuli.selection import ROWS
-from brainbench.types import CHANNELS
+from brainbench.core.contracts import CHANNELS
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.files import write_text
+from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
+from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -163,7 +163,7 @@ def save_run(
     Raises:
         UsageError: the stimulus is unknown or not said, whiskers lack a side, or the shapes do not fit.
     """
-    from brainbench.types import check_stimulus_set
+    from brainbench.core.contracts import check_stimulus_set
 
     check_stimulus_set(dataset)
     if dialect not in DIALECTS:

@@ -122,7 +122,7 @@ the permutation p repeats the choice for every order of the six stimuli.""",
     ),
     (
         "code",
-        """from brainbench.scoring import score_record
+        """from brainbench.scoring.scores import score_record
 
 record = score_record("zhuang-intersection-ln-small", seed=0)
 record.score""",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robotics_bridge.envs._actions import ActionMap
+from robotics_bridge.envs.actions import ActionMap
 from robotics_bridge.envs.env import ENGINES, Env
 
 __all__ = ["ENGINES", "ActionMap", "Env"]

@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError, unknown_name
-from robotics_bridge._device import pick_device
-from robotics_bridge.envs._actions import ActionMap
-from robotics_bridge.envs._captured import Captured
-from robotics_bridge.envs._contacts import Contacts
-from robotics_bridge.envs._drives import Drives
-from robotics_bridge.envs._goal_state import GoalState
-from robotics_bridge.envs._observe import observe, shapes_of
-from robotics_bridge.envs._resets import Resets
-from robotics_bridge.envs._saved import restore, saved
-from robotics_bridge.envs._world import World
+from brainbench.core.devices import pick_device
+from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.envs.actions import ActionMap
+from robotics_bridge.envs.actuators import Drives
+from robotics_bridge.envs.checkpoint import restore, saved
+from robotics_bridge.envs.contacts import Contacts
+from robotics_bridge.envs.cuda_graphs import Captured
+from robotics_bridge.envs.goal_state import GoalState
+from robotics_bridge.envs.observations import observe, shapes_of
+from robotics_bridge.envs.reset import Resets
+from robotics_bridge.envs.simulation import World
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.tasks.moment import Moment
 from robotics_bridge.tasks.rotations import conjugate, from_xyzw, multiply, rotate
 from robotics_bridge.tasks.scenes import build
+from robotics_bridge.tasks.step_context import Moment
 
 if TYPE_CHECKING:
     import torch
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from robotics_bridge.envs.tactile import TactileLayout
     from robotics_bridge.hands import Hand
     from robotics_bridge.tasks.task import Task
-    from robotics_bridge.tasks.watch import Watch
+    from robotics_bridge.tasks.task_state import Watch
 
 ENGINES = ("mujoco", "warp")
 _WILD = 1e4

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError, missing_dependency
+from brainbench.core.errors import UsageError, missing_dependency
 
 try:
     import gymnasium

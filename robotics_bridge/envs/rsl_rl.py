@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from brainbench.errors import missing_dependency
+from brainbench.core.errors import missing_dependency
 
 if TYPE_CHECKING:
     import torch

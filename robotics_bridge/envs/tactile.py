@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotics_bridge._device import mujoco_module, warp
+from brainbench.core.devices import mujoco_module, warp
 from robotics_bridge.hands.observations import (
     PATCH_FORCE_SCALE,
     TAXELS_IN_CONTACT,

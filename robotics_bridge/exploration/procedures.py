@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from brainbench.errors import unknown_name
+from brainbench.core.errors import unknown_name
 
 
 @dataclass(frozen=True)

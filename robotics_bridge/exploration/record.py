@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench import __version__
-from brainbench.errors import UsageError
-from brainbench.files import content_hash, to_json
-from brainbench.models.ead import SUB_STEP_SECONDS, SUB_STEPS
-from brainbench.types import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError
+from brainbench.core.files import content_hash, to_json
+from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
-from robotics_bridge._device import mujoco_module
 from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
 from robotics_bridge.hands.observations import observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.physics.variants import compile_variants
-from robotics_bridge.policies._rays import FINGERS
-from robotics_bridge.policies.calibration import HandCalibration
-from robotics_bridge.policies.taxel_grid import SITES, TaxelGrid
+from robotics_bridge.policies.encoders.calibration import HandCalibration
+from robotics_bridge.policies.encoders.finger_axes import FINGERS
+from robotics_bridge.policies.encoders.taxel_grid import SITES, TaxelGrid
 from robotics_bridge.sensors import SensorSuite
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+    from brainbench.core.progress import Progress
     from brainbench.geometry import Mesh
-    from brainbench.types import Progress
 
 _STEPS = 2
 """Physics steps per frame."""

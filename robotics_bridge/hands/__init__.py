@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from brainbench.errors import unknown_name
+from brainbench.core.errors import unknown_name
 from robotics_bridge.hands.hand import Hand, from_file
 from robotics_bridge.hands.layouts import PLACEMENTS, RESOLUTIONS, active_count, read_probes, write_probes
 
@@ -26,8 +26,8 @@ def load(name_or_path: str | os.PathLike[str]) -> Hand:
         UsageError: there is no hand of this name.
         DataError: the file is missing or holds no hand.
     """
-    from robotics_bridge.hands._sharpa import sharpa
-    from robotics_bridge.hands._xhand1 import xhand1
+    from robotics_bridge.hands.sharpa import sharpa
+    from robotics_bridge.hands.xhand1 import xhand1
 
     own = {"sharpa": sharpa, "xhand1": xhand1}
     name = os.fspath(name_or_path)

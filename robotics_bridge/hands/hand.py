@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
-from robotics_bridge.hands._mujoco import engine
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, palm_side, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
 
@@ -117,7 +117,7 @@ class Hand:
         return Hand(self.name, self.palm, self.fingers, self.spec, self.path, {**self.probes, resolution: layout})
 
     def _cast(self, resolution: str, links: tuple[str, ...]) -> Layout:
-        from robotics_bridge.hands._surface import cast_grid, geoms_of
+        from robotics_bridge.hands.surface import cast_grid, geoms_of
 
         found: Layout = {}
         facing = palmar_directions(self.model, self.palm, self.fingers)
@@ -145,7 +145,7 @@ def read_mjspec(path: Path) -> Any:
         DataFileNotFoundError: the file is missing.
         DataError: MuJoCo cannot read it.
     """
-    mujoco = engine()
+    mujoco = mujoco_module()
 
     if not path.is_file():
         raise DataFileNotFoundError(f"There is no hand file {str(path)!r}.")
@@ -216,7 +216,7 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
     face as the next one towards the tip does. The palm faces where the finger tips go, along the nearest axis of
     its frame.
     """
-    mujoco = engine()
+    mujoco = mujoco_module()
 
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -245,7 +245,7 @@ def _flexed(
     model: Any, data: Any, body: int, following: np.ndarray | None, *, symmetric: bool = False
 ) -> np.ndarray | None:
     """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
-    from robotics_bridge.hands._surface import link_points
+    from robotics_bridge.hands.surface import link_points
 
     own = link_points(model, body)
     joint = _flexion(model, body)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import DataError, UsageError, unknown_name
-from brainbench.files import read_json, write_json
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.files import read_json, write_json
 from robotics_bridge.hands.spec import Box, Capsule, Grid, Link
-from robotics_bridge.sensors.placement import Probes
+from robotics_bridge.sensors.probes.placement import Probes
 
 if TYPE_CHECKING:
     import os

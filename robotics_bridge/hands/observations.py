@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from brainbench.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     import torch

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from robotics_bridge.hands._mujoco import engine
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError
 from robotics_bridge.hands.hand import Hand, palmar_directions
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def holding_spec(
     Raises:
         UsageError: the palm's side is unknown, or radius or mass are not positive.
     """
-    mujoco = engine()
+    mujoco = mujoco_module()
     if not (radius > 0 and mass > 0):
         raise UsageError(f"A ball has a positive radius (m) and mass (kg); received {radius!r} and {mass!r}.")
     facing = palmar_directions(hand.model, hand.palm, hand.fingers)
@@ -76,7 +76,7 @@ def holding_spec(
 
 def _raised(model: Any) -> Any:
     """Lift the ball of a model until it touches nothing: hulls of meshes reach above the palm they stand for."""
-    mujoco = engine()
+    mujoco = mujoco_module()
     ball, body = model.geom(OBJECT).id, model.body(OBJECT).id
     for _ in range(60):
         data = mujoco.MjData(model)
@@ -100,7 +100,7 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
 
 def _add_servos(spec: Any) -> None:
     """Give every hinge of a hand without drives, as URDF files are, a weak position servo."""
-    mujoco = engine()
+    mujoco = mujoco_module()
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             joint.armature = max(joint.armature, _ARMATURE)
@@ -113,7 +113,7 @@ def _add_servos(spec: Any) -> None:
 
 def _towards_fingers(hand: Hand, surface: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the step [3] (m, palm frame) along the palm from a point to the mean root of the fingers."""
-    mujoco = engine()
+    mujoco = mujoco_module()
     data = mujoco.MjData(hand.model)
     mujoco.mj_kinematics(hand.model, data)
     palm = hand.model.body(hand.palm).id

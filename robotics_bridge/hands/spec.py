@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from robotics_bridge.hands._mujoco import engine
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -184,7 +184,7 @@ def build(hand: HandSpec) -> Any:
     Raises:
         UsageError: the links form no tree.
     """
-    mujoco = engine()
+    mujoco = mujoco_module()
 
     spec = mujoco.MjSpec()
     spec.modelname = hand.name
@@ -224,7 +224,7 @@ def build(hand: HandSpec) -> Any:
 
 def _add_solids(body: Any, link: Link) -> None:
     """Attach the solids; each gets its share of the link's mass by volume."""
-    mujoco = engine()
+    mujoco = mujoco_module()
 
     volumes = np.array([_volume(solid) for solid in link.solids])
     if not link.solids:

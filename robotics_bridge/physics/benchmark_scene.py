@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robotics_bridge._device import mujoco_module
+from brainbench.core.devices import mujoco_module
 
 EDGE = 0.25
 """Edge of a box (m)."""

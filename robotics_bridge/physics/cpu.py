@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from robotics_bridge._device import mujoco_module
-from robotics_bridge.physics._fields import check_fields
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError
+from robotics_bridge.physics.model_fields import check_fields
 from robotics_bridge.physics.scene import Scene
 from robotics_bridge.physics.state import HandState
 

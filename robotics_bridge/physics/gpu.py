@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import MissingDependencyError, UsageError, unknown_name
-from robotics_bridge._device import pick_device, warp
-from robotics_bridge.physics._fields import check_fields, differing_fields
-from robotics_bridge.physics._state_kernels import mujoco_kernels
+from brainbench.core.devices import pick_device, warp
+from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
+from robotics_bridge.physics.kernels.state import mujoco_kernels
+from robotics_bridge.physics.model_fields import check_fields, differing_fields
 from robotics_bridge.physics.scene import Scene
 from robotics_bridge.physics.state import HandState
 

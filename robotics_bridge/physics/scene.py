@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError, unknown_name
-from robotics_bridge._device import mujoco_module
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

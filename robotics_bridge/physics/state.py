@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from robotics_bridge._device import pick_device, warp
+from brainbench.core.devices import pick_device, warp
+from brainbench.core.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -168,7 +168,7 @@ class HandState:
 
     def check(self) -> None:
         """Refresh :attr:`status`: which environments diverged, and whether contacts were lost."""
-        from robotics_bridge.physics._state_kernels import state_kernels
+        from robotics_bridge.physics.kernels.state import state_kernels
 
         kernels = state_kernels()
         inputs = [self.pose, self.velocity, self.contact_count, self.contact_env.shape[0], self.status]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from brainbench.errors import UsageError, unknown_name
-from robotics_bridge._device import mujoco_module
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import Geometry

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from brainbench.types import Interval
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Interval
 
 
 @dataclass(frozen=True)

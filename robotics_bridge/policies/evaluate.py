@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from brainbench.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     import torch

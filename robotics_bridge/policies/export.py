@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from brainbench.errors import DataError, missing_dependency, unknown_name
-from brainbench.files import atomic_path, provenance, write_json
-from brainbench.models.extract import evaluating
+from brainbench.core.errors import DataError, missing_dependency, unknown_name
+from brainbench.core.files import atomic_path, provenance, write_json
+from brainbench.models.activations import evaluating
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.errors import DataError, DataFileNotFoundError
-from brainbench.files import content_hash, provenance, read_json
-from brainbench.types import Interval, ModelCard, ResultRecord, Score, SubjectScore
-from robotics_bridge.policies.distill_config import DistillConfig
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.files import content_hash, provenance, read_json
+from brainbench.core.records import Interval, ModelCard, ResultRecord, Score, SubjectScore
+from robotics_bridge.policies.training.distill_config import DistillConfig
 
 EVALUATION, AGENTS = "evaluation.json", "agents.json"
 """Of a student; of the teacher and the agents that do nothing and anything, as ``policy evaluate --out`` writes it."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from brainbench.errors import unknown_name
-from brainbench.files import read_json
+from brainbench.core.errors import unknown_name
+from brainbench.core.files import read_json
 
 FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""

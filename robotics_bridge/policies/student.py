@@ -1,7 +1,8 @@
 """The network of a policy as a model class of rsl_rl: groups of observations → encoders → head → actions.
 
 Name it in a configuration as ``class_name="robotics_bridge.policies.student:TactilePolicy"``. Each flat group passes an
-encoder of its own, ``tactile`` [B, S, N, C] one of :mod:`~robotics_bridge.policies.encoders`; the head is a multilayer
+encoder of its own, ``tactile`` [B, S, N, C] one of :mod:`~robotics_bridge.policies.encoders.arms`; the head is a
+multilayer
 perceptron. All memory is one array [1, B, H], as rsl_rl stores it, and exports are complete: normalisers, taxel grid,
 encoder, head and memory. Letters: B batch, T time, H state, D latent, A action.
 """
@@ -18,8 +19,8 @@ from rsl_rl.models import MLPModel
 from rsl_rl.utils import unpad_trajectories
 from torch import nn
 
-from brainbench.errors import UsageError, unknown_name
-from robotics_bridge.policies.encoders import EncoderConfig, TactileEncoder
+from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.policies.encoders.arms import EncoderConfig, TactileEncoder
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -183,7 +184,8 @@ class TactilePolicy(MLPModel):
         activation: Of the head.
         obs_normalization: Normalise flat groups by their running mean and deviation.
         distribution_cfg: Of the actions' distribution, as rsl_rl takes it.
-        tactile: Fields of :class:`~robotics_bridge.policies.encoders.EncoderConfig`; needed when the set has touch.
+        tactile: Fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`; needed when the set has
+        touch.
         embedder: Encoder of flat groups: ``none``, ``mlp`` or ``lstm``.
 
     Raises:

@@ -11,9 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from brainbench.errors import UsageError, unknown_name
-from brainbench.fidelity import TradeoffPoint, cheapest
-from robotics_bridge.sensors._base import Sensor
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.tradeoffs import TradeoffPoint, cheapest
+from robotics_bridge.sensors.sensor import Sensor
 
 TABLE = Path(__file__).with_name("fidelity_table.json")
 """The measured settings that ship with the package."""
@@ -83,7 +83,7 @@ PRESETS: dict[str, Fidelity] = {
 
 @cache
 def _table() -> dict[str, Any]:
-    from brainbench.files import read_json
+    from brainbench.core.files import read_json
 
     return read_json(TABLE)
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError, unknown_name
-from robotics_bridge._device import pick_device, warp
+from brainbench.core.devices import pick_device, warp
+from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.state import DIVERGED, HandState
-from robotics_bridge.sensors._base import Clock, Context, History, Place, Runtime, Sensor
-from robotics_bridge.sensors._pair_kernels import begin_kernel
-from robotics_bridge.sensors._pairs import PairTable
-from robotics_bridge.sensors._solids import Solids
-from robotics_bridge.sensors.probes import DistanceRuntime
+from robotics_bridge.sensors.probes.sensors import DistanceRuntime
+from robotics_bridge.sensors.queries.kernels.pairs import begin_kernel
+from robotics_bridge.sensors.queries.pairs import PairTable
+from robotics_bridge.sensors.queries.solids import Solids
+from robotics_bridge.sensors.sensor import Clock, Context, History, Place, Runtime, Sensor
 
 if TYPE_CHECKING:
     import torch

@@ -22,23 +22,23 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from brainbench.files import write_json
+from brainbench.core.files import write_json
 from robotics_bridge.physics import Geometry, HandState, Scene
-from robotics_bridge.sensors._base import Sensor
-from robotics_bridge.sensors._clouds import surface_points
 from robotics_bridge.sensors.fidelity import Fidelity
-from robotics_bridge.sensors.kinematic import KinematicTaxel
-from robotics_bridge.sensors.placement import Probes
-from robotics_bridge.sensors.proximity import ProximityTaxel
+from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.sensors.queries.surface_points import surface_points
+from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.suite import SensorSuite
+from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
+from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from brainbench.core.progress import Progress
     from brainbench.geometry import Mesh
-    from brainbench.types import Progress
 
 RESOLUTIONS = (16, 32, 64, 128)
 POINTS = (250, 500, 1000, 2000, 4000, 16_000)
@@ -245,7 +245,7 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    from brainbench.errors import missing_dependency
+    from brainbench.core.errors import missing_dependency
 
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg

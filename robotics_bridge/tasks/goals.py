@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge.tasks.rotations import about, constant, multiply, tilted
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.envs.env import Env
-    from robotics_bridge.tasks.moment import Moment
+    from robotics_bridge.tasks.step_context import Moment
 
 SIDE, WALL, HEIGHT, TILT = 0.5, 0.0125, 0.25, math.radians(10)
 """Outer edge of the bin, thickness of its walls and floor, its height [m], and how far it leans about y [rad]."""
@@ -41,7 +41,7 @@ _SITES = tuple((0.13 * (i - 1), 0.13 * (j - 1), -0.13 * (i - 1) * math.sin(TILT)
 
 def bin_walls(spec: Any) -> None:
     """Add the tilted bin, its floor's middle at the origin."""
-    from robotics_bridge._device import mujoco_module
+    from brainbench.core.devices import mujoco_module
 
     mujoco = mujoco_module()
     body = spec.worldbody.add_body(name="bin", quat=(math.cos(TILT / 2), 0.0, math.sin(TILT / 2), 0.0))

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from brainbench.errors import UsageError
-from robotics_bridge._device import mujoco_module
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError
 
 GRAIN = 1e-4
 """Half size of the stand-in for a solid that a shape lacks [m]."""

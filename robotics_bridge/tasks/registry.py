@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 
-from brainbench.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.tasks.task import Task
 
 Maker = Callable[[], Task]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from robotics_bridge._device import mujoco_module
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError
 from robotics_bridge.hands.hand import Hand, palmar_directions
 from robotics_bridge.tasks.objects import Shape, add_object, slots, with_sizes
 

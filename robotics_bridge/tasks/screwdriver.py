@@ -2,7 +2,7 @@
 
 Values of ``published`` are those of the thesis (tables 4.4, 4.5, 4.7–4.9) and, where it is silent, of the settings
 released with it (neuroagents-lab/tactile-genesis). Episodes start from sampled grasps
-(:mod:`robotics_bridge.tasks.grasps`).
+(:mod:`robotics_bridge.envs.grasps`).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ POSES = {
 
 def table(spec: Any) -> None:
     """Add the plane on which the tip stands."""
-    from robotics_bridge._device import mujoco_module
+    from brainbench.core.devices import mujoco_module
 
     plane = mujoco_module().mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name="table", type=plane, size=(0.0, 0.0, 1.0))

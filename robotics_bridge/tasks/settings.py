@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from brainbench.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 
 SCHEDULES = ("adaptive", "fixed")
-BOUNDED = "robotics_bridge.policies._ppo:BoundedPPO"
+BOUNDED = "robotics_bridge.policies.training.bounded_ppo:BoundedPPO"
 """The algorithm of runs whose learning rate has other bounds than rsl_rl's."""
 _WIDEST = (1e-5, 1e-2)
 

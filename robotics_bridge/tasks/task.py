@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from brainbench.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, Shape
 from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
 
 if TYPE_CHECKING:
-    from robotics_bridge.tasks.watch import Watch
+    from robotics_bridge.tasks.task_state import Watch
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""

@@ -1,6 +1,7 @@
 """Reward terms and conditions that end an episode: small functions of one moment of all environments.
 
-A term takes a :class:`~robotics_bridge.tasks.moment.Moment` and its parameters and returns one number per environment
+A term takes a :class:`~robotics_bridge.tasks.step_context.Moment` and its parameters and returns one number per
+environment
 [B]. Weights are per second: the environment multiplies by its weight and by the time of a control step, as
 manager-based environments do. Formulas behind the names of table 4.8 are not published; those here are ours.
 
@@ -18,7 +19,7 @@ from robotics_bridge.tasks.rotations import constant, rotate
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.tasks.moment import Moment
+    from robotics_bridge.tasks.step_context import Moment
 
 
 def goal_reached(m: Moment) -> torch.Tensor:

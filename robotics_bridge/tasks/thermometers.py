@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from brainbench.errors import UsageError
-from robotics_bridge._device import warp
+from brainbench.core.devices import warp
+from brainbench.core.errors import UsageError
 from robotics_bridge.sensors import Body, SensorSuite, TemperatureGrid, ThermalMaterial
-from robotics_bridge.sensors.temperature import link_temperature
+from robotics_bridge.sensors.temperature.grid import link_temperature
 
 if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.envs.env import Env
-    from robotics_bridge.tasks.moment import Moment
+    from robotics_bridge.tasks.step_context import Moment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +175,7 @@ class Thermometers:
         """Advance latch and metric by a control step of dt (s)."""
         import torch
 
-        from robotics_bridge.envs._actuation_kernels import environment_kernels
+        from robotics_bridge.envs.kernels.actuation import environment_kernels
 
         wp, state = warp(), self._env.world.state
         self._touch.zero_()

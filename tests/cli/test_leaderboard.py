@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from brainbench.cli.leaderboard._scoring import find_models, parse_seeds, read_batch
-from brainbench.errors import DataError, UsageError
-from brainbench.types import ResultRecord
+from brainbench.cli.leaderboard.scoring import find_models, parse_seeds, read_batch
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.records import ResultRecord
 from leaderboards.store import read_record, record_name
 from tests.cli.test_commands import files  # noqa: F401 - a fixture
 
@@ -170,7 +170,7 @@ def test_patterns_mean_architectures_unless_they_have_a_dot():
 
 
 def test_a_pattern_with_a_dot_finds_the_trained_models_that_come_with_the_package(monkeypatch, tmp_path):
-    from brainbench.models import checkpoints
+    from brainbench.models.training import checkpoints
 
     monkeypatch.setattr(
         checkpoints, "shipped", lambda: {"s4-small.simclr": tmp_path, "zhuang-small.supervised": tmp_path}

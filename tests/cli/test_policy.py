@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brainbench.cli import app
-from brainbench.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError
 
 SMALL = """
 from dataclasses import replace

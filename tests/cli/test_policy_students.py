@@ -10,12 +10,12 @@ from tensordict import TensorDict
 from typer.testing import CliRunner
 
 from brainbench.cli import app
-from brainbench.errors import UsageError
-from brainbench.files import write_json
+from brainbench.core.errors import UsageError
+from brainbench.core.files import write_json
 from robotics_bridge import hands
-from robotics_bridge.policies.distill_config import DistillConfig
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.student import TactilePolicy
+from robotics_bridge.policies.training.distill_config import DistillConfig
 
 
 def _run(*arguments: object, code: int = 0) -> str:

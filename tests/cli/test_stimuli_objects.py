@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from brainbench.geometry import load_mesh
-from brainbench.stimuli import shapes
+from brainbench.stimuli.objects import procedural
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def cup(tmp_path):
 
 
 def test_the_families_are_listed(run):
-    assert json.loads(run("stimuli", "objects", "--json").out).keys() == set(shapes.list_families())
+    assert json.loads(run("stimuli", "objects", "--json").out).keys() == set(procedural.list_families())
     assert "family:NAME" in run("stimuli", "objects").out
 
 

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from brainbench.files import read_json
+from brainbench.core.files import read_json
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from brainbench.stimuli.generation.run import generate
-from tests.stimuli.generation.fakes import small_plan
+from brainbench.stimuli.sweeps.generation import generate
+from tests.factories.sweep_batches import small_plan
 
 
 @pytest.fixture(scope="module")

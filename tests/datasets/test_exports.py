@@ -3,12 +3,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import export, open_recordings, write_recordings
-from brainbench.errors import DataError, UsageError
-
-from .fakes import make_simple_session
-from .test_nwb import HUMAN, write_nwb
-from .test_rodgers import write_rodgers
+from tests.datasets.layouts.test_rodgers import write_rodgers
+from tests.datasets.test_nwb import HUMAN, write_nwb
+from tests.factories.recordings import make_simple_session
 
 
 def same(one, two):

@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brainbench.core.errors import DataError
 from brainbench.datasets import blocks, check, inspect, make_session, open_recordings, pooled, write_recordings
 from brainbench.datasets.sessions import Table
-from brainbench.datasets.synthetic import Design, Geometry, as_recordings, simulate
-from brainbench.errors import DataError
+from brainbench.datasets.synthetic.animals import Design, Geometry, as_recordings, simulate
 from brainbench.metrics import TrialBlock, subject_rdm
-
-from .fakes import make_simple_session
+from tests.factories.recordings import make_simple_session
 
 
 def make_geometry(stimuli):

@@ -3,10 +3,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
-from brainbench.errors import DataError, UsageError
-
-from .fakes import make_simple_session
+from tests.factories.recordings import make_simple_session
 
 
 def test_sessions_written_and_read_give_the_same_recordings(tmp_path):

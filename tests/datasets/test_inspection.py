@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from brainbench.datasets import inspect, open_recordings, write_recordings
-
-from .fakes import make_simple_session
-from .test_nwb import write_nwb
+from tests.datasets.test_nwb import write_nwb
+from tests.factories.recordings import make_simple_session
 
 
 def test_proposals_put_stimulus_like_columns_first_and_times_nowhere(tmp_path):

@@ -4,10 +4,10 @@ import h5py
 import numpy as np
 import pytest
 
+from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import blocks, inspect, make_session, open_recordings
-from brainbench.datasets._nwb_writer import NwbWriter
 from brainbench.datasets.nwb import read_nwb
-from brainbench.errors import DataError, UsageError
+from brainbench.datasets.synthetic.nwb_writer import NwbWriter
 
 HUMAN = "pynapple_sub-4_ses-4_ecephys+image.nwb"
 INTRACELLULAR = {

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.datasets import (
     Conditions,
     Recipe,
@@ -20,12 +21,10 @@ from brainbench.datasets import (
     register_recipe,
     write_recordings,
 )
-from brainbench.datasets.hires import recorded_runs
+from brainbench.datasets.layouts.hires import recorded_runs
 from brainbench.datasets.sessions import Series
-from brainbench.errors import DataError, MissingDependencyError, UsageError
-
-from .dandi_files import make_pole_task, write_area2, write_hires, write_yu
-from .fakes import make_simple_session
+from tests.factories.dandi_files import make_pole_task, write_area2, write_hires, write_yu
+from tests.factories.recordings import make_simple_session
 
 WRITERS = {"yu": write_yu, "hires": write_hires, "area2-bump": write_area2}
 
@@ -160,7 +159,7 @@ def my_recipe(name="my-lab", **changes):
 
 @pytest.fixture
 def registry(monkeypatch):
-    from brainbench.datasets import recipes
+    from brainbench.datasets.layouts import registry as recipes
 
     monkeypatch.setattr(recipes, "_RECIPES", dict(recipes._RECIPES))
 
@@ -223,7 +222,7 @@ def test_installed_packages_add_recipes_and_one_that_fails_takes_nothing_away(re
         "[brainbench.recordings]\nmine = their_recordings:ONE\nbroken = broken_recordings\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("brainbench.datasets.recipes._loaded", [])
+    monkeypatch.setattr("brainbench.datasets.layouts.registry._loaded", [])
     with caplog.at_level(logging.WARNING):
         names = list_recipes()
     assert {"their-one", "their-two", "rodgers"} <= set(names)

@@ -5,6 +5,8 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from brainbench.core.contracts import check_recordings
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.datasets import (
     Selection,
     Session,
@@ -15,11 +17,8 @@ from brainbench.datasets import (
     open_recordings,
     write_recordings,
 )
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.types import check_recordings
-
-from .fakes import make_simple_session
-from .test_nwb import write_nwb
+from tests.datasets.test_nwb import write_nwb
+from tests.factories.recordings import make_simple_session
 
 
 def export_to(path):

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets.sessions import Table, as_labels, decode, make_session, natural_key, natural_order
-from brainbench.errors import DataError, UsageError
 
 
 def test_numbers_become_the_text_a_person_would_write():

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from brainbench.errors import DataError, MissingDependencyError, UsageError
-from brainbench.files import cache_dir
-from brainbench.geometry import DecompositionSettings, Mesh, _decomposition, decompose
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError
+from brainbench.core.files import cache_dir
+from brainbench.geometry import DecompositionSettings, Mesh, decompose, decomposition
 
 
 def _angle_bracket(name="bracket"):
@@ -40,7 +40,7 @@ def test_pieces_are_closed_outward_and_where_the_mesh_is():
 
 
 def test_one_decomposition_serves_every_size_and_is_found_in_the_cache(bracket, monkeypatch):
-    monkeypatch.setattr(_decomposition, "_run", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(decomposition, "_run", lambda *_: pytest.fail("computed again"))
     again = decompose(_angle_bracket().scaled(0.04))
     assert again.cached
     assert again.deviation.largest == pytest.approx(0.04 * bracket.deviation.largest)
@@ -50,7 +50,7 @@ def test_one_decomposition_serves_every_size_and_is_found_in_the_cache(bracket, 
 
 def test_other_settings_are_another_result_but_other_limits_are_not(bracket, monkeypatch):
     calls = []
-    monkeypatch.setattr(_decomposition, "_run", lambda mesh, settings: calls.append(settings) or [mesh.vertices])
+    monkeypatch.setattr(decomposition, "_run", lambda mesh, settings: calls.append(settings) or [mesh.vertices])
     assert decompose(_angle_bracket(), DecompositionSettings(seconds=60, memory=1e9)).cached
     assert not decompose(_angle_bracket(), DecompositionSettings(threshold=0.5)).cached
     assert len(calls) == 1
@@ -58,7 +58,7 @@ def test_other_settings_are_another_result_but_other_limits_are_not(bracket, mon
 
 def test_a_damaged_cache_is_made_again(monkeypatch, caplog):
     mesh = Mesh(trimesh.creation.box().vertices, trimesh.creation.box().faces, "box")
-    monkeypatch.setattr(_decomposition, "_run", lambda mesh, settings: [mesh.vertices])
+    monkeypatch.setattr(decomposition, "_run", lambda mesh, settings: [mesh.vertices])
     before = set(cache_dir("collision").glob("*.npz"))
     decompose(mesh)
     (path,) = set(cache_dir("collision").glob("*.npz")) - before
@@ -81,7 +81,7 @@ def test_the_limit_of_memory_is_kept_in_words():
 def test_a_mesh_of_too_many_triangles_is_simplified_and_says_by_how_much(monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=4)
     seen = []
-    monkeypatch.setattr(_decomposition, "_run", lambda mesh, settings: seen.append(mesh) or [mesh.vertices])
+    monkeypatch.setattr(decomposition, "_run", lambda mesh, settings: seen.append(mesh) or [mesh.vertices])
     result = decompose(Mesh(ball.vertices, ball.faces), DecompositionSettings(most_faces=2500))
     assert len(seen[0].faces) <= 500
     assert result.notes[0].startswith("5,120 triangles were simplified to 500")
@@ -91,8 +91,8 @@ def test_a_mesh_of_too_many_triangles_is_simplified_and_says_by_how_much(monkeyp
 
 @pytest.mark.parametrize(("method", "package", "extra"), [("coacd", "coacd", "mesh"), ("vhacd", "pybullet", "bullet")])
 def test_a_missing_package_names_its_extra(monkeypatch, method, package, extra):
-    find = _decomposition.find_spec
-    monkeypatch.setattr(_decomposition, "find_spec", lambda name: None if name == package else find(name))
+    find = decomposition.find_spec
+    monkeypatch.setattr(decomposition, "find_spec", lambda name: None if name == package else find(name))
     with pytest.raises(MissingDependencyError, match=rf"brainbench\[{extra}\]"):
         decompose(_angle_bracket(), DecompositionSettings(method=method, most_faces=4000))
 

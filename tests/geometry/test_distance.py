@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brainbench.geometry import Mesh, deviation, hausdorff, winding_number
-from brainbench.geometry._distance import point_triangle_distance
+from brainbench.geometry.distance import point_triangle_distance
 
 
 def _mesh(solid):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.geometry import Mesh, load_mesh, save_mesh
 
 

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import pytest
 
-from brainbench.types import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
+from brainbench.core.records import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
 
 STIMULI = tuple(f"{shape}-{distance}" for shape in ("convex", "concave") for distance in ("close", "medium", "far"))
 MODEL_RDM = tuple((i * j + 1) / 31 for i, j in combinations(range(6), 2))

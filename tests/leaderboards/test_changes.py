@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from brainbench.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError, DataFileNotFoundError
 from leaderboards.changes import compare_builds, differences, open_build
 from leaderboards.store import read_records, write_record
 

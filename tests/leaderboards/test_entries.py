@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brainbench.types import SubjectScore
+from brainbench.core.records import SubjectScore
 from leaderboards.entries import entries_of, twins
 from leaderboards.ranking import rank
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from brainbench.types import Interval
+from brainbench.core.records import Interval
 from leaderboards.ranking import PAIRED_ANIMALS, rank, rank_ranges
 
 INTERVALS = st.lists(

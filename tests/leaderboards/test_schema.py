@@ -18,7 +18,7 @@ VALIDATOR = Draft202012Validator(record_schema())
 
 def test_published_schema_is_the_one_the_dataclasses_give():
     assert json.loads(SCHEMA_PATH.read_text(encoding="utf-8")) == record_schema(), (
-        "the dataclasses changed: rewrite the file with brainbench.files.write_json(SCHEMA_PATH, record_schema())"
+        "the dataclasses changed: rewrite the file with brainbench.core.files.write_json(SCHEMA_PATH, record_schema())"
     )
 
 

@@ -16,8 +16,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brainbench.errors import DataError, DataFileNotFoundError
-from brainbench.types import ResultRecord, Score, record_identity
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.records import ResultRecord, Score, record_identity
 from leaderboards.store import read_record, read_records, record_name, write_record
 
 

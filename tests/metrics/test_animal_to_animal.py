@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.metrics import (
     compare,
     noise_corrected,
@@ -17,8 +17,8 @@ from brainbench.metrics import (
     spearman_brown,
     subject_rdm,
 )
-from brainbench.metrics._pairs import permuted_pairs
-from tests.metrics.fakes import STIMULI, make_block, make_latent, make_rdm, make_subject
+from brainbench.metrics.rdms.pairs import permuted_pairs
+from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 
 def _make_animals(count, seed=0, noise=3.0, latent=None, splits=100):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from brainbench.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import (
     COMPARISONS,
     RDM_METHODS,
@@ -19,8 +19,8 @@ from brainbench.metrics import (
     rdm_problem,
     score_rdms,
 )
-from brainbench.metrics.precision import NOISE_METHODS
-from tests.metrics.fakes import STIMULI, make_rdm, make_subject
+from brainbench.metrics.rdms.precision import NOISE_METHODS
+from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
@@ -49,7 +49,7 @@ def test_rdms_of_trials_are_the_same(method, dtype, device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "poisson"])
 def test_rdms_of_wide_patterns_are_the_same_in_slices(method, device, monkeypatch):
-    monkeypatch.setattr("brainbench.metrics._distances._SLICE_ELEMENTS", 64)
+    monkeypatch.setattr("brainbench.metrics.rdms.distances._SLICE_ELEMENTS", 64)
     patterns = 1e4 + np.random.default_rng(1).gamma(2.0, size=(6, 301))
     patterns[2, 5] = np.nan
     expected = rdm(patterns, method=method)
@@ -103,7 +103,7 @@ def test_a_noise_covariance_by_name_needs_no_matrix_of_units_by_units():
 @pytest.mark.parametrize("method", COMPARISONS)
 @pytest.mark.parametrize("stimuli", [6, 10])
 def test_permutation_tests_are_the_same(method, stimuli, device, monkeypatch):
-    monkeypatch.setattr("brainbench.metrics.inference.RANDOM_PERMUTATIONS", 300)
+    monkeypatch.setattr("brainbench.metrics.inference.permutation.RANDOM_PERMUTATIONS", 300)
     rng = np.random.default_rng(6)
     model, brain = rdm(rng.normal(size=(stimuli, 9))), np.stack([rdm(rng.normal(size=(stimuli, 9))) for _ in range(4)])
     expected = permutation_test(model, brain, method=method)

@@ -9,7 +9,18 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    "module", ["rdm", "compare", "noise", "inference", "multiple", "equivalence", "procrustes", "nuisance", "decoding"]
+    "module",
+    [
+        "rdms.dissimilarity",
+        "rdms.comparison",
+        "reliability.noise_correction",
+        "inference.permutation",
+        "inference.multiple",
+        "inference.equivalence",
+        "measures.procrustes",
+        "measures.nuisance",
+        "measures.classifier",
+    ],
 )
 def test_the_examples_of_the_docstrings_hold(module):
     result = doctest.testmod(importlib.import_module(f"brainbench.metrics.{module}"))

@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.metrics import noise_corrected, score_rdms
 from brainbench.metrics.explain import (
     CORRECTED,
@@ -19,7 +19,7 @@ from brainbench.metrics.explain import (
     explain_score,
     explain_splits,
 )
-from tests.metrics.fakes import STIMULI, make_rdm, make_subject
+from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 
 @pytest.mark.shared

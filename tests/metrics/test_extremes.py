@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from brainbench.errors import DataError
+from brainbench.core.errors import DataError
 from brainbench.metrics import (
     TrialBlock,
     compare,
@@ -20,7 +20,7 @@ from brainbench.metrics import (
     score_rdms,
     subject_rdm,
 )
-from tests.metrics.fakes import STIMULI, make_block, make_latent, make_rdm, make_subject
+from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 LABELS = np.repeat(np.arange(6), 8)
 

@@ -8,7 +8,7 @@ from scipy import stats
 
 from brainbench.metrics import score_rdms
 from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
-from tests.metrics.fakes import STIMULI, make_rdm, make_subject
+from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 
 def test_each_animal_gets_the_layer_that_is_best_on_the_others():

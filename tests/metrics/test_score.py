@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Score
 from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm, score_rdms, subject_rdm
-from brainbench.metrics._animals import t_interval
-from brainbench.metrics._pairs import permuted_pairs
-from brainbench.types import Score
-from tests.metrics.fakes import STIMULI, make_block, make_latent, make_rdm, make_subject
+from brainbench.metrics.animals import t_interval
+from brainbench.metrics.rdms.pairs import permuted_pairs
+from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 
 def _make_animals(latent, count=6, noise=2.0, seed=100, splits=60):

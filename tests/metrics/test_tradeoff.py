@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.metrics.tradeoff import measure_tradeoff
 
 

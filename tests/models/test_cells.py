@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brainbench.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.models.cells import CELLS, GRU, LSTM, UGRNN, IntersectionRNN, TimeDecay
 
 GATED = [UGRNN, IntersectionRNN, GRU, LSTM]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from brainbench.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.models import export
 from brainbench.models.export import READERS, export_model
 from brainbench.models.registry import load_model

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
 
 NAMES = ["zhuang-small", "zhuang-intersection-ln-small", "zhuang-lstm-small+gpt", "resnet18-small+mamba", "s4-small"]

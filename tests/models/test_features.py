@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from brainbench.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.models.features import read_features, write_features
 
 

@@ -2,10 +2,10 @@ from collections import Counter
 
 import pytest
 
-from brainbench.errors import UsageError
-from brainbench.models.optimizers import OPTIMIZERS, SCHEDULES
+from brainbench.core.errors import UsageError
 from brainbench.models.recipes import find_recipe, list_recipes, recipe_for
 from brainbench.models.registry import OBJECTIVES, describe_model, list_models
+from brainbench.models.training.optimizers import OPTIMIZERS, SCHEDULES
 
 
 def test_there_are_as_many_recipes_as_published():

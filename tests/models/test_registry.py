@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.models import registry
 from brainbench.models.registry import describe_model, find_model, list_models, load_model, register_model
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from brainbench.models.checkpoints import CARD, WEIGHTS, read_config, shipped
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.batches import ArrayBatches
-from tests.models.training.fakes import sweeps
+from brainbench.models.training.checkpoints import CARD, WEIGHTS, read_config, shipped
+from tests.factories.training_sweeps import sweeps
 
 NAMES = sorted(shipped())
 COUNT = 12

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
 from brainbench.models.streaming import StreamingStep
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
 from brainbench.models.tradeoff import Reduced, Setting, measure, round_weights, settings
 

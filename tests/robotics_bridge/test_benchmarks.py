@@ -17,7 +17,7 @@ from robotics_bridge.physics import HandState
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import numpy as np, warp as wp
-from robotics_bridge._device import pick_device, warp
+from brainbench.core.devices import pick_device, warp
 
 @wp.kernel(module="unique")
 def add(x: wp.array(dtype=float), y: float):

@@ -5,24 +5,24 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from brainbench.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import simulation
-from brainbench.stimuli._plan import plan, reach_of
-from brainbench.stimuli.backends import _reach, mujoco
-from brainbench.stimuli.backends._mujoco_model import build_model
-from brainbench.stimuli.backends._reach import Reach
-from brainbench.stimuli.chain import build_chain
+from brainbench.stimuli.engines import reach as _reach
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.job_schedule import plan, reach_of
+from brainbench.stimuli.engines.mujoco import engine
+from brainbench.stimuli.engines.mujoco.model import build_model
+from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.explain import Explanation
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import Still, Translation
-from brainbench.stimuli.objects import PlacedObject, box, rodgers_solid, sphere
-from brainbench.stimuli.obstacle import Obstacle, TriangleMesh
-from brainbench.stimuli.recipes import get_recipe
-from brainbench.stimuli.scene import Frames, Scene
+from brainbench.stimuli.motion.trajectories import Still, Translation
+from brainbench.stimuli.objects.obstacle import Obstacle, TriangleMesh
+from brainbench.stimuli.objects.placed_object import PlacedObject, box, rodgers_solid, sphere
+from brainbench.stimuli.scenes.recipes import get_recipe
+from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
-
-from .fakes import FakeBackend
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from brainbench.stimuli.whiskers.chain import build_chain
+from tests.factories.engines import FakeBackend
 
 # The same step on every whisker, so that steps can be counted by hand.
 FAST = Fidelity(links=6, time_step=2e-4)
@@ -39,7 +39,7 @@ def _scene(label, *objects, **changes):
 @pytest.fixture
 def in_full(monkeypatch):
     """Make the engine simulate every whisker with every object, whether it can be reached or not."""
-    monkeypatch.setattr(mujoco, "reachable", lambda whisker, base, obstacles, times: Reach(obstacles, 0.0))
+    monkeypatch.setattr(engine, "reachable", lambda whisker, base, obstacles, times: Reach(obstacles, 0.0))
 
 
 def test_runs_are_counted_as_simulated_shared_or_silent():
@@ -55,7 +55,7 @@ def test_runs_are_counted_as_simulated_shared_or_silent():
 def test_whiskers_without_motion_or_object_are_silent_and_a_full_simulation_feels_nothing_either(in_full, monkeypatch):
     scene = _scene("far", FAR, NEAR, whisking=Still(), array=ARRAY.select("C1,D6"))
     full = simulate(scene, fidelity=FAST, backend="mujoco", cache=False)
-    monkeypatch.setattr(mujoco, "reachable", _reach.reachable)
+    monkeypatch.setattr(engine, "reachable", _reach.reachable)
     pruned = simulate(scene, fidelity=FAST, backend="mujoco", cache=False)
     told = Explanation.of(pruned)
     assert told.silent == 1
@@ -76,7 +76,7 @@ def test_whiskers_that_the_rodgers_solid_cannot_touch_feel_the_same_in_a_full_si
         label, scene.array.select(",".join(out)), scene.objects, scene.whisking, scene.head, Frames(0, 2e-3, 30)
     )
     full = simulate(short, fidelity=FAST, backend="mujoco", cache=False)
-    monkeypatch.setattr(mujoco, "reachable", _reach.reachable)
+    monkeypatch.setattr(engine, "reachable", _reach.reachable)
     pruned = simulate(short, fidelity=FAST, backend="mujoco", cache=False)
     assert not full["contact"].any()
     scale = np.abs(pruned["wrench"].values).max(axis=(0, 1, 2))

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from brainbench.errors import UsageError
-from brainbench.stimuli import validation
-from brainbench.stimuli.backends import get_backend
-from brainbench.stimuli.backends.protocol import Job, Load, StillFollicle
-from brainbench.stimuli.chain import build_chain
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.obstacle import Box, Capsule, Obstacle, Sphere
-from brainbench.stimuli.whisker import Whisker
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
+from brainbench.stimuli.validation import bench_tests
+from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 pytestmark = pytest.mark.slow
 
@@ -149,7 +149,7 @@ def test_two_pegs_at_once_share_the_load_as_beam_theory_says():
 
 
 def test_sixty_links_agree_with_the_elastica():
-    result = validation.peg(C2, 0.6 * C2.arc_length, 0.1 * C2.arc_length, fidelity=Fidelity(links=60, time_step=2e-4))
+    result = bench_tests.peg(C2, 0.6 * C2.arc_length, 0.1 * C2.arc_length, fidelity=Fidelity(links=60, time_step=2e-4))
     assert result.moment_error < 0.01
     assert result.force_error < 0.01
 

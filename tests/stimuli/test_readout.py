@@ -1,14 +1,13 @@
 import numpy as np
 import pytest
 
-from brainbench.errors import DataError, UsageError
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.morphology import WhiskerArray
+from brainbench.core.errors import DataError, UsageError
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.readout import to_frame, to_grid
-from brainbench.stimuli.scene import Frames, Scene
+from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
-
-from .fakes import FakeBackend
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.engines import FakeBackend
 
 
 def _dataset(whiskers="all", side="right", count=110, unstable=None):

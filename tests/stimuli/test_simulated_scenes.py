@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import Path, Still, Translation, Whisking, smooth_step
-from brainbench.stimuli.objects import PlacedObject, Solid, capsule, euler_matrix, sphere
-from brainbench.stimuli.obstacle import Capsule
-from brainbench.stimuli.recipes import get_recipe
-from brainbench.stimuli.scene import Frames, Head, Scene
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.motion.trajectories import Path, Still, Translation, Whisking, smooth_step
+from brainbench.stimuli.objects.obstacle import Capsule
+from brainbench.stimuli.objects.placed_object import PlacedObject, Solid, capsule, euler_matrix, sphere
+from brainbench.stimuli.scenes.recipes import get_recipe
+from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
+from brainbench.stimuli.whiskers.array import WhiskerArray
 
 # A straight C2 whose base frame lies on the array frame: it points along +x.
 STRAIGHT = WhiskerArray.mouse(whiskers="C2").replace(

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from brainbench.errors import UsageError
+from brainbench.core.contracts import check_stimulus_set
+from brainbench.core.errors import UsageError
 from brainbench.stimuli import simulation
-from brainbench.stimuli.backends.protocol import base_rotation
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.motion import ArrayFollicle, Still, Translation, Whisking
-from brainbench.stimuli.objects import PlacedObject, euler_matrix, sphere
-from brainbench.stimuli.scene import Frames, Head, Scene
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.motion.trajectories import ArrayFollicle, Still, Translation, Whisking
+from brainbench.stimuli.objects.placed_object import PlacedObject, euler_matrix, sphere
+from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
-from brainbench.types import check_stimulus_set
-
-from .fakes import FakeBackend
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.engines import FakeBackend
 
 ARRAY = WhiskerArray.mouse(whiskers="C1,C2,D6")
 FRAMES = Frames(0.0, 0.01, 10)

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from brainbench.errors import DataError, MissingDependencyError, UsageError
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.stimuli import tradeoff
-from brainbench.stimuli.fidelity import Fidelity
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.tradeoff import Setting
 
 

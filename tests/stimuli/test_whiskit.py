@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.stimuli.backends import get_backend
-from brainbench.stimuli.chain import build_chain
-from brainbench.stimuli.fidelity import Fidelity
-from brainbench.stimuli.morphology import WhiskerArray
-from brainbench.stimuli.objects import PlacedObject, sphere
-from brainbench.stimuli.scene import Frames, Scene
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.objects.placed_object import PlacedObject, sphere
+from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskit import bends, load_bends, load_parameters, save_parameters, save_run
 
 TABLES = ("param_name", "param_side_row_col", "param_s_a", "param_bp_pos", "param_bp_angles", "param_angles")

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, SelectOption, WindowOption, emit, progress_bar
+from brainbench.cli.output import JsonOption, SelectOption, WindowOption, emit, progress_bar
 
 if TYPE_CHECKING:
-    from brainbench.cli.leaderboard._scoring import Job
-    from brainbench.types import ResultRecord
+    from brainbench.cli.leaderboard.scoring import Job
+    from brainbench.core.records import ResultRecord
 
 
 def add(
@@ -49,8 +49,8 @@ def add(
     states other numbers for the same computation. Scores that are there already are not computed again, so an
     interrupted batch goes on where it stopped, and a stale one is renewed.
     """
-    from brainbench.cli.leaderboard._scoring import Job, find_models, parse_seeds, read_batch
-    from brainbench.errors import UsageError
+    from brainbench.cli.leaderboard.scoring import Job, find_models, parse_seeds, read_batch
+    from brainbench.core.errors import UsageError
 
     given = {"recordings": recordings, "stimuli": stimuli, "fidelity": fidelity, "whiskers": whiskers}
     given |= {"conditions": conditions, "select": select, "window": window}
@@ -80,7 +80,7 @@ def add(
 
 
 def _files(sources: list[Path]) -> list[Path]:
-    from brainbench.errors import DataFileNotFoundError
+    from brainbench.core.errors import DataFileNotFoundError
 
     found: list[Path] = []
     for source in sources:
@@ -98,7 +98,7 @@ def _take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, 
 
 
 def _take_in_one(path: Path, to: Path, present: dict[str, ResultRecord], *, keep_both: bool) -> dict[str, Any]:
-    from brainbench.errors import DataError
+    from brainbench.core.errors import DataError
     from leaderboards.audit import conflicting, remarks
     from leaderboards.store import read_records, write_record
 
@@ -148,8 +148,8 @@ def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
 
 
 def _score(jobs: list[Job], to: Path, *, prune: bool) -> list[dict[str, Any]]:
-    from brainbench.cli.leaderboard._scoring import missing
-    from brainbench.scoring import score_record
+    from brainbench.cli.leaderboard.scoring import missing
+    from brainbench.scoring.scores import score_record
     from leaderboards.store import write_record
 
     if not jobs:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit
 
 
 def build(
@@ -19,8 +19,8 @@ def build(
     as_json: JsonOption = False,
 ) -> None:
     """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
-    from brainbench.errors import DataFileNotFoundError
-    from leaderboards.site import build_leaderboard
+    from brainbench.core.errors import DataFileNotFoundError
+    from leaderboards.site.site import build_leaderboard
     from leaderboards.store import read_records
 
     sources = records or [Path("brainbench-results")]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, table
 
 
 def diff(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit
 
 
 def report(
@@ -23,7 +23,7 @@ def report(
 ) -> None:
     """Write a report of result records as Markdown, HTML or PDF, with the citations as BibTeX beside it."""
     from leaderboards.changes import open_build
-    from leaderboards.paper import write_paper
+    from leaderboards.report.paper import write_paper
 
     stored = [item for source in records or [Path("brainbench-results")] for item in open_build(source)]
     kind = format or (out.suffix.removeprefix(".") if out is not None and out.suffix else "html")

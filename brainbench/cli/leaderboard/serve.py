@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit
 
 
 def serve(
@@ -24,9 +24,9 @@ def serve(
     as_json: JsonOption = False,
 ) -> None:
     """Serve a leaderboard for local reading, without writing anything; stop it with Ctrl-C."""
-    from brainbench.errors import DataFileNotFoundError
-    from leaderboards.serve import LOOPBACK, make_server
-    from leaderboards.site import build_leaderboard
+    from brainbench.core.errors import DataFileNotFoundError
+    from leaderboards.site.serve import LOOPBACK, make_server
+    from leaderboards.site.site import build_leaderboard
     from leaderboards.store import read_records
 
     if not source.exists():

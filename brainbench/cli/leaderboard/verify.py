@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 
 def verify(
@@ -46,8 +46,8 @@ def verify(
 
 
 def _repeat(record: Any, recordings: str | None, tolerance: float) -> dict[str, Any]:
-    from brainbench.cli.leaderboard._scoring import score_again
-    from brainbench.errors import BrainbenchError
+    from brainbench.cli.leaderboard.scoring import score_again
+    from brainbench.core.errors import BrainbenchError
     from leaderboards.changes import differences
 
     try:

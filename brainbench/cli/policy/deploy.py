@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit
 
 if TYPE_CHECKING:
-    from robotics_bridge.policies.deploy.session import DeployedPolicy
+    from robotics_bridge.deploy.session import DeployedPolicy
 
 
 def deploy(
@@ -41,10 +41,10 @@ def deploy(
 
     Exit status 1: it was stopped for safety.
     """
-    from robotics_bridge.policies.deploy import session
-    from robotics_bridge.policies.deploy.realtime import realtime
-    from robotics_bridge.policies.deploy.sim_hand import Faults, simulated_hand
-    from robotics_bridge.policies.deploy.udp import UdpDriver
+    from robotics_bridge.deploy import session
+    from robotics_bridge.deploy.realtime import realtime
+    from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
+    from robotics_bridge.deploy.udp import UdpDriver
 
     deployed = session.read_deployed(policy)
     faults = Faults.parse(fault or [])
@@ -87,7 +87,7 @@ def deploy(
 
 
 def _remote(text: str, deployed: DeployedPolicy) -> tuple[tuple[str, int], tuple[str, ...], tuple[str, ...]]:
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
     from robotics_bridge import hands
 
     host, _, port = text.rpartition(":")
@@ -98,7 +98,7 @@ def _remote(text: str, deployed: DeployedPolicy) -> tuple[tuple[str, int], tuple
 
 
 def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
-    from robotics_bridge.policies.deploy.shadow import ShadowTouch
+    from robotics_bridge.deploy.shadow import ShadowTouch
 
     facts = deployed.deployment
     names = (str(facts[key]) for key in ("observe", "placement", "resolution"))
@@ -110,8 +110,8 @@ class _Tape:
 
     def __init__(self, deployed: DeployedPolicy) -> None:
         from robotics_bridge import hands
-        from robotics_bridge.policies._rays import rays_of
-        from robotics_bridge.policies.deploy.lerobot import Episode, TactilePoints
+        from robotics_bridge.deploy.episodes import Episode, TactilePoints
+        from robotics_bridge.policies.encoders.finger_axes import rays_of
 
         self.hand, self.rate = hands.load(deployed.hand), deployed.rate
         layout = self.hand.layout("med", "tips")
@@ -131,7 +131,7 @@ class _Tape:
     def __call__(self, reading: Any, obs: Any, action: Any, targets: Any) -> None:
         import numpy as np
 
-        from robotics_bridge.policies.deploy.lerobot import total_wrench
+        from robotics_bridge.deploy.episodes import total_wrench
 
         del obs, action
         # The maker's pressure is about outward normals with axes z, y, x; a force on the skin points inward.
@@ -143,7 +143,7 @@ class _Tape:
 
     def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
         """Write the data set."""
-        from robotics_bridge.policies.deploy.lerobot import write_lerobot
+        from robotics_bridge.deploy.episodes import write_lerobot
 
         return write_lerobot(
             folder, [self.episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name

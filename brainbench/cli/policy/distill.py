@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar
-from brainbench.cli.policy._options import (
+from brainbench.cli.output import JsonOption, emit, progress_bar
+from brainbench.cli.policy.options import (
     DeviceOption,
     HandOption,
     NoisyOption,
@@ -55,9 +55,9 @@ def distill(
     as_json: JsonOption = False,
 ) -> None:
     """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
-    from robotics_bridge.policies.distill_config import DistillConfig
-    from robotics_bridge.policies.encoders import ARMS, AUTO
-    from robotics_bridge.policies.students import train_student
+    from robotics_bridge.policies.encoders.arms import ARMS, AUTO
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+    from robotics_bridge.policies.training.students import train_student
 
     settings: dict[str, Any] = {}
     if encoder not in (AUTO, *ARMS):

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
-from brainbench.cli.policy._options import (
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.policy.options import (
     ConfigOption,
     DeviceOption,
     EnvsOption,
@@ -43,8 +43,8 @@ def evaluate(
     touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
     task) ended.
     """
-    from brainbench.errors import UsageError
-    from brainbench.files import write_json
+    from brainbench.core.errors import UsageError
+    from brainbench.core.files import write_json
     from robotics_bridge.policies.evaluate import evaluate as run
 
     if seeds < 1:

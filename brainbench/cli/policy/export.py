@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit
 
 
 def export(
@@ -19,8 +19,8 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a student with normalisers, taxel grid, encoder and head in one file, and compare it step by step."""
-    from robotics_bridge.policies.distill import load_student
     from robotics_bridge.policies.export import STEPS, SUFFIXES, export_policy
+    from robotics_bridge.policies.training.distill import load_student
 
     student, described = load_student(run)
     suffix = SUFFIXES.get(format, "")

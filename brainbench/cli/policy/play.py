@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
-from brainbench.cli.policy._options import (
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.policy.options import (
     ConfigOption,
     DeviceOption,
     HandOption,
@@ -47,7 +47,7 @@ def play(
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
     import math
 
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
 
     if not (seconds > 0 and math.isfinite(seconds) and rate > 0 and width >= 64):
         raise UsageError(
@@ -64,7 +64,7 @@ def play(
     rewards: list[float] = []
     ended = 0
     with progress_bar() as progress:
-        from brainbench.cli.policy import _picture
+        from brainbench.cli.policy import pictures as _picture
 
         size = (width, round(width * 5 / 6))
         stage = _picture.Stage(env, size) if pictures else None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -85,7 +85,7 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
     """Return the differences of all pairs of each task and hand, best students first."""
     from itertools import combinations, groupby
 
-    from brainbench.metrics.multiple import adjust
+    from brainbench.metrics.inference.multiple import adjust
     from robotics_bridge.policies.contrasts import contrast, pooled_spread
 
     found = []

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
-from brainbench.cli.policy._options import DeviceOption
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.policy.options import DeviceOption
 
 
 def sweep(
@@ -28,8 +28,8 @@ def sweep(
     from dataclasses import replace
 
     from robotics_bridge.policies.report import EVALUATION
-    from robotics_bridge.policies.students import train_student
-    from robotics_bridge.policies.sweep import PUBLISHED, read_sweep
+    from robotics_bridge.policies.training.students import train_student
+    from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
 
     found = read_sweep(file or PUBLISHED)
     if count:
@@ -60,7 +60,7 @@ def sweep(
 
 
 def _shard(text: str) -> tuple[int, int]:
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
 
     part, slash, parts = text.partition("/")
     if not (slash and part.isdigit() and parts.isdigit() and 0 <= int(part) < int(parts)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, table
 
 
 def list_tasks(as_json: JsonOption = False) -> None:

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
-from brainbench.cli.policy._options import (
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.policy.options import (
     ConfigOption,
     DeviceOption,
     HandOption,
@@ -56,8 +56,8 @@ def train(
     from dataclasses import replace
 
     from robotics_bridge import tasks
-    from robotics_bridge.policies import teacher
-    from robotics_bridge.tasks.changes import changed
+    from robotics_bridge.policies.training import teacher
+    from robotics_bridge.tasks.overrides import changed
 
     count = envs or (8192 if device != "cpu" else 64)
     if task_file is not None:

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar
-from brainbench.cli.stimuli._options import (
+from brainbench.cli.output import JsonOption, emit, progress_bar
+from brainbench.cli.stimuli.options import (
     BackendOption,
     FidelityOption,
     StimulusOption,
@@ -17,8 +17,8 @@ from brainbench.cli.stimuli._options import (
     numbers,
     open_recipe,
 )
-from brainbench.errors import UsageError
-from brainbench.stimuli.backends import DEFAULT_BACKEND
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import DEFAULT_BACKEND
 
 
 def render(
@@ -51,9 +51,9 @@ def render(
     as_json: JsonOption = False,
 ) -> None:
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
-    from brainbench.stimuli import render as drawing
-    from brainbench.stimuli._figure import check_format
-    from brainbench.stimuli.camera import Camera
+    from brainbench.stimuli.figures import scenes as drawing
+    from brainbench.stimuli.figures.camera import Camera
+    from brainbench.stimuli.figures.canvas import check_format
 
     suffix = check_format(out, drawing.FORMATS)
     scene = choose_scene(open_recipe(source, whiskers), stimulus)
@@ -118,9 +118,9 @@ def plot(
     import math
 
     from brainbench.stimuli import load_stimuli
-    from brainbench.stimuli._figure import check_format
-    from brainbench.stimuli.plot import FORMATS, check_channel
-    from brainbench.stimuli.plot import plot as draw
+    from brainbench.stimuli.figures.canvas import check_format
+    from brainbench.stimuli.figures.traces import FORMATS, check_channel
+    from brainbench.stimuli.figures.traces import plot as draw
 
     check_format(out, FORMATS)
     check_channel(channel)
@@ -143,13 +143,13 @@ def plot(
 
 
 def _instant(scene: Any, at: float | None) -> float:
-    from brainbench.stimuli.render import still_time
+    from brainbench.stimuli.figures.scenes import still_time
 
     return still_time(scene) if at is None else at * 1e-3
 
 
 def _film(scene: Any, at: float | None, start: float, stop: float | None, step: float) -> list[float]:
-    from brainbench.stimuli.render import film_times
+    from brainbench.stimuli.figures.scenes import film_times
 
     if at is not None:
         raise UsageError("--at chooses the instant of a .png; a film takes --start, --stop and --step.")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 if TYPE_CHECKING:
     from robotics_bridge.exploration.record import Explored
@@ -45,9 +45,9 @@ def hand(
     """
     import numpy as np
 
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
     from brainbench.stimuli import write_stimulus_set
-    from brainbench.stimuli.storage import hash_stimulus_set
+    from brainbench.stimuli.stimulus_set import hash_stimulus_set
     from robotics_bridge.exploration.procedures import PROCEDURES
     from robotics_bridge.exploration.record import record_exploration
 
@@ -93,9 +93,9 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
     """
     import math
 
-    from brainbench.stimuli.collections import resolve_objects
-    from brainbench.stimuli.objects import rodgers_solid
-    from brainbench.stimuli.recipes import get_recipe
+    from brainbench.stimuli.objects.collections import resolve_objects
+    from brainbench.stimuli.objects.placed_object import rodgers_solid
+    from brainbench.stimuli.scenes.recipes import get_recipe
     from robotics_bridge.exploration.record import Explored
     from robotics_bridge.physics import Geometry
 

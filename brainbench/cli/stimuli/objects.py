@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, table
 
 if TYPE_CHECKING:
     from brainbench.geometry import DecompositionSettings, Mesh
@@ -40,7 +40,7 @@ def objects(
     as_json: JsonOption = False,
 ) -> None:
     """List the shape families, or describe one object: its size, its faults, and what whiskers touch of it."""
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
     from brainbench.geometry import DecompositionSettings
 
     settings = DecompositionSettings(method=method, threshold=threshold)  # type: ignore[arg-type]
@@ -64,9 +64,9 @@ def objects(
 
 
 def _families() -> tuple[dict[str, Any], str]:
-    from brainbench.stimuli import shapes
+    from brainbench.stimuli.objects import procedural
 
-    data = {family: shapes.describe_family(family) for family in shapes.list_families()}
+    data = {family: procedural.describe_family(family) for family in procedural.list_families()}
     hint = (
         '\n\nin scene files: shape = "family:NAME", seed, diagonal_mm; one in detail: brainbench stimuli objects NAME'
     )
@@ -74,7 +74,7 @@ def _families() -> tuple[dict[str, Any], str]:
 
 
 def _folder(source: str, ids: Path | None, categories: Path | None) -> tuple[dict[str, Any], str]:
-    from brainbench.stimuli.shapenet import load_shapenet
+    from brainbench.stimuli.objects.shapenet import load_shapenet
 
     found = load_shapenet(source, ids=ids, categories=categories)
     data = {"models": len(found), "labels": found.counts, "missing": list(found.missing)}
@@ -90,17 +90,17 @@ def _member(
     collision: str | None,
     settings: DecompositionSettings,
 ) -> tuple[dict[str, Any], Solid]:
-    from brainbench.errors import unknown_name
-    from brainbench.stimuli import shapes
-    from brainbench.stimuli.objects import shape_solid
+    from brainbench.core.errors import unknown_name
+    from brainbench.stimuli.objects import procedural
+    from brainbench.stimuli.objects.placed_object import shape_solid
 
     family = name.removeprefix("family:")
-    if family not in shapes.list_families():
+    if family not in procedural.list_families():
         hint = "Or the path of a mesh file or of a ShapeNet folder."
-        raise unknown_name("object", name, shapes.list_families(), hint=hint)
-    shape = shapes.make(family, seed, detail=detail)
+        raise unknown_name("object", name, procedural.list_families(), hint=hint)
+    shape = procedural.make(family, seed, detail=detail)
     solid = shape_solid(shape, diagonal=diagonal or 0.04, collision=collision, decomposition=settings)
-    about = {"family": family, "description": shapes.describe_family(family), "seed": seed}
+    about = {"family": family, "description": procedural.describe_family(family), "seed": seed}
     mesh = solid.mesh or shape.mesh
     return {**about, "parameters": dict(shape.parameters), **_measures(mesh, solid)}, solid
 
@@ -108,9 +108,9 @@ def _member(
 def _file(
     source: str, unit: str | None, diagonal: float | None, collision: str, settings: DecompositionSettings
 ) -> tuple[dict[str, Any], Solid]:
-    from brainbench.errors import UsageError
+    from brainbench.core.errors import UsageError
     from brainbench.geometry import UNITS, load_mesh
-    from brainbench.stimuli.objects import mesh_solid
+    from brainbench.stimuli.objects.placed_object import mesh_solid
 
     if unit is None:
         raise UsageError(f"Mesh files carry no unit; say what the numbers in {source!r} are: --unit {'|'.join(UNITS)}.")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 
 def separability(
@@ -22,9 +22,9 @@ def separability(
     as_json: JsonOption = False,
 ) -> None:
     """Train support vector machines on 2, 3 and 4 classes; print their accuracy on new objects against chance."""
-    from brainbench.cli.stimuli._options import whole_numbers
-    from brainbench.datasets.separability import separability as measure
-    from brainbench.datasets.whisking import WhiskingDataset
+    from brainbench.cli.stimuli.options import whole_numbers
+    from brainbench.datasets.whisking.dataset import WhiskingDataset
+    from brainbench.datasets.whisking.separability import separability as measure
 
     data = WhiskingDataset(folder, split=split, view="raw")
     names = None if classes is None else [name.strip() for name in classes.split(",")]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, table
-from brainbench.cli.stimuli._options import StimulusOption, choose_scene, open_recipe
+from brainbench.cli.output import JsonOption, emit, table
+from brainbench.cli.stimuli.options import StimulusOption, choose_scene, open_recipe
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -65,7 +65,7 @@ def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:
 def _of_file(dataset: xr.Dataset, stimulus: str | None) -> dict[str, Any]:
     import json
 
-    from brainbench.errors import unknown_name
+    from brainbench.core.errors import unknown_name
 
     scenes = json.loads(dataset.attrs["scene"])
     labels = [scene["label"] for scene in scenes]

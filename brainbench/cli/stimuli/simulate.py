@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
-from brainbench.cli.stimuli._options import BackendOption, FidelityOption, WhiskersOption
-from brainbench.errors import UsageError
-from brainbench.stimuli.backends import DEFAULT_BACKEND
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.stimuli.options import BackendOption, FidelityOption, WhiskersOption
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import DEFAULT_BACKEND
 
 
 def simulate(

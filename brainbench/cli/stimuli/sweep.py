@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
-from brainbench.cli.stimuli._options import BackendOption, FidelityOption, WhiskersOption
-from brainbench.errors import UsageError, unknown_name
-from brainbench.stimuli.backends import DEFAULT_BACKEND
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.stimuli.options import BackendOption, FidelityOption, WhiskersOption
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.stimuli.engines import DEFAULT_BACKEND
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.generation.plan import GenerationPlan
+    from brainbench.stimuli.sweeps.plan import GenerationPlan
 
 _SHOWN = 8
 
@@ -64,9 +64,9 @@ def sweep(
     A run that was interrupted or killed goes on where it stopped when the same command is given again.
     """
     from brainbench.stimuli import Fidelity, get_backend
-    from brainbench.stimuli.collections import resolve_objects
-    from brainbench.stimuli.generation.plan import GenerationPlan, Settings
-    from brainbench.stimuli.sweeps import GRIDS, SweepScenes, counts
+    from brainbench.stimuli.objects.collections import resolve_objects
+    from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+    from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes, counts
 
     if grid not in GRIDS:
         raise unknown_name("sweep grid", grid, GRIDS)
@@ -130,7 +130,7 @@ def _generate(
     plan: GenerationPlan, out: Path, workers: int | None, scheduler: str | None
 ) -> tuple[dict[str, Any], str]:
     """Make the data set; return what --json says of it and what people read."""
-    from brainbench.stimuli.generation.run import generate
+    from brainbench.stimuli.sweeps.generation import generate
 
     started = time.perf_counter()
     with progress_bar() as progress:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 
 def bench(
@@ -23,19 +23,21 @@ def bench(
 
     The benchmark against peers and rooflines is benchmarks/tactile.py in the repository.
     """
-    from brainbench.cli.tactile import _scene
-    from brainbench.errors import UsageError
+    from brainbench.cli.tactile import grip_scene
+    from brainbench.core.errors import UsageError
 
     if envs < 1 or repeats < 1:
         raise UsageError(f"--envs and --repeats are at least 1; received {envs} and {repeats}.")
     rows, results = [], []
     with progress_bar() as progress:
-        grip = _scene.Grip(hand, envs=envs, device=device)
+        grip = grip_scene.Grip(hand, envs=envs, device=device)
         grip.run(60)
-        names = list(_scene.CLASSES)
+        names = list(grip_scene.CLASSES)
         for index, name in enumerate(names):
             progress(index, len(names), "timing sensors")
-            result: dict[str, Any] = _scene.time_class(grip, name, resolution, placement, noisy=noisy, repeats=repeats)
+            result: dict[str, Any] = grip_scene.time_class(
+                grip, name, resolution, placement, noisy=noisy, repeats=repeats
+            )
             results.append(result)
             rows.append(
                 [name, str(result["probes"]), f"{1e3 * result['seconds']:.3f}", f"{result['per_probe_ns']:.1f}",

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, table
 
 
 def calibrate(
@@ -22,9 +22,9 @@ def calibrate(
     'reference' holds the true signal in the sensor's unit (a load cell, a stage); without it the device was at rest.
     Load the preset with robotics_bridge.sensors.Noise.load(path).
     """
-    from brainbench.errors import UsageError
-    from robotics_bridge.sensors.calibrate import calibrate as fit
-    from robotics_bridge.sensors.calibrate import describe, read_log
+    from brainbench.core.errors import UsageError
+    from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
+    from robotics_bridge.sensors.calibration.calibrate import describe, read_log
 
     if not max_delay >= 0:
         raise UsageError(f"--max-delay is zero or positive (s); received {max_delay:g}.")

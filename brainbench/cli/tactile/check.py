@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 
 def check(
@@ -14,7 +14,7 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Compare sensors with closed forms on this machine; exit status 1 if one is off."""
-    from brainbench.cli.tactile._checks import CHECKS
+    from brainbench.cli.tactile.checks import CHECKS
 
     rows, results = [], []
     with progress_bar() as progress:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli._shared import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
 
 
 def demo(
@@ -22,13 +22,13 @@ def demo(
     Four pictures: forces on the taxels, marker motion of an elastomer, temperature of the finger tips, and the sound
     of a ball on wood, metal and glass.
     """
-    from brainbench.cli.tactile import _demo
+    from brainbench.cli.tactile import demo_scenes
 
     jobs = {
-        "forces": lambda path: _demo.forces(path, hand, resolution, noisy=noisy),
-        "markers": lambda path: _demo.markers(path, noisy=noisy),
-        "temperature": lambda path: _demo.temperature(path, hand),
-        "sound": _demo.sound,
+        "forces": lambda path: demo_scenes.forces(path, hand, resolution, noisy=noisy),
+        "markers": lambda path: demo_scenes.markers(path, noisy=noisy),
+        "temperature": lambda path: demo_scenes.temperature(path, hand),
+        "sound": demo_scenes.sound,
     }
     made: dict[str, Any] = {}
     rows = []

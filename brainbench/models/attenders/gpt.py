@@ -15,8 +15,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.errors import UsageError
-from brainbench.models._layers import Linear
+from brainbench.core.errors import UsageError
+from brainbench.models.ops.layers import Linear
 from brainbench.models.parts import wanted
 
 # GPT-2 draws weights with standard deviation 0.02 at any width; gain/√fan_in is its width-aware form

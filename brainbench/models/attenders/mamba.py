@@ -16,9 +16,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.errors import UsageError
-from brainbench.models._layers import Linear
-from brainbench.models._scan import linear_scan
+from brainbench.core.errors import UsageError
+from brainbench.models.ops.layers import Linear
+from brainbench.models.ops.linear_scan import linear_scan
 from brainbench.models.parts import wanted
 
 _STEP_RANGE = (1e-3, 1e-1)

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.errors import UsageError
-from brainbench.models._layers import RECTIFIER_GAIN, Conv2d, Linear
+from brainbench.core.errors import UsageError
 from brainbench.models.encoders.zhuang import INPUT_SHAPE, small_width
+from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear
 from brainbench.models.parts import wanted
 
 _WIDTHS = (64, 128, 256, 512)

@@ -14,10 +14,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.errors import UsageError
-from brainbench.models._layers import RECTIFIER_GAIN, Linear
-from brainbench.models._state_space import StateSpace, System
+from brainbench.core.errors import UsageError
 from brainbench.models.encoders.zhuang import INPUT_SHAPE, small_width
+from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear
+from brainbench.models.ops.state_space import StateSpace, System
 from brainbench.models.parts import wanted
 
 S4State = tuple[tuple[torch.Tensor, System], ...]

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from brainbench.models.graph_spec import Convolution, Dense, Edge, GraphSpec, Memory, Node
+from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node
 
 INPUT_SHAPE = (30, 5, 7)
 """Five sub-steps of six channels (sub-step-major) on the whisker grid."""

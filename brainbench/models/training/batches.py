@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 
 
 class Batches(Protocol):

@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from brainbench.files import provenance, to_plain
-from brainbench.models.evaluation import Evaluation
+from brainbench.core.files import provenance, to_plain
 from brainbench.models.registry import describe_model
 from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.evaluation import Evaluation
 
 _START = "| start | biases drawn as PyTorch does: layer norm of silence has a slope of 316, step after step |"
 
@@ -25,7 +25,7 @@ def checkpoint_info(
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
-    ``drawn_biases`` is what :func:`~brainbench.models.training.start.draw_silent_biases` returned.
+    ``drawn_biases`` is what :func:`~brainbench.models.training.initial_state.draw_silent_biases` returned.
     """
     return {
         "objective": config.objective,

@@ -9,9 +9,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
-from brainbench.models.checkpoints import DTYPES
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, Setting, recipe_for
+from brainbench.models.training.checkpoints import DTYPES
 
 PRECISIONS = ("auto", "float32", "bf16")
 COMPILE = ("off", "parts", "default", "graphs")
@@ -31,9 +31,9 @@ class TrainingConfig:
     objective: str = "supervised"
     """One of :data:`~brainbench.models.registry.OBJECTIVES`."""
     optimizer: str = "sgd"
-    """One of :data:`~brainbench.models.optimizers.OPTIMIZERS`."""
+    """One of :data:`~brainbench.models.training.optimizers.OPTIMIZERS`."""
     schedule: str = "step"
-    """One of :data:`~brainbench.models.optimizers.SCHEDULES`."""
+    """One of :data:`~brainbench.models.training.optimizers.SCHEDULES`."""
     learning_rate: float = 1e-2
     """At its highest."""
     warmup_epochs: int = 0
@@ -43,9 +43,9 @@ class TrainingConfig:
     batch_size: int = BATCH_SIZE
     """Sweeps per optimiser step, over all processes."""
     decoder: str = "linear"
-    """One of :data:`~brainbench.models.decoders.DECODERS`."""
+    """One of :data:`~brainbench.models.heads.decoders.DECODERS`."""
     augmentation: str = "physical"
-    """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.augment`)."""
+    """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.training.augmentation`)."""
     masking: float = 0.0
     """Share of masked time steps."""
     precision: str = "auto"
@@ -144,7 +144,7 @@ def read_options(path: str | Path) -> dict[str, Any]:
     """
     import tomllib
 
-    from brainbench.files import read_json
+    from brainbench.core.files import read_json
 
     path = Path(path)
     if not path.is_file():

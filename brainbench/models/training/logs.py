@@ -36,7 +36,7 @@ class RunLog:
                         kept.append(line)
                 except (json.JSONDecodeError, KeyError):  # the line that a kill cut short
                     break
-        from brainbench.files import write_text
+        from brainbench.core.files import write_text
 
         write_text(path, "".join(f"{line}\n" for line in kept))
         self._file = path.open("a", encoding="utf-8")

@@ -14,11 +14,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.errors import DataError
-from brainbench.models._layers import Linear
-from brainbench.models.extract import evaluating
-from brainbench.models.optimizers import make_optimizer, rate_factor
+from brainbench.core.errors import DataError
+from brainbench.models.activations import evaluating
+from brainbench.models.ops.layers import Linear
 from brainbench.models.recipes import BATCH_SIZE, PROBE
+from brainbench.models.training.optimizers import make_optimizer, rate_factor
 
 
 def fit_probe(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.errors import DataError
+from brainbench.core.errors import DataError
 
 
 def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer, plain: Mapping[str, Any]) -> None:
     """Write weights, optimiser, random states and plain values."""
     from safetensors.torch import save_file
 
-    from brainbench.files import atomic_path
+    from brainbench.core.files import atomic_path
 
     tensors = {f"learner.{name}": value for name, value in learner.state_dict().items()}
     packed = optimizer.state_dict()

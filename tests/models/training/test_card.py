@@ -1,8 +1,8 @@
 import pytest
 
-from brainbench.models.evaluation import Evaluation, wilson
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.evaluation import Evaluation, wilson
 
 DATA = {"hash": "0123abcd", "train": 3259, "validation": 405, "test": 407, "left_out": 921, "classes": 2}
 

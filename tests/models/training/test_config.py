@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from brainbench.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.models.training.config import TrainingConfig, read_options
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.devices import mujoco_module, warp
+from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
-from robotics_bridge._device import mujoco_module, warp
 from robotics_bridge.envs import Env
 from robotics_bridge.hands.observations import observe, sensors_for
 from robotics_bridge.tasks.goals import SteppingRotation

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs.gymnasium import IDS, GymEnv, GymVectorEnv
 

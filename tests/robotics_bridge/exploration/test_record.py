@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from brainbench import load_model
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.stimuli import load_stimuli
-from brainbench.stimuli.storage import hash_stimulus_set
+from brainbench.stimuli.stimulus_set import hash_stimulus_set
 from robotics_bridge.exploration.procedures import PROCEDURES, find_procedure
 from robotics_bridge.exploration.record import Explored, record_exploration
 from robotics_bridge.physics import Geometry
-from robotics_bridge.policies.taxel_grid import TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
 
 def _box(label: str = "box", **changes) -> Explored:

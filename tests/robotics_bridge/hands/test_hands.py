@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from brainbench.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands.hand import palmar_directions
 from robotics_bridge.hands.layouts import active_count, fillers, read_probes, write_probes

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import OBSERVATIONS, observe, real_contact, repeat_slots, sensors_for
 from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import Noise, SensorSuite
-from robotics_bridge.sensors.placement import Probes
+from robotics_bridge.sensors.probes.placement import Probes
 
 
 def _layout() -> dict[str, Probes]:

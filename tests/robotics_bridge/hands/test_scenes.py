@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands.scenes import OBJECT, closing, holding
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge.physics import HandState, MujocoEngine, MujocoWarpEngine, initial_velocities, pyramid
 
 TWO = """<mujoco><option timestep="0.005"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge.physics import Geometry, MujocoEngine, Scene, Variants, compile_variants
 
 CHAIN = """<mujoco><worldbody>

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge.policies.contrasts import contrast, pooled_spread
 
 

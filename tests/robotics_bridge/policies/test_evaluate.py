@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import Evaluation, agent, evaluate

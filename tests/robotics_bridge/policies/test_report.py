@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brainbench.errors import DataError
-from brainbench.files import read_json, write_json
+from brainbench.core.errors import DataError
+from brainbench.core.files import read_json, write_json
 from leaderboards import rank, read_record, write_record
-from robotics_bridge.policies.distill_config import DistillConfig
 from robotics_bridge.policies.report import (
     COLUMNS,
     LeftOut,
@@ -24,6 +23,7 @@ from robotics_bridge.policies.report import (
     remarks,
     rows,
 )
+from robotics_bridge.policies.training.distill_config import DistillConfig
 
 
 def _write(folder, shares, *, seed=0, **changes) -> None:

@@ -12,7 +12,7 @@ from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from tests.robotics_bridge.policies.worlds import Follower, TouchWorld
+from tests.factories.task_worlds import Follower, TouchWorld
 
 STUDENT = {
     "class_name": "robotics_bridge.policies.student:TactilePolicy",

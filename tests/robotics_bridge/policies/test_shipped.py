@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from brainbench.errors import UsageError
-from brainbench.files import read_json
+from brainbench.core.errors import UsageError
+from brainbench.core.files import read_json
 from robotics_bridge import tasks
-from robotics_bridge.policies.distill import StudentPolicy, load_student
 from robotics_bridge.policies.shipped import FOLDER, list_students, list_teachers, student_path, teacher_path
-from robotics_bridge.policies.teacher import Trainer, load_teacher
+from robotics_bridge.policies.training.distill import StudentPolicy, load_student
+from robotics_bridge.policies.training.teacher import Trainer, load_teacher
 
 
 @pytest.mark.parametrize("name", list_teachers())

@@ -12,8 +12,8 @@ from rsl_rl.utils import resolve_class, split_and_pad_trajectories
 from tensordict import TensorDict
 
 from brainbench import load_model
-from brainbench.errors import DataError, UsageError
-from robotics_bridge.policies.encoders import ARMS, EncoderConfig, RunningScale
+from brainbench.core.errors import DataError, UsageError
+from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig, RunningScale
 from robotics_bridge.policies.export import compare, export_policy, read_policy
 from robotics_bridge.policies.student import TactilePolicy
 

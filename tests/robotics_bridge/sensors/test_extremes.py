@@ -15,7 +15,7 @@ from robotics_bridge.sensors import (
     SensorSuite,
     SurfaceDistanceProbe,
 )
-from tests.robotics_bridge.scenes import PAD, pad_scene, poses_at, state_of
+from tests.factories.touch_scenes import PAD, pad_scene, poses_at, state_of
 
 BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
 

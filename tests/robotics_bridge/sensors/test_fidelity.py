@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brainbench.errors import UsageError
-from brainbench.files import read_json
+from brainbench.core.errors import UsageError
+from brainbench.core.files import read_json
 from brainbench.geometry import Mesh, winding_number
 from robotics_bridge.sensors import ContactProbe, ElastomerTaxel, Fidelity, Probes, ProximityTaxel
 from robotics_bridge.sensors.fidelity import PRESETS, TABLE

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry, Scene
 from robotics_bridge.sensors import (
@@ -21,11 +21,11 @@ from robotics_bridge.sensors import (
     ProximityTaxel,
     SensorSuite,
     SurfaceDistanceProbe,
-    _cloud_kernels,
-    _elastomer_kernels,
-    _probe_kernels,
 )
-from tests.robotics_bridge.scenes import PAD, move_all, pad_scene, poses_at, random_pose, state_of
+from robotics_bridge.sensors.elastomer.kernels import dilation
+from robotics_bridge.sensors.probes.kernels import probe as _probe_kernels
+from robotics_bridge.sensors.taxels.kernels import proximity
+from tests.factories.touch_scenes import PAD, move_all, pad_scene, poses_at, random_pose, state_of
 
 BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
 GRID = Probes.grid(4, 5, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.003)
@@ -61,7 +61,7 @@ def test_readings_have_the_shapes_of_their_layouts_and_share_memory() -> None:
 
 
 def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> None:
-    for factory in (_probe_kernels.kinematic_kernel, _cloud_kernels.proximity_kernel, _elastomer_kernels.marker_kernel):
+    for factory in (_probe_kernels.kinematic_kernel, proximity.proximity_kernel, dilation.marker_kernel):
         factory.cache_clear()
     _probe_kernels.depth_kernel.cache_clear()
     mesh = Mesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -75,8 +75,8 @@ def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> N
     assert suite.solids.tree_count == 0
     assert _probe_kernels.depth_kernel.cache_info().currsize == 1
     assert _probe_kernels.kinematic_kernel.cache_info().currsize == 0
-    assert _cloud_kernels.proximity_kernel.cache_info().currsize == 0
-    assert _elastomer_kernels.marker_kernel.cache_info().currsize == 0
+    assert proximity.proximity_kernel.cache_info().currsize == 0
+    assert dilation.marker_kernel.cache_info().currsize == 0
 
 
 def test_only_meshes_that_a_sensor_tracks_get_a_field_and_equal_meshes_share_it() -> None:

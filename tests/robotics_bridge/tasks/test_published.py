@@ -234,7 +234,7 @@ def test_settings_are_those_released(reference: Path, name: str, hand: str) -> N
 @pytest.mark.parametrize("hand", ["xhand1", "sharpa"])
 def test_grasps_are_sought_as_released(reference: Path, hand: str) -> None:
     yaml = pytest.importorskip("yaml")
-    from robotics_bridge.tasks.grasps import SETTINGS
+    from robotics_bridge.envs.grasps import SETTINGS
     from robotics_bridge.tasks.screwdriver import POSES, REST
 
     c = yaml.safe_load((reference / "tasks" / f"screwdrivers_{hand}.yaml").read_text())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from brainbench.errors import UsageError
+from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
@@ -34,7 +34,7 @@ def keep_still() -> tasks.Task:
 
 
 def test_a_task_of_ones_own_is_one_file(tmp_path: Path) -> None:
-    from brainbench.cli.policy._options import read_task_file
+    from brainbench.cli.policy.options import read_task_file
 
     file = tmp_path / "keep_still.py"
     file.write_text(MY_TASK)

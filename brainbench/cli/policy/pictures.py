@@ -1,0 +1,139 @@
+"""Pictures of an environment without a display or OpenGL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.envs import Env
+
+FACES = np.array(
+    [
+        [0.86, 0.35, 0.29], [0.97, 0.68, 0.57], [0.27, 0.60, 0.42],
+        [0.60, 0.82, 0.66], [0.24, 0.45, 0.76], [0.95, 0.80, 0.35],
+    ]
+)  # fmt: skip
+"""Colours of an object's sides (+x, −x, +y, −y, +z, −z of its body), so that its rotation shows."""
+HOT, BALL, WOOD = (0.86, 0.30, 0.22), (0.62, 0.72, 0.86), (0.93, 0.90, 0.85)
+VIEWS = {"hot_ball": (-0.8, -0.9, 1.3), "screwdriver": (-0.9, 0.9, 0.45)}
+"""Direction from the scene to the camera, by task."""
+_VIEW = (0.85, -0.75, 0.95)
+_SAMPLES = 2
+
+
+class Stage:
+    """Draws one environment of a batch; the camera stands still.
+
+    Args:
+        env: the environments.
+        size: width and height [pixels].
+        number: which environment.
+    """
+
+    def __init__(self, env: Env, size: tuple[int, int] = (480, 400), number: int = 0) -> None:
+        from brainbench.cli.tactile.figures import SKIN, _solid
+        from brainbench.stimuli.figures.camera import Camera
+
+        self._env, self._number = env, number
+        self._scene = env.world.engine.scene
+        still = np.array([0.0, 0, 0, 0, 0, 0, 1])
+        self._parts: list[tuple[int, Any]] = []
+        focus = []
+        for index in range(len(self._scene.geometries)):
+            geometry = self._scene.geometry_in(number, index)
+            link = self._scene.link_index(geometry.link)
+            held = geometry.link in env.model.objects
+            if (held and max(geometry.size) < 1e-3) or geometry.kind == "plane":
+                continue
+            solid = _solid(geometry, still, WOOD if link == 0 else SKIN)
+            if held:
+                solid = _coloured(solid, self._object_colors(geometry.link, solid))
+            self._parts.append((link, solid))
+            focus.append(self._placed(link, solid, self._pose()).corners.reshape(-1, 3))
+        points = np.concatenate(focus)
+        self._lens = Camera(view=VIEWS.get(env.task.name, _VIEW)).lens(points, size).supersampled(_SAMPLES)
+        self._size = size
+
+    def frame(self) -> NDArray[np.uint8]:
+        """Return the picture [H, W, 3] of this moment."""
+        from brainbench.stimuli.figures.raster import Triangles, draw
+        from brainbench.stimuli.figures.shading import lamp, paint, shade
+
+        pose = self._pose()
+        everything = Triangles.joined([self._placed(link, solid, pose) for link, solid in self._parts])
+        light = lamp(self._lens, _SAMPLES, everything.corners.reshape(-1, 3), everything)
+        image = np.ones((self._lens.size[1], self._lens.size[0], 3))
+        layer = draw(everything, self._lens)
+        paint(layer, shade(layer, self._lens, light, gloss=0.05, bias=8.0), image)
+        width, height = self._size
+        image = image.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
+        return (255 * np.clip(image, 0, 1)).astype(np.uint8)
+
+    def _pose(self) -> NDArray[np.float64]:
+        return self._env.world.state.pose_torch[self._number].cpu().numpy().astype(float)
+
+    def _placed(self, link: int, solid: Any, pose: NDArray[np.float64]) -> Any:
+        from brainbench.cli.tactile.figures import _turn
+        from brainbench.stimuli.figures.raster import Triangles
+
+        turn = _turn(pose[link, 3:])
+        return Triangles(solid.corners @ turn.T + pose[link, :3], solid.normals @ turn.T, solid.colors)
+
+    def _object_colors(self, link: str, solid: Any) -> NDArray[np.float64]:
+        if len(self._env.model.objects) > 1:
+            hot = self._env.model.objects.index(link) == int(self._env.target[self._number])
+            return np.tile(np.array(HOT if hot else BALL), (len(solid.corners), 1))
+        normal = np.cross(solid.corners[:, 1] - solid.corners[:, 0], solid.corners[:, 2] - solid.corners[:, 0])
+        axis = np.abs(normal).argmax(axis=1)
+        sign = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0
+        return FACES[2 * axis + sign]
+
+
+def _coloured(solid: Any, colors: NDArray[np.float64]) -> Any:
+    from brainbench.stimuli.figures.raster import Triangles
+
+    return Triangles(solid.corners, solid.normals, colors)
+
+
+def write_video(
+    path: Path, frames: Iterable[NDArray[np.uint8]], count: int, size: tuple[int, int], rate: float
+) -> None:
+    """Write frames to an ``.mp4`` or ``.gif``."""
+    from brainbench.stimuli.figures.films import require_writer, write_film
+    from brainbench.stimuli.figures.scenes import Style
+
+    require_writer(path.suffix.lower())
+    kept = list(frames) if path.suffix.lower() == ".gif" else frames
+    sample: Sequence[Any] = kept[:: max(1, count // 4)] if isinstance(kept, list) else ()
+    write_film(path, kept, count, Style(size=size, frames_per_second=rate), palette_from=sample)
+
+
+def write_strip(path: Path, frames: Sequence[NDArray[np.uint8]], times: Sequence[float]) -> None:
+    """Write a PNG of frames side by side, each with its time (s)."""
+    from brainbench.cli.tactile.figures import _pyplot, _save
+
+    pyplot = _pyplot()
+    height, width = frames[0].shape[:2]
+    scale = 2.2
+    figure, axes = pyplot.subplots(
+        1, len(frames), figsize=(scale * len(frames) * width / height, scale), squeeze=False, layout="constrained"
+    )
+    for ax, frame, time in zip(axes[0], frames, times, strict=True):
+        ax.imshow(frame)
+        ax.set_title(f"{time:.1f} s", fontsize=8)
+        ax.set_axis_off()
+    _save(figure, path)
+
+
+def film(env: Env, act: Any, stage: Stage, steps: int, every: int) -> Iterator[NDArray[np.uint8]]:
+    """Run an agent and yield a frame at every so many control steps."""
+    for step in range(steps):
+        if step % every == 0:
+            yield stage.frame()
+        env.step(act(env.observations))

@@ -1,0 +1,136 @@
+"""The scenes behind ``brainbench tactile demo``; each job draws a picture and returns the numbers it shows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.cli.tactile import figures
+from brainbench.cli.tactile.grip_scene import Grip
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def forces(path: Path, hand: str, resolution: str, *, noisy: bool) -> dict[str, float]:
+    """Draw the forces on all taxels of a hand that holds a ball."""
+    from robotics_bridge.sensors import SensorSuite
+
+    grip = Grip(hand)
+    members = grip.sensors("KinematicTaxel", resolution, "hand", noisy=noisy)
+    suite = SensorSuite(grip.engine.scene, members, num_envs=1)
+    for _ in range(300):
+        grip.run(1)
+        suite.update(grip.engine.state, grip.engine.timestep)
+    readings = {link: suite.read(link)[0].reshape(-1, 6).numpy()[:, :3].copy() for link in members}
+    pose = grip.engine.state.pose_torch[0].numpy().copy()
+    probes = {link: sensor.probes for link, sensor in members.items()}
+    figures.draw_forces(path, grip.engine.scene, pose, probes, readings)
+    true = [suite.read_ground_truth(link)[0].reshape(-1, 6)[:, :3].norm(dim=1) for link in members]
+    touched = sum(int((force > 1e-3).sum()) for force in true)
+    total = max(float(np.linalg.norm(force, axis=1).max()) for force in readings.values())
+    taxels = sum(int(item.active.sum()) for item in probes.values())
+    return {"taxels": taxels, "in contact": touched, "largest force (N)": total}
+
+
+def markers(path: Path, *, noisy: bool) -> dict[str, float]:
+    """Draw the markers of an elastomer pad that a ball presses, drags and twists."""
+    from robotics_bridge.physics import Geometry, HandState, Scene
+    from robotics_bridge.sensors import ElastomerTaxel, Noise, Probes, SensorSuite
+
+    probes = Probes.grid(15, 15, size=(0.018, 0.018), radius=0.001)
+    shapes = (
+        Geometry(name="pad", link="pad", kind="box", size=(0.012, 0.012, 0.002), position=(0, 0, -0.002)),
+        Geometry(name="ball", link="ball", kind="sphere", size=(0.006,)),
+    )
+    noise = Noise.preset("published-elastomer") if noisy else Noise()
+    # A soft thin gel: markers move by tenths of a millimetre, and shear stays near where it is applied.
+    sensor = ElastomerTaxel(
+        link="pad",
+        probes=probes,
+        noise=noise,
+        points=2000,
+        dilate_scale=8.0,
+        dilate_spread=1e5,
+        shear_scale=8.0,
+        shear_spread=1e5,
+    )
+    suite = SensorSuite(Scene(("pad", "ball"), shapes), {"pad": sensor}, num_envs=1)
+    state = HandState.empty(1, 2, 1)
+    state.set_contacts([0], [[0, 1]])
+    moves = {"pressed": (0.0, 0.0), "dragged": (0.0015, 0.0), "twisted": (0.0, 0.6)}
+    fields = {}
+    for name, (shift, twist) in moves.items():
+        suite.reset()
+        for share in np.linspace(0, 1, 21):
+            pressed, moved = min(2 * share, 1.0), max(2 * share - 1, 0.0)
+            pose = np.zeros((2, 7))
+            pose[:, 6] = 1
+            pose[1, :3] = moved * shift, 0, 0.006 - 0.0008 * pressed
+            pose[1, 5:] = np.sin(moved * twist / 2), np.cos(moved * twist / 2)
+            state.set_pose(pose)
+            suite.update(state, 0.01)
+        fields[name] = suite.read("pad")[0].reshape(-1, 3).numpy().copy()
+    figures.draw_markers(path, probes.position, fields)
+    return {f"{name} (mm)": 1e3 * float(np.linalg.norm(field[:, :2], axis=1).max()) for name, field in fields.items()}
+
+
+def temperature(path: Path, hand: str) -> dict[str, float]:
+    """Draw the warming of the finger tips by a ball of 45 °C, for three materials."""
+    from robotics_bridge.sensors import Body, SensorSuite, TemperatureGrid
+
+    grip = Grip(hand)
+    tips = grip.hand.tips
+    members = {
+        f"{name}/{link}": TemperatureGrid(
+            link=link, cells=(12, 12, 12), material="steel", bodies={"object": Body(name, 45.0)}
+        )
+        for name in ("aluminium", "glass", "wood")
+        for link in tips
+    }
+    suite = SensorSuite(grip.engine.scene, members, num_envs=1)
+    times, traces = [], {name: [] for name in members}
+    for step in range(1500):
+        grip.run(1)
+        suite.update(grip.engine.state, grip.engine.timestep)
+        if step % 10 == 0:
+            times.append(step * grip.engine.timestep)
+            for name, trace in traces.items():
+                trace.append(float(suite.read(name).max()))
+    maps: dict[str, Any] = {name: suite.read(name)[0].numpy().copy() for name in members}
+    warmest = max(tips, key=lambda link: maps[f"aluminium/{link}"].max())
+    chosen = {name: maps[f"{name}/{warmest}"] for name in ("aluminium", "glass", "wood")}
+    lines = {name: np.array(traces[f"{name}/{warmest}"]) for name in chosen}
+    figures.draw_temperature(path, warmest, np.array(times), lines, chosen)
+    return {f"{name} (°C)": float(field.max()) for name, field in chosen.items()}
+
+
+def sound(path: Path) -> dict[str, float]:
+    """Draw spectrograms of a ball that bounces on plates of wood, metal and glass."""
+    from brainbench.core.devices import mujoco_module as mujoco
+    from robotics_bridge.physics import MujocoEngine
+    from robotics_bridge.sensors import ContactAudio, SensorSuite, Solid, find_modes
+
+    model = mujoco().MjModel.from_xml_string("""
+    <mujoco><option timestep="0.005"/><worldbody>
+      <body name="slab"><geom type="box" size="0.15 0.1 0.01" solref="0.004 0.3"/></body>
+      <body name="ball" pos="0.03 0.02 0.12"><freejoint/>
+        <geom size="0.02" mass="0.05" solref="0.004 0.3"/></body>
+    </worldbody></mujoco>""")
+    solid = Solid("box", (0.15, 0.1, 0.01))
+    sensors = {
+        name: ContactAudio(link="slab", samples=160, modes=find_modes(solid, name, count=24, cells=10))
+        for name in ("wood", "metal", "glass")
+    }
+    engine = MujocoEngine(model, 1, threads=1)
+    suite = SensorSuite(engine.scene, sensors, num_envs=1)
+    blocks: dict[str, list[Any]] = {name: [] for name in sensors}
+    for _ in range(240):
+        engine.step()
+        suite.update(engine.state, engine.timestep)
+        for name, heard in blocks.items():
+            heard.append(suite.read(name)[0, 0].numpy().copy())
+    signals = {name: np.concatenate(heard) for name, heard in blocks.items()}
+    figures.draw_sound(path, signals, 160 / engine.timestep)
+    return {f"{name}: first mode (Hz)": sensor.modes.frequency[0] for name, sensor in sensors.items()}

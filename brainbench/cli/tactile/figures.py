@@ -1,0 +1,240 @@
+"""The pictures of ``brainbench tactile demo``, without a display or OpenGL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import missing_dependency
+from brainbench.core.files import atomic_path
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+SIZE = (1100, 900)
+SKIN, OBJECT = (0.80, 0.82, 0.86), (0.95, 0.75, 0.45)
+_SAMPLES = 2
+
+
+def _pyplot() -> Any:
+    try:
+        import matplotlib as mpl
+    except ImportError as error:
+        raise missing_dependency("matplotlib", extra="report", purpose="Pictures") from error
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def _save(figure: Any, path: Path) -> None:
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+    _pyplot().close(figure)
+
+
+def _turn(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix of a quaternion (x, y, z, w)."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _solid(geometry: Any, pose: NDArray[np.float64], color: tuple[float, float, float]) -> Any:
+    """Return the triangles of one geometry in the world."""
+    from trimesh import creation
+
+    from brainbench.geometry import Mesh
+    from brainbench.stimuli.figures.raster import Triangles
+    from brainbench.stimuli.figures.surfaces import corner_normals
+
+    size = geometry.size
+    if geometry.kind == "sphere":
+        solid = creation.icosphere(subdivisions=4, radius=size[0])
+    elif geometry.kind == "capsule":
+        solid = creation.capsule(height=2 * size[1], radius=size[0], count=[32, 32])
+        solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
+    elif geometry.kind == "cylinder":
+        solid = creation.cylinder(radius=size[0], height=2 * size[1], sections=48)
+    elif geometry.kind == "box":
+        solid = creation.box(extents=[2 * value for value in size[:3]])
+    elif geometry.kind == "mesh" and geometry.mesh is not None:
+        solid = geometry.mesh
+    else:
+        return Triangles.joined([])
+    mesh = Mesh(np.asarray(solid.vertices, dtype=float), np.asarray(solid.faces, dtype=np.int64))
+    w, x, y, z = geometry.quaternion
+    inner, outer = _turn(np.array([x, y, z, w])), _turn(pose[3:])
+    rotation = outer @ inner
+    place = pose[:3] + outer @ np.array(geometry.position)
+    corners = mesh.vertices[mesh.faces] @ rotation.T + place
+    colors = np.broadcast_to(np.array(color), (len(corners), 3))
+    return Triangles(corners, corner_normals(mesh) @ rotation.T, colors)
+
+
+def draw_forces(
+    path: Path,
+    scene: Any,
+    pose: NDArray[np.float64],
+    probes: Mapping[str, Any],
+    readings: Mapping[str, NDArray[np.float64]],
+) -> None:
+    """Draw a hand with its taxels coloured by force, and arrows along the force (link frame)."""
+    from brainbench.stimuli.figures.camera import Camera
+    from brainbench.stimuli.figures.raster import Triangles, draw
+    from brainbench.stimuli.figures.shading import lamp, paint, shade
+    from brainbench.stimuli.figures.surfaces import ball, tube
+
+    pyplot = _pyplot()
+    peak = max(float(np.linalg.norm(force, axis=1).max()) for force in readings.values()) or 1e-9
+    hand, held, marks = [], [], []
+    for geometry in scene.geometries:
+        where = pose[scene.link_index(geometry.link)]
+        (held if geometry.link == "object" else hand).append(
+            _solid(geometry, where, OBJECT if geometry.link == "object" else SKIN)
+        )
+    palette = pyplot.get_cmap("inferno")
+    for link, item in probes.items():
+        where = pose[scene.link_index(link)]
+        turn = _turn(where[3:])
+        world, normal = item.position @ turn.T + where[:3], item.normal @ turn.T
+        force = readings[link] @ turn.T
+        for index in np.flatnonzero(item.active):
+            share = float(np.linalg.norm(force[index])) / peak
+            color = np.array(palette(0.15 + 0.75 * share)[:3]) if share > 1e-3 else np.array([0.30, 0.42, 0.62])
+            marks.append(ball(world[index], 0.0007 + 0.0004 * (share > 1e-3), color))
+            if share > 0.02:
+                # The arrow shows the push on the skin from outside, so that it stays visible.
+                tip = world[index] - force[index] / peak * 0.022
+                start = world[index] + 0.0006 * normal[index]
+                line = np.linspace(tip, start, 12)
+                radii = np.r_[np.full(7, 0.00045), np.linspace(0.0011, 0.00015, 5)]
+                marks.append(tube(line, radii, np.broadcast_to(color, line.shape)))
+    solid, shown, seen = Triangles.joined(hand), Triangles.joined(marks), Triangles.joined(held)
+    camera = Camera(view=(0.95, -0.55, 0.75))
+    lens = camera.lens(np.concatenate([solid.corners.reshape(-1, 3), seen.corners.reshape(-1, 3)]), SIZE)
+    fine = lens.supersampled(_SAMPLES)
+    everything = Triangles.joined([solid, shown])
+    light = lamp(fine, _SAMPLES, everything.corners.reshape(-1, 3), everything)
+    image = np.ones((fine.size[1], fine.size[0], 3))
+    layer = draw(everything, fine)
+    paint(layer, shade(layer, fine, light, gloss=0.08, bias=8.0), image)
+    veil = draw(seen, fine)
+    front = veil.nearness.reshape(-1)[veil.pixels] > layer.nearness.reshape(-1)[veil.pixels]
+    colors = shade(veil, fine, light)
+    flat = image.reshape(-1, 3)
+    flat[veil.pixels[front]] = 0.24 * colors[front] + 0.76 * flat[veil.pixels[front]]
+    image = image.reshape(lens.size[1], _SAMPLES, lens.size[0], _SAMPLES, 3).mean(axis=(1, 3))
+    image = _trimmed(np.clip(image, 0, 1))
+    inches = image.shape[1] / 110, image.shape[0] / 110 + 0.75
+    figure = pyplot.figure(figsize=inches)
+    axes = figure.add_axes((0, 0.75 / inches[1], 1, 1 - 0.75 / inches[1]))
+    axes.imshow(image)
+    axes.set_axis_off()
+    scale = pyplot.cm.ScalarMappable(pyplot.Normalize(0, peak), _part(palette))
+    bar = figure.colorbar(
+        scale, cax=figure.add_axes((0.3, 0.55 / inches[1], 0.4, 0.14 / inches[1])), orientation="horizontal"
+    )
+    bar.set_label("force on a taxel (N); arrows push on the skin; blue taxels feel nothing", labelpad=2)
+    _save(figure, path)
+
+
+def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64]:
+    """Cut white borders off a picture [H, W, 3]."""
+    darkest = image.min(axis=2)
+    spans = []
+    for used in (darkest.min(axis=1) < 0.999, darkest.min(axis=0) < 0.999):
+        found = np.flatnonzero(used)
+        low, high = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, used.size)
+        spans.append(slice(max(low - margin, 0), high + margin))
+    return image[spans[0], spans[1]]
+
+
+def _part(palette: Any) -> Any:
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(palette(np.linspace(0.15, 0.9, 256)))
+
+
+def draw_markers(path: Path, rest: NDArray[np.float64], fields: Mapping[str, NDArray[np.float64]]) -> None:
+    """Draw marker displacements [N, 3] (m) from their places at rest [N, 3], one panel per motion."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(1, len(fields), figsize=(11, 4.1), layout="constrained")
+    bulge = max(float(np.abs(field[:, 2]).max()) for field in fields.values()) or 1.0
+    places = None
+    for panel, (name, field) in zip(axes, fields.items(), strict=True):
+        x, y = 1e3 * rest[:, 0], 1e3 * rest[:, 1]
+        places = panel.scatter(x, y, c=field[:, 2] / bulge, s=16, cmap="viridis", vmin=0, vmax=1)
+        largest = float(np.linalg.norm(field[:, :2], axis=1).max())
+        stretch = 1.8e-3 / max(largest, 1e-12)
+        panel.quiver(
+            x, y, 1e3 * stretch * field[:, 0], 1e3 * stretch * field[:, 1], angles="xy", scale_units="xy", scale=1,
+            width=0.004,
+        )  # fmt: skip
+        panel.set(title=f"{name}: up to {1e3 * largest:.2g} mm", xlabel="x (mm)", aspect="equal")
+    axes[0].set_ylabel("y (mm)")
+    figure.colorbar(places, ax=axes, label="bulge (of the largest)", shrink=0.8)
+    _save(figure, path)
+
+
+def draw_temperature(
+    path: Path,
+    link: str,
+    times: NDArray[np.float64],
+    lines: Mapping[str, NDArray[np.float64]],
+    maps: Mapping[str, NDArray[np.float64]],
+) -> None:
+    """Draw the warmest cell over time, and for each material the warmest value along one axis (°C)."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(
+        1, 1 + len(maps), figsize=(12, 3.4), layout="constrained", width_ratios=[1.5] + [1] * len(maps)
+    )
+    colors = dict(zip(lines, ("#c1440e", "#2b6cb0", "#4a7c3a"), strict=False))
+    for name, line in lines.items():
+        axes[0].plot(times, line, color=colors.get(name), linewidth=1.8)
+        place = {"xytext": (5, -3), "textcoords": "offset points", "color": colors.get(name), "fontsize": 9}
+        axes[0].annotate(name, (times[-1], line[-1]), **place)
+    axes[0].spines[["top", "right"]].set_visible(False)
+    axes[0].set(xlabel="time (s)", ylabel="warmest cell (°C)", title=f"tip {link.replace('right_hand_', '')}")
+    axes[0].set_xlim(right=1.25 * times[-1])
+    top = max(float(field.max()) for field in maps.values())
+    bottom = min(float(field.min()) for field in maps.values())
+    # The eye has to tell a tenth of a degree under wood from ten degrees under metal.
+    scale = pyplot.matplotlib.colors.PowerNorm(0.35, bottom, top)
+    shown = None
+    for panel, (name, field) in zip(axes[1:], maps.items(), strict=True):
+        seen = field.max(axis=0).T
+        shown = panel.imshow(seen, origin="lower", cmap="inferno", norm=scale)
+        panel.set_title(f"{name} ball, 45 °C: +{seen.max() - bottom:.1f} K", fontsize=10)
+        panel.set(xlabel="cell across", xticks=[], yticks=[])
+    axes[1].set_ylabel("cell along the finger")
+    bar = figure.colorbar(shown, ax=axes[1:], label="°C", shrink=0.85)
+    bar.set_ticks([bottom, *(bottom + share * (top - bottom) for share in (0.02, 0.1, 0.3, 0.6)), top])
+    bar.ax.yaxis.set_major_formatter("{x:.1f}")
+    _save(figure, path)
+
+
+def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: float) -> None:
+    """Draw spectrograms of signals [T] at a sample rate (Hz)."""
+    from scipy.signal import spectrogram
+
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(1, len(signals), figsize=(12, 3.8), layout="constrained", sharey=True)
+    shown = None
+    for panel, (name, signal) in zip(axes, signals.items(), strict=True):
+        frequency, time, power = spectrogram(signal, rate, nperseg=1024, noverlap=896)
+        level = 10 * np.log10(power / power.max() + 1e-12)
+        shown = panel.pcolormesh(time, frequency / 1e3, level, vmin=-80, vmax=0, cmap="magma", rasterized=True)
+        panel.set(title=f"ball on {name}", xlabel="time (s)")
+    axes[0].set_ylabel("frequency (kHz)")
+    figure.colorbar(shown, ax=axes, label="dB", shrink=0.9)
+    _save(figure, path)

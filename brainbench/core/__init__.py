@@ -1,0 +1,1 @@
+"""What every package stands on: errors, files, records, data contracts, statistics, rotations and devices."""

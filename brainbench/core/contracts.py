@@ -1,0 +1,98 @@
+"""The xarray data sets that the packages exchange.
+
+Letters used everywhere: B batch, T time step, S sub-step, C channel, H×W whisker grid, N taxel,
+K stimulus, R trial, U unit, A animal, P = K(K−1)/2 RDM pair.
+
+A **stimulus set** is an :class:`xarray.Dataset` with ``wrench`` [stimulus, time, whisker, channel]
+(float32; N and N·m; the action of the whisker on its base, about the base point, world axes).
+A **recordings** data set is an :class:`xarray.Dataset` with ``counts`` [trial, time, unit], where
+NaN means "not recorded". :func:`check_stimulus_set` and :func:`check_recordings` state the rest.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.errors import DataError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+CHANNELS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+"""Order of the six channels of a base wrench: forces in N, then moments in N·m."""
+
+GRID_SHAPE = (5, 7)
+"""Rows A–E and columns 0–6 of the whisker grid; whisker (row, col) sits at flat index row·7 + col."""
+
+SWEEPS_FORMAT = "brainbench-sweeps"
+"""Attribute ``format`` of every shard and manifest of a data set of sweeps (``docs/datasets.md``)."""
+SWEEPS_SCHEMA = 1
+"""Version of that layout."""
+
+
+def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
+    """Return ``dataset`` if it is a valid stimulus set.
+
+    Required: ``wrench`` [stimulus, time, whisker, channel]; coordinates ``stimulus`` (unique labels),
+    ``time`` (s, increasing), ``whisker`` (names) with ``row`` and ``col`` (grid position from 0),
+    ``channel`` (:data:`CHANNELS`); attributes ``array``, ``scene``, ``fidelity``, ``seed``,
+    ``backend``, ``version``, ``content_hash``.
+
+    Raises:
+        DataError: something of this is missing.
+    """
+    _check_variable(dataset, "wrench", ("stimulus", "time", "whisker", "channel"), "stimulus set")
+    _check_present(
+        dataset.coords, ("stimulus", "time", "whisker", "row", "col", "channel"), "stimulus set", "coordinate"
+    )
+    _check_present(
+        dataset.attrs,
+        ("array", "scene", "fidelity", "seed", "backend", "version", "content_hash"),
+        "stimulus set",
+        "attribute",
+    )
+    if tuple(str(name) for name in dataset["channel"].values) != CHANNELS:
+        raise DataError(f"The stimulus set has channels {list(dataset['channel'].values)}; expected {list(CHANNELS)}.")
+    return dataset
+
+
+def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
+    """Return ``dataset`` if it is a valid recordings data set.
+
+    Required: ``counts`` [trial, time, unit] (NaN = not recorded, never zero); ``duration`` [trial, time]
+    (s, length of each bin); per trial ``stimulus`` (label), ``subject``, ``session``, ``trial_id``;
+    per unit ``unit_subject``, ``unit_session``, ``unit_id``; attributes ``vocabulary`` (ordered
+    labels), ``window``, ``selection``, ``removed`` (rule → trials or units removed), ``source``,
+    ``synthetic``, ``content_hash``.
+
+    Raises:
+        DataError: something of this is missing.
+    """
+    _check_variable(dataset, "counts", ("trial", "time", "unit"), "recordings data set")
+    _check_present(dataset.variables, ("duration",), "recordings data set", "variable")
+    _check_present(
+        dataset.coords,
+        ("stimulus", "subject", "session", "trial_id", "unit_subject", "unit_session", "unit_id"),
+        "recordings data set",
+        "coordinate",
+    )
+    _check_present(
+        dataset.attrs,
+        ("vocabulary", "window", "selection", "removed", "source", "synthetic", "content_hash"),
+        "recordings data set",
+        "attribute",
+    )
+    return dataset
+
+
+def _check_variable(dataset: xr.Dataset, name: str, dims: tuple[str, ...], what: str) -> None:
+    if name not in dataset:
+        raise DataError(f"A {what} needs the variable {name!r}; this one has {sorted(map(str, dataset))}.")
+    if dataset[name].dims != dims:
+        raise DataError(f"{name!r} of a {what} has dimensions {dims}; this one has {dataset[name].dims}.")
+
+
+def _check_present(container: Any, names: tuple[str, ...], what: str, kind: str) -> None:
+    missing = [name for name in names if name not in container]
+    if missing:
+        raise DataError(f"This {what} lacks the {kind} {', '.join(map(repr, missing))}.")

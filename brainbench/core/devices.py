@@ -1,0 +1,119 @@
+"""Warp and MuJoCo, loaded late and quietly, and the devices they compute on."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import MissingDependencyError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+
+_STARTING = threading.Lock()
+
+
+def warp() -> Any:
+    """Return the initialised module ``warp``.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    with _STARTING:
+        return _start()
+
+
+@cache
+def _start() -> Any:
+    try:
+        import warp as wp
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Whisker and tactile simulation need warp-lang; install it with: pip install 'warp-lang>=1.19'"
+        ) from error
+    # Only errors: a user need not hear which devices there are, nor that kernels were compiled.
+    wp.config.log_level = wp.LOG_ERROR
+    wp.config.enable_backward = False
+    with _without_driver_warning():
+        wp.init()
+    return wp
+
+
+_NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Keep back the line that Warp's native library writes to stderr on machines without an NVIDIA driver.
+
+    Whoever asks for ``cuda`` there is told by :func:`pick_device`. All else that is written meanwhile follows after.
+    """
+    try:
+        kept = os.dup(2)
+    except OSError:  # no stderr at all
+        yield
+        return
+    try:
+        with tempfile.TemporaryFile() as said:
+            os.dup2(said.fileno(), 2)
+            try:
+                yield
+            finally:
+                os.dup2(kept, 2)
+                said.seek(0)
+                rest = b"".join(line for line in said if _NO_DRIVER not in line)
+                if rest:
+                    os.write(2, rest)
+    finally:
+        os.close(kept)
+
+
+def mujoco_module() -> Any:
+    """Return the module ``mujoco``; its names are made at run time, so type checkers do not know them."""
+    return import_module("mujoco")
+
+
+def pick_device(name: Any) -> Any:
+    """Return the Warp device called ``cpu``, ``cuda`` or ``cuda:1``; a Warp device passes through.
+
+    ``auto`` is the processor, or the GPU where this build of Warp lacks the compiler for processors.
+
+    Raises:
+        UsageError: there is no such device here, or nothing compiles for it.
+    """
+    wp = warp()
+    if not isinstance(name, str):
+        return wp.get_device(name)
+    if name == "auto":
+        name = "cuda" if not wp.is_cpu_available() and wp.is_cuda_available() else "cpu"
+    if name != "cpu" and name.split(":")[0] != "cuda":
+        raise UsageError(f"A device is 'cpu' or 'cuda'; received {name!r}.")
+    if name != "cpu" and not wp.is_cuda_available():
+        raise UsageError(f"No CUDA device was found, so {name!r} cannot be used; use 'cpu'.")
+    if name == "cpu" and not wp.is_cpu_available():
+        raise UsageError(
+            "This build of warp-lang has no compiler for processors; install the one from PyPI, or use the engine "
+            "'mujoco'."
+        )
+    return wp.get_device(name)
+
+
+def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:
+    """Fill a Warp structure of arrays; empty arrays become one unused element."""
+    wp = warp()
+    struct = kind()
+    for name, value in values.items():
+        dtype = kind.vars[name].type.dtype
+        array = np.ascontiguousarray(value)
+        if array.size == 0:
+            array = np.zeros((1, *array.shape[1:]), dtype=array.dtype)
+        setattr(struct, name, wp.array(array, dtype=dtype, device=device))
+    return struct

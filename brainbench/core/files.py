@@ -1,0 +1,184 @@
+"""Files on disk: atomic writes, the cache folder, content hashes and provenance."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from brainbench.core.errors import DataError
+
+CACHE_VARIABLE = "BRAINBENCH_CACHE"
+"""Environment variable that overrides the platform's cache folder."""
+
+
+def cache_dir(*parts: str) -> Path:
+    """Return (and create) the cache folder, ``$BRAINBENCH_CACHE`` or the platform's own."""
+    root = os.environ.get(CACHE_VARIABLE)
+    if root is None:
+        import platformdirs
+
+        root = platformdirs.user_cache_dir("brainbench", appauthor=False)
+    path = Path(root).expanduser().joinpath(*parts)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+@contextlib.contextmanager
+def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside ``target`` that replaces it on success and vanishes on error.
+
+    The temporary name keeps the target's suffix, so libraries that choose a format by suffix work.
+    """
+    target = Path(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(8)}{target.suffix}")
+    # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    try:
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def to_plain(value: Any) -> Any:
+    """Turn dataclasses, mappings, arrays and paths into JSON types; a float without value is null.
+
+    A field that came later than files and hashes which exist (its metadata say ``later=True``) appears only where it
+    is used, so that those stay what they are.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        return {
+            field.name: to_plain(getattr(value, field.name))
+            for field in fields(value)
+            if not (field.metadata.get("later") and getattr(value, field.name) == field.default)
+        }
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(item) for item in value]
+    if isinstance(value, (set, frozenset)):
+        return sorted(to_plain(item) for item in value)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    as_list = getattr(value, "tolist", None)  # numpy scalars and arrays, torch tensors
+    if callable(as_list):
+        return to_plain(as_list())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def to_json(value: Any, *, indent: int | None = 2) -> str:
+    """Serialise deterministically: sorted keys, full float precision, null for NaN."""
+    return json.dumps(to_plain(value), indent=indent, sort_keys=True, ensure_ascii=False, allow_nan=False)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> Path:
+    """Write ``text`` (UTF-8) so that readers see the old file or the new one, never a part."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> Path:
+    """Write ``value`` as deterministic JSON, atomically."""
+    return write_text(path, to_json(value) + "\n")
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Read JSON.
+
+    Raises:
+        DataError: the file is missing or is not JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError(f"There is no file {os.fspath(path)!r}.") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DataError(f"{os.fspath(path)!r} is not valid JSON ({error}).") from error
+
+
+def content_hash(*values: Any, length: int = 16) -> str:
+    """Hash configuration and arrays to a hexadecimal name that is equal on every machine.
+
+    Arrays count by dtype, shape and bytes; paths by the bytes of the file; all else by its JSON.
+    """
+    digest = hashlib.sha256()
+    for value in values:
+        _update(digest, value)
+    return digest.hexdigest()[:length]
+
+
+def file_hash(path: str | os.PathLike[str], *, length: int = 16) -> str:
+    """Hash a file's bytes in bounded memory."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()[:length]
+
+
+def hash_arrays(arrays: Mapping[str, Any]) -> str:
+    """Hash arrays by name, type, shape and bytes, in alphabetical order of their names (SHA-256, 32 digits).
+
+    Unlike :func:`content_hash` it copies nothing: for hundreds of megabytes.
+    """
+    import numpy as np
+
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name}:{array.dtype.str}:{array.shape}:".encode())
+        digest.update(array.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()[:32]
+
+
+def _update(digest: Any, value: Any) -> None:
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        digest.update(b"bytes:")
+        digest.update(value)
+    elif isinstance(value, os.PathLike):
+        digest.update(b"file:" + file_hash(value, length=64).encode())
+    elif hasattr(value, "dtype") and hasattr(value, "shape"):
+        import numpy as np
+
+        array = np.ascontiguousarray(value)
+        digest.update(f"array:{array.dtype.str}:{array.shape}:".encode())
+        digest.update(array.tobytes() if array.dtype != object else repr(array.tolist()).encode())
+    else:
+        digest.update(b"json:" + to_json(value, indent=None).encode())
+    digest.update(b"\x00")
+
+
+def provenance(**extra: Any) -> dict[str, Any]:
+    """Return what a result needs to be made again: versions, machine, time, and what the caller adds."""
+    import datetime
+    import platform
+    from importlib import metadata
+
+    from brainbench import __version__
+
+    versions: dict[str, str] = {}
+    for package in ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "packages": versions,
+        "machine": f"{platform.system()} {platform.machine()}",
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        **extra,
+    }

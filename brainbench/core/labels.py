@@ -1,0 +1,93 @@
+"""Pairs of condition labels in recordings and stimulus labels."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from brainbench.core.errors import UsageError, listing
+
+
+def join_labels(
+    vocabulary: tuple[str, ...],
+    labels: tuple[str, ...],
+    match: str | os.PathLike[str] | Mapping[str, str | None] | None,
+) -> dict[str, str]:
+    """Pair recording labels with stimulus labels, in the order of the recordings' vocabulary.
+
+    Args:
+        vocabulary: condition labels of the recordings.
+        labels: stimulus labels of the model side.
+        match: recording label → stimulus label (None drops it), or a file of such pairs. Labels it
+            does not name are paired with their equals; without it every label must have an equal.
+
+    Raises:
+        UsageError: a label has no partner (both sides are listed), or two share one.
+    """
+    explicit = read_match(match) if isinstance(match, (str, os.PathLike)) else dict(match or {})
+    sides = f"recordings: {listing(vocabulary, limit=40)}; stimuli: {listing(labels, limit=40)}"
+    for label, partner in explicit.items():
+        if label not in vocabulary:
+            raise UsageError(f"The match names {label!r}, which is no label of the recordings ({sides}).")
+        if partner is not None and partner not in labels:
+            raise UsageError(f"The match pairs {label!r} with {partner!r}, which is no stimulus ({sides}).")
+    pairs = {label: explicit.get(label, label) for label in vocabulary}
+    pairs = {label: partner for label, partner in pairs.items() if partner is not None}
+    alone = [label for label, partner in pairs.items() if partner not in labels]
+    unused = [] if explicit else [label for label in labels if label not in pairs.values()]
+    if alone or unused:
+        raise UsageError(
+            "The labels of recordings and stimuli do not match ("
+            + "; ".join(
+                part
+                for part in (
+                    f"without a stimulus: {listing(alone, limit=40)}" if alone else "",
+                    f"without recordings: {listing(unused, limit=40)}" if unused else "",
+                )
+                if part
+            )
+            + f"). The {sides}. Map them with --match FILE (recording label → stimulus label)."
+        )
+    partners = list(pairs.values())
+    for partner in partners:
+        if partners.count(partner) > 1:
+            raise UsageError(
+                f"Two recording labels are paired with the stimulus {partner!r}; pairs must be one to one."
+            )
+    return {label: str(partner) for label, partner in pairs.items()}
+
+
+def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
+    """Read label pairs from JSON or TOML (an object) or CSV (two columns; an empty second one drops).
+
+    Raises:
+        UsageError: the file is missing, of another kind, or holds something else.
+    """
+    import csv
+    import tomllib
+
+    from brainbench.core.files import read_json
+
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"There is no match file {str(path)!r}.")
+    kind = path.suffix.lower()
+    if kind == ".json":
+        pairs = read_json(path)
+    elif kind == ".toml":
+        try:
+            pairs = tomllib.loads(path.read_text(encoding="utf-8"))
+        except tomllib.TOMLDecodeError as error:
+            raise UsageError(f"{str(path)!r} is not valid TOML ({error}).") from error
+    elif kind == ".csv":
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = [row for row in csv.reader(stream) if row]
+        if any(len(row) != 2 for row in rows):
+            raise UsageError(f"{str(path)!r} must have two columns: recording label, stimulus label.")
+        pairs = dict(rows)
+    else:
+        raise UsageError(f"A match file ends in .json, .toml or .csv; received {path.name!r}.")
+    if not isinstance(pairs, dict) or not all(isinstance(value, (str, type(None))) for value in pairs.values()):
+        raise UsageError(f"{str(path)!r} must map recording labels to stimulus labels (text, or null to drop one).")
+    return {str(key): value or None for key, value in pairs.items()}

@@ -1,0 +1,1 @@
+"""Checks of recordings, worst finding first: clock, labels, spikes and tables."""

@@ -1,0 +1,136 @@
+"""The doctor for recordings: what is wrong with a file, worst first, before a score hides it.
+
+:func:`check` reads spike times and tables of every session (no raw data) and applies each check of
+:mod:`brainbench.datasets.checks.spikes`, ``_check_tables``, ``_check_labels`` and ``_check_clock``.
+A finding is an *error* when results would be wrong, a *warning* when they may be, a *note* when it
+only has to be known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from brainbench.core.errors import DataError
+from brainbench.core.files import to_json
+from brainbench.datasets import hdf5
+from brainbench.datasets.checks.clock import check_clock
+from brainbench.datasets.checks.findings import SEVERITIES, Finding, repeats
+from brainbench.datasets.checks.labels import check_labels
+from brainbench.datasets.checks.spikes import check_spikes
+from brainbench.datasets.checks.tables import check_coverage, check_tables
+from brainbench.datasets.layouts.registry import Recipe
+from brainbench.datasets.reading import Source, each_session, find_recordings
+from brainbench.datasets.sessions import Session
+from brainbench.datasets.sources import open_file
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.counting import has_units, no_units, read_spikes
+
+
+@dataclass(frozen=True)
+class Checkup:
+    """Findings about the sessions of one source, worst first."""
+
+    source: str
+    files: int
+    sessions: tuple[str, ...]
+    """Sessions that could be opened, by name."""
+    findings: tuple[Finding, ...]
+
+    @property
+    def verdict(self) -> str:
+        """The worst severity found, ``"ok"`` if nothing was."""
+        return next((level for level in SEVERITIES if self.count(level)), "ok")
+
+    def count(self, severity: str) -> int:
+        """Number of findings of one severity."""
+        return sum(item.severity == severity for item in self.findings)
+
+    def to_json(self) -> str:
+        """Serialise deterministically."""
+        return to_json(self)
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        found = ", ".join(f"{self.count(level)} {level}{'s' * (self.count(level) != 1)}" for level in SEVERITIES)
+        yield f"{self.source}: {len(self.sessions)} session{'s' * (len(self.sessions) != 1)}, {found}"
+        for item in self.findings:
+            yield f"{item.severity.upper():8}{item.check:12}{item.where}: {item.message}"
+            if item.advice:
+                yield f"{'':20}→ {item.advice}"
+
+
+def check(source: Source, *, conditions: str | Conditions | None = None) -> Checkup:
+    """Look for what would make scores of these recordings wrong.
+
+    Files that cannot be read become findings, so that a folder is judged as a whole.
+
+    Args:
+        source: as in :func:`~brainbench.datasets.open_recordings`.
+        conditions: table and columns that label the trials, to check the labels; the recipe's by default.
+
+    Raises:
+        DataFileNotFoundError: the source names nothing.
+        UsageError: it names an unknown recipe, or the conditions cannot be read.
+    """
+    recipe, paths = find_recordings(source)
+    wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
+    findings: list[Finding] = []
+    names: list[str] = []
+    for path in paths:
+        try:
+            findings += _check_file(path, recipe, wanted, names)
+        except DataError as error:
+            findings.append(Finding("error", "file", path.name, str(error)))
+    findings += _check_together(names)
+    order = sorted(range(len(findings)), key=lambda index: (SEVERITIES.index(findings[index].severity), index))
+    shown = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
+    return Checkup(shown, len(paths), tuple(names), tuple(findings[index] for index in order))
+
+
+def _check_file(
+    path: Path, recipe: Recipe | None, conditions: Conditions | None, names: list[str]
+) -> Iterator[Finding]:
+    with open_file(path) as file:
+        if hdf5.is_ours(file) and hdf5.read_kind(file, path) == "counts":
+            hdf5.read_counts(file, path)
+            message = "holds responses that are already counted; spikes, clock and tables cannot be checked"
+            yield Finding("note", "file", path.name, message)
+            return
+        for session, found in each_session(file, path, recipe):
+            name = f"{session.subject} / {session.session}"
+            names.append(name)
+            yield from check_session(session, found, conditions, name)
+
+
+def check_session(
+    session: Session, recipe: Recipe | None = None, conditions: Conditions | None = None, where: str = ""
+) -> Iterator[Finding]:
+    """Yield the findings about one session, which must still be open."""
+    where = where or f"{session.subject} / {session.session}"
+    conditions = conditions or (recipe.conditions if recipe else None)
+    yield from check_tables(session, where)
+    yield from check_labels(session, recipe, conditions, where)
+    if not has_units(session) or session.units is None:
+        yield Finding("error", "units", where, no_units(session))
+        return
+    notes: list[str] = []
+    try:
+        spikes = read_spikes(session.units, notes)
+    except DataError as error:
+        yield Finding("error", "spikes", where, str(error))
+        return
+    for note in notes:
+        yield Finding("warning", "spikes", where, note, "Whoever wrote the file may have joined trials or probes.")
+    yield from check_spikes(session, spikes, where)
+    yield from check_coverage(session, spikes, recipe, conditions, where)
+    yield from check_clock(session, spikes, recipe, where)
+
+
+def _check_together(names: list[str]) -> Iterator[Finding]:
+    for name in repeats(names):
+        message = f"{names.count(name)} files hold this session; its trials would count more than once"
+        yield Finding("error", "file", name, message, "Leave all but one of them out.")

@@ -1,0 +1,94 @@
+"""Recipe for Hires 2015 (DANDI 000013): single layer 4 neurons while a mouse finds a pole with a whisker.
+
+One cell per file, and no units table: spikes are a 0/1 signal ``acquisition/SpikeTrain`` with time
+stamps, touches likewise under ``acquisition/behavior``. They become a unit and a contact table here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.datasets.layouts.layout import Recipe
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, Table, ragged
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.selection import Rule, Selection
+from brainbench.datasets.trials.windows import Window
+
+TRAIN = "acquisition/SpikeTrain"
+ONSET, OFFSET = "touch_onset", "touch_offset"
+WHISKER = "C2"
+"""The files do not name the whisker; the paper recorded around the C2 column with one whisker left."""
+
+SELECTION = (
+    Rule("type", refuse=("N/A",)),
+    Rule("stim_present", refuse=("true",), required=False),
+)
+"""Photostimulated trials are not the neuron's own answer to touch."""
+
+
+def adapt(session: Session) -> Session:
+    """Turn the spike train into a unit and the touches into ``contacts_by_whisker_C2``."""
+    made = session
+    if session.units is None and TRAIN in session.series:
+        made = replace(made, units=_unit(session.series[TRAIN], session.source), intracellular={})
+        note = f"{session.source}: the unit was made from the 0/1 signal {TRAIN}"
+        made = replace(made, notes=(*made.notes, note))
+    return with_contacts(made, "acquisition/behavior/", WHISKER)
+
+
+def with_contacts(session: Session, prefix: str, whisker: str) -> Session:
+    """Add the contact table of a whisker from its 0/1 signals of touch onsets and offsets."""
+    name = f"contacts_by_whisker_{whisker}"
+    onset, offset = (session.series.get(f"{prefix}{part}") for part in (ONSET, OFFSET))
+    if name in session.tables or onset is None or offset is None:
+        return session
+    begin, end = onset.active_times(), offset.active_times()
+    if not len(begin):
+        return session
+    # A touch ends at the next offset; one that is cut off by the end of the recording ends at once.
+    after = np.searchsorted(end, begin, side="left")
+    stop = np.append(end, np.nan)[after]
+    table = Table(name, {"start_time": begin, "stop_time": np.where(np.isnan(stop), begin, stop)}, session.source)
+    return replace(session, tables={**session.tables, name: table})
+
+
+def _unit(train: Series, source: str) -> Table:
+    times = train.active_times()
+    columns: dict[str, NDArray[np.generic]] = {"id": np.arange(1), **ragged(SPIKES, [times])}
+    if train.timestamps is not None and len(train.timestamps):
+        stamps = np.asarray(train.timestamps[...], dtype=np.float64)
+        columns |= ragged(OBSERVED, [recorded_runs(np.sort(stamps))])
+    return Table("units", columns, source)
+
+
+def recorded_runs(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Spans [n, 2] (s) of unbroken sampling, the last sample's own step included.
+
+    Pauses longer than ten sampling steps are no recording.
+    """
+    steps = np.diff(stamps)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    breaks = np.flatnonzero(steps > 10 * step)
+    return np.stack([stamps[np.append(0, breaks + 1)], stamps[np.append(breaks, len(stamps) - 1)] + step], axis=1)
+
+
+RECIPE = Recipe(
+    name="hires",
+    title="pole localisation with one whisker, single neurons of layer 4 (DANDI 000013)",
+    citation="Hires S. A., Gutnisky D. A. et al., eLife 4:e06619 (2015), doi:10.7554/eLife.06619",
+    conditions=Conditions("trials", ("type",)),
+    orders={},
+    selection=Selection(name="hires", trials=SELECTION),
+    window=Window("pole_in_time", stop="pole_out_time"),
+    layout=("type", "response", "stim_present", "pole_position", "pole_in_time", "pole_out_time"),
+    adapt=adapt,
+    dandiset="000013",
+    remarks=(
+        "units: one per file, from the 0/1 signal acquisition/SpikeTrain",
+        "contacts: from the 0/1 signals touch_onset and touch_offset of acquisition/behavior",
+        "conditions: Go and Nogo are the two ranges of pole positions; trials:pole_position labels single positions",
+    ),
+)

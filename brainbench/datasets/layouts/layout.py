@@ -1,0 +1,76 @@
+"""What a recipe is: how one published data set is read, in one record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+
+from brainbench.datasets.sessions import Session
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.selection import Selection
+from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one published data set is read. Every part can be overridden by an argument."""
+
+    name: str
+    title: str
+    citation: str
+    conditions: Conditions
+    orders: Mapping[str, tuple[str, ...]]
+    """Column → its values in fixed order; other values are not part of the experiment."""
+    selection: Selection
+    window: Window
+    layout: tuple[str, ...]
+    """Columns of the condition table by which a file of this data set is recognised; empty: never, the
+    recipe has to be named."""
+    remarks: tuple[str, ...] = ()
+    adapt: Callable[[Session], Session] | None = None
+    """Turns the file's own layout into units and interval tables; must leave alone what is already
+    adapted (an export keeps what it made)."""
+    touch: str = FIRST_CONTACT
+    """Event that neurons answer within 5 to 30 ms, an anchor of :class:`Window`: it tells whether
+    spikes and behaviour share a clock."""
+    dandiset: str = ""
+    """Number on the DANDI archive."""
+    assets: str = ""
+    """Glob of the archive's files that hold units; all of them if empty."""
+
+    def matches(self, session: Session) -> bool:
+        """Tell whether a session has the layout of this data set."""
+        table = session.tables.get(self.conditions.table)
+        return bool(self.layout) and table is not None and all(column in table for column in self.layout)
+
+    def adapted(self, session: Session) -> Session:
+        """Return the session with the units and tables that this data set stores in its own way."""
+        return session if self.adapt is None else self.adapt(session)
+
+    def vocabulary(self, conditions: Conditions) -> tuple[str, ...] | None:
+        """Return the fixed labels, or None if a column's values are not declared here."""
+        if conditions.table != self.conditions.table or any(name not in self.orders for name in conditions.columns):
+            return None
+        return tuple("-".join(values) for values in product(*(self.orders[name] for name in conditions.columns)))
+
+    def describe(self) -> str:
+        """Print every rule of the recipe, one per line."""
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"{self.name}: {self.title}"
+        yield f"citation: {self.citation}"
+        yield f"conditions: {self.conditions}"
+        vocabulary = self.vocabulary(self.conditions)
+        yield f"vocabulary: {', '.join(vocabulary) if vocabulary else 'the values found, sorted naturally'}"
+        yield f"window: {self.window}"
+        if self.window.fallback is not None:
+            yield f"window of sessions without contact tables: {self.window.fallback}"
+        yield from self.selection.lines()
+        yield from self.remarks
+
+
+def variant(recipe: Recipe, **changes: object) -> Recipe:
+    """Return a recipe that differs in some parts and is used only when named."""
+    return replace(recipe, layout=(), **changes)  # pyright: ignore[reportArgumentType]

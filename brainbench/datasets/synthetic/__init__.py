@@ -1,0 +1,1 @@
+"""Synthetic recordings whose truth is known: neurons, sessions, files, and the demo recordings."""

@@ -1,0 +1,207 @@
+"""Synthetic recordings with a known geometry: the instrument by which statistics are validated.
+
+Every unit has a mean rate b (log-normal over units) and a random direction w in tuning space. Its
+expected rate for stimulus k is b · max(0, 1 + m (√(1−ι) x_k·w + √ι y_k·w′)): x_k is the shared
+direction of the stimulus (:class:`Geometry`), y_k the animal's own random one, m the ``modulation``
+and ι the ``individual`` share. Over many units the correlation distance between stimuli is then
+proportional to 1 − x_k·x_l, so RDMs compared by any correlation have the geometry as their truth
+(rectification touches less than 0.7 % of rates at the largest modulation).
+
+Counts are Poisson around that rate, times a gamma gain per unit and trial (``dispersion`` φ: variance =
+mean + φ mean², the negative binomial), times one gain common to all units of a trial (``shared_gain``).
+
+:func:`simulate` gives arrays, :func:`as_recordings` a recordings data set, :func:`write_files` real NWB or
+HDF5 files whose counts are the same numbers. Letters: K stimulus, R trial, U unit, P pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.datasets.synthetic.design import MODULATION, Design, draw_session, entropy, stimulus_means, subject_name
+from brainbench.datasets.synthetic.geometry import Geometry
+from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
+from brainbench.datasets.synthetic.truth import correlation_rdm
+from brainbench.datasets.trials.blocks import SessionBlock
+
+__all__ = [
+    "FAULTS",
+    "Design",
+    "Geometry",
+    "SyntheticAnimal",
+    "as_recordings",
+    "calibrate",
+    "make_sessions",
+    "measure_ceiling",
+    "simulate",
+    "stimulus_means",
+    "write_files",
+]
+
+_STEPS = 20
+_EXACT = 0.001
+"""Calibration stops this close to the ceiling asked for, on the studies it draws."""
+
+
+@dataclass(frozen=True)
+class SyntheticAnimal:
+    """One animal's trials, and the truth about it."""
+
+    subject: str
+    blocks: tuple[SessionBlock, ...]
+    """Sessions: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``."""
+    truth: NDArray[np.float64] = field(repr=False)
+    """[P] correlation-distance RDM of its units' expected rates, free of noise."""
+
+
+def simulate(
+    geometry: Geometry, design: Design | None = None, *, seed: int | Sequence[int] = 0, faults: Sequence[str] = ()
+) -> tuple[SyntheticAnimal, ...]:
+    """Draw animals that share a geometry.
+
+    Every animal and session has its own random stream, so the first animals of a larger design are
+    those of a smaller one.
+
+    Args:
+        geometry: the shared truth.
+        design: what is recorded; the defaults of :class:`Design` if None.
+        seed: one integer, or several (such as study and simulation).
+        faults: ``"zero-fill"``, ``"first-appearance"``: faults of the released analysis, for
+            demonstrations of what they cost; see :data:`FAULTS`.
+
+    Raises:
+        UsageError: an unknown fault, or a missing stimulus that does not exist.
+    """
+    design = design or Design()
+    for name in faults:
+        if name not in FAULTS:
+            raise unknown_name("fault", name, FAULTS)
+    animals = []
+    for index in range(design.animals):
+        drawn = [draw_session(geometry, design, index, number, seed) for number in range(design.sessions)]
+        blocks = [item.block for item in drawn]
+        # The order of the stimuli goes wrong before trials are filled up.
+        for name in sorted(faults):
+            blocks = [FAULTS[name](block, len(geometry.labels)) for block in blocks]
+        truth = correlation_rdm(np.concatenate([item.expected for item in drawn], axis=1))
+        animals.append(SyntheticAnimal(subject_name(index), tuple(blocks), truth))
+    return tuple(animals)
+
+
+def measure_ceiling(
+    geometry: Geometry, design: Design, *, simulations: int = 50, seed: int | Sequence[int] = 0
+) -> tuple[float, float]:
+    """Measure the noise ceiling of a design: what the true geometry itself scores.
+
+    That is the mean Pearson correlation between the true RDM and the RDM measured in one animal
+    (correlation distance of mean responses, sessions joined). Animals without an RDM, because they lack a
+    stimulus or did not answer one at all, are left out.
+
+    Args:
+        geometry: the shared truth.
+        design: what is recorded.
+        simulations: studies drawn, each of ``design.animals`` animals.
+        seed: seed of the first.
+
+    Returns:
+        The ceiling and its Monte-Carlo standard error; NaN if no animal has all stimuli, an RDM is
+        flat (two stimuli), or there is one animal only for the error.
+    """
+    truth, stimuli = geometry.rdm, len(geometry.labels)
+    scores: list[float] = []
+    for number in range(simulations):
+        for animal in simulate(geometry, design, seed=(*entropy(seed), number)):
+            means = np.concatenate([stimulus_means(block, stimuli) for block in animal.blocks], axis=1)
+            scores.append(_pearson(correlation_rdm(means), truth))
+    known = np.array([score for score in scores if np.isfinite(score)])
+    if not len(known):
+        return float("nan"), float("nan")
+    error = known.std(ddof=1) / np.sqrt(len(known)) if len(known) > 1 else np.nan
+    return float(known.mean()), float(error)
+
+
+def calibrate(
+    geometry: Geometry,
+    design: Design,
+    *,
+    ceiling: float,
+    simulations: int = 50,
+    seed: int | Sequence[int] = 0,
+) -> Design:
+    """Return the design with the modulation at which it has a given noise ceiling.
+
+    Found by false position with common random numbers: the same animals are drawn at every step.
+
+    Args:
+        geometry: the shared truth.
+        design: all but the modulation.
+        ceiling: wanted value of :func:`measure_ceiling`, between 0 and 1.
+        simulations: studies behind each step; the result is as exact as their Monte-Carlo error.
+        seed: seed of the studies.
+
+    Raises:
+        UsageError: even the largest modulation stays below the ceiling; what is reached is said.
+    """
+
+    def excess(modulation: float) -> float:
+        tried = replace(design, modulation=modulation)
+        return measure_ceiling(geometry, tried, simulations=simulations, seed=seed)[0] - ceiling
+
+    # Without modulation the expected comparison is zero, so it need not be simulated.
+    low, below, high, above = 0.0, -ceiling, MODULATION, excess(MODULATION)
+    if not (ceiling > 0 and above >= 0):
+        raise UsageError(
+            f"A noise ceiling of {ceiling:g} is out of reach: this design has up to {above + ceiling:.3f}. More units "
+            f"or trials, a higher rate, less dispersion or a smaller individual share raise it."
+        )
+    middle = high
+    for _ in range(_STEPS):
+        middle = low + (high - low) * below / (below - above)
+        found = excess(middle)
+        if abs(found) < _EXACT:
+            break
+        # Halving the value at the end that stays makes false position converge fast on both sides.
+        if found < 0:
+            low, below, above = middle, found, above / 2
+        else:
+            high, above, below = middle, found, below / 2
+    return replace(design, modulation=middle)
+
+
+def _zero_fill(block: SessionBlock, stimuli: int) -> SessionBlock:
+    """Give every trial a response of zero to each stimulus that it did not show."""
+    trials, bins, units = block.responses.shape
+    filled = np.zeros((trials, stimuli, bins, units))
+    filled[np.arange(trials), block.labels] = block.responses
+    keys = tuple(f"{key}/{stimulus}" for key in block.keys for stimulus in range(stimuli))
+    labels = np.tile(np.arange(stimuli), trials)
+    return SessionBlock(filled.reshape(trials * stimuli, bins, units), labels, keys)
+
+
+def _first_appearance(block: SessionBlock, stimuli: int) -> SessionBlock:
+    """Number the stimuli in the order in which the session shows them."""
+    _, first = np.unique(block.labels, return_index=True)
+    order = block.labels[np.sort(first)]
+    number = np.full(stimuli, -1)
+    number[order] = np.arange(len(order))
+    return block._replace(labels=number[block.labels])
+
+
+FAULTS: dict[str, Callable[[SessionBlock, int], SessionBlock]] = {
+    "first-appearance": _first_appearance,
+    "zero-fill": _zero_fill,
+}
+"""Faults of the released analysis, as functions of a session and the number of stimuli: stimuli
+numbered by first appearance (so that sessions and animals disagree about the axes), and zeros in
+place of what a trial did not show."""
+
+
+def _pearson(one: NDArray[np.float64], two: NDArray[np.float64]) -> float:
+    a, b = one - one.mean(), two - two.mean()
+    size = np.sqrt((a @ a) * (b @ b))
+    return float(a @ b / size) if size > 0 else float("nan")

@@ -1,0 +1,288 @@
+"""Turn one session into counted trials: rules, windows, recorded spans, bins."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, Table, as_labels, natural_key
+from brainbench.datasets.trials.conditions import Conditions, join
+from brainbench.datasets.trials.covariates import trial_covariates
+from brainbench.datasets.trials.selection import Selection, Tally
+from brainbench.datasets.trials.windows import Window
+
+UNIT_COLUMNS = {"depth": float, "layer": str, "inhibitory": float}
+"""Unit columns carried along where present, with the type that can say "missing"."""
+
+_MOST_COUNTS = 1 << 32
+"""Counts of one session that are made at most: 16 GiB."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How sessions are read; equal for all of them."""
+
+    conditions: Conditions
+    vocabulary: tuple[str, ...] | None
+    selection: Selection
+    window: Window
+    bin: float | None
+
+
+@dataclass(frozen=True)
+class Part:
+    """The kept trials [R] and units [U] of one session, in canonical order."""
+
+    subject: str
+    session: str
+    source: str
+    values: tuple[tuple[str, ...], ...]
+    """[R] condition values."""
+    labels: tuple[str, ...]
+    """[R] condition values joined."""
+    trial_ids: tuple[str, ...]
+    unit_ids: tuple[str, ...]
+    edges: NDArray[np.float64]
+    """[R, 2] window of each trial, s."""
+    counts: NDArray[np.float32]
+    """[R, T, U] spikes; NaN = not recorded."""
+    duration: NDArray[np.float64]
+    """[R, T] length of each bin, s."""
+    columns: dict[str, NDArray[Any]]
+    """Unit columns [U]."""
+    covariates: dict[str, NDArray[np.float64]]
+    """What else is known of the trials [R]."""
+    tally: Tally
+    trials: int
+    """Rows of the condition table before any rule."""
+    units: int
+    """Units in the file before any rule."""
+    synthetic: bool
+
+
+def extract(session: Session, plan: Plan) -> Part:
+    """Read one session by a plan.
+
+    Raises:
+        UsageError: a table or column does not exist (the nearest is named).
+        DataError: the session's units or tables cannot be used.
+    """
+    if session.units is None or not has_units(session):
+        raise DataError(no_units(session))
+    tally = Tally()
+    table = session.table(plan.conditions.table)
+    if "start_time" not in table:
+        raise DataError(f"{table.label} has no start_time; conditions need a table of time intervals.")
+    values = plan.conditions.values(table)
+    labels = np.array(join(values), dtype=str)
+    kept = tally.select(table, plan.selection.trials, "trials")
+    kept = tally.apply(kept, labels != "", f"trials: no value of {','.join(plan.conditions.columns)}")
+    if plan.vocabulary is not None:
+        kept = tally.apply(kept, np.isin(labels, plan.vocabulary), "trials: label outside the vocabulary")
+    edges = plan.window.edges(session, table, tally.notes)
+    kept = tally.apply(kept, np.isfinite(edges).all(axis=1), f"trials: no event for the window {plan.window}")
+    kept = tally.apply(kept, ~(edges[:, 1] <= edges[:, 0]), "trials: window of no length")
+    invalid = session.tables.get("invalid_times")
+    if invalid is not None:
+        kept = tally.apply(kept, ~_overlaps(edges, invalid), "trials: overlap with invalid_times")
+
+    spikes = read_spikes(session.units, tally.notes)
+    covered, unit_kept = _coverage(session.units, spikes, edges, plan.selection, tally)
+    kept = tally.apply(kept, covered.any(axis=1), "trials: outside the recorded span")
+    unit_kept = tally.apply(unit_kept, covered[kept].any(axis=0) | ~kept.any(), "units: recorded in no kept trial")
+
+    rows = _rows_in_order(np.flatnonzero(kept), table)
+    units = _units_in_order(np.flatnonzero(unit_kept), session.units, spikes)
+    counts, duration = count(
+        [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], plan.bin, plan.window.length
+    )
+    ids, unit_ids = as_labels(table.ids()), as_labels(session.units.ids())
+    return Part(
+        subject=session.subject,
+        session=session.session,
+        source=session.source,
+        values=tuple(tuple(values[row].tolist()) for row in rows),
+        labels=tuple(labels[rows].tolist()),
+        trial_ids=tuple(ids[rows].tolist()),
+        unit_ids=tuple(unit_ids[units].tolist()),
+        edges=edges[rows],
+        counts=counts,
+        duration=duration,
+        columns={name: _unit_column(session.units, name, kind, units) for name, kind in UNIT_COLUMNS.items()},
+        covariates=trial_covariates(session, table, rows, edges[rows]),
+        tally=tally,
+        trials=len(table),
+        units=len(session.units),
+        synthetic=session.synthetic,
+    )
+
+
+def has_units(session: Session) -> bool:
+    """Tell whether a session has at least one unit with spike times."""
+    return session.units is not None and SPIKES in session.units and len(session.units) > 0
+
+
+def no_units(session: Session) -> str:
+    """Say in one sentence why a session without units cannot be used and what it holds instead."""
+    series = ", ".join(f"{number} {kind}" for kind, number in session.intracellular.items())
+    total = sum(session.intracellular.values())
+    if total:
+        return (
+            f"{session.source} has no units table: it holds {total} intracellular series ({series}), which are "
+            f"voltages or currents of single cells, while brainbench needs spike times of units per trial."
+        )
+    holds = f"interval tables {', '.join(session.tables)}" if session.tables else "no interval tables either"
+    return f"{session.source} has no units table with spike_times (it holds {holds}); there is nothing to score."
+
+
+def read_spikes(units: Table, notes: list[str]) -> list[NDArray[np.float64]]:
+    """Read the spike times (s, ascending) of every unit.
+
+    Raises:
+        DataError: the ragged index is inconsistent or a time is not finite.
+    """
+    if f"{SPIKES}_index" not in units:
+        raise DataError(f"{units.label} has spike_times without spike_times_index; the spikes belong to no unit.")
+    ends = units.ends(SPIKES)
+    flat = np.asarray(units.data[SPIKES][...], dtype=np.float64)
+    bad = ~np.isfinite(flat)
+    if bad.any():
+        row = int(np.searchsorted(ends, np.flatnonzero(bad)[0], side="right"))
+        raise DataError(
+            f"{int(bad.sum())} spike times of {units.label} are not finite (first in unit {units.ids()[row]}); "
+            f"the file is damaged or was exported wrongly."
+        )
+    spikes = np.split(flat, ends[:-1]) if len(ends) else []
+    unsorted = [index for index, times in enumerate(spikes) if np.any(np.diff(times) < 0)]
+    if unsorted:
+        notes.append(f"{units.label}: spike times of {len(unsorted)} units were not in order and have been sorted")
+        for index in unsorted:
+            spikes[index] = np.sort(spikes[index])
+    return spikes
+
+
+def recorded_span(spikes: list[NDArray[np.float64]]) -> tuple[float, float] | None:
+    """Return the first and last spike (s) of all units, or None without any."""
+    heard = [times for times in spikes if len(times)]
+    return (float(min(times[0] for times in heard)), float(max(times[-1] for times in heard))) if heard else None
+
+
+def count(
+    spikes: list[NDArray[np.float64]],
+    edges: NDArray[np.float64],
+    covered: NDArray[np.bool_],
+    bin: float | None,
+    length: float | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Count spikes in bins from each window's begin.
+
+    A bin is half open, [begin, end). Bins past the end of a short window are NaN with duration 0; the
+    last bin of a window may be shorter than ``bin`` and its duration says so.
+
+    Args:
+        spikes: [U] ascending spike times, s.
+        edges: [R, 2] windows, s.
+        covered: [R, U] whether the unit was recorded.
+        bin: bin width, s; None for one bin.
+        length: length common to all windows, s, if the window has one.
+
+    Returns:
+        counts [R, T, U] (float32) and duration [R, T] (s).
+
+    Raises:
+        UsageError: the bin is not positive, or so narrow that the counts would not fit in memory.
+    """
+    span = edges[:, 1] - edges[:, 0]
+    if bin is None:
+        bounds = edges
+    else:
+        if not bin > 0:
+            raise UsageError(f"A bin is a positive number of seconds; received {bin}.")
+        longest = max([length or 0.0, *span.tolist()])
+        # Rounding must not add an empty bin when the length is a whole number of bins.
+        number = max(1, math.ceil(longest / bin - 1e-6))
+        if number * len(edges) * max(1, len(spikes)) > _MOST_COUNTS:
+            raise UsageError(
+                f"A bin of {bin:g} s cuts windows of up to {longest:g} s into {number:,} bins; with {len(edges):,} "
+                f"trials and {len(spikes):,} units that is more than {_MOST_COUNTS:,} counts. Take wider bins."
+            )
+        bounds = np.minimum(edges[:, :1] + bin * np.arange(number + 1), edges[:, 1:])
+        bounds[:, -1] = edges[:, 1]
+    duration = np.diff(bounds, axis=1)
+    found = np.empty((len(spikes), *duration.shape), dtype=np.float32)
+    for index, times in enumerate(spikes):
+        found[index] = np.diff(np.searchsorted(times, bounds, side="left"), axis=1)
+    counts = np.ascontiguousarray(found.transpose(1, 2, 0))
+    counts[duration <= 1e-9] = np.nan
+    counts[np.broadcast_to(~covered[:, None, :], counts.shape)] = np.nan
+    return counts, np.where(duration > 1e-9, duration, 0.0)
+
+
+def _coverage(
+    units: Table, spikes: list[NDArray[np.float64]], edges: NDArray[np.float64], selection: Selection, tally: Tally
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which windows each unit was recorded in [rows, units] and which units pass [units]."""
+    kept = tally.select(units, selection.units, "units")
+    numbers = np.array([len(times) for times in spikes], dtype=np.int64)
+    if selection.min_spikes:
+        few = "no spikes" if selection.min_spikes == 1 else f"fewer than {selection.min_spikes} spikes"
+        kept = tally.apply(kept, numbers >= selection.min_spikes, f"units: {few}")
+    covered = np.zeros((len(edges), len(spikes)), dtype=bool)
+    if OBSERVED in units and f"{OBSERVED}_index" in units:
+        ends = units.ends(OBSERVED)
+        spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)
+        for index, own in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
+            for low, high in merged_spans(own):
+                covered[:, index] |= (edges[:, 0] >= low) & (edges[:, 1] <= high)
+    elif (span := recorded_span(spikes)) is not None:
+        low, high = span
+        covered[:] = ((edges[:, 0] >= low) & (edges[:, 1] <= high))[:, None]
+        tally.notes.append(
+            f"{units.label}: no obs_intervals; recorded span taken from first to last spike, {low:.3f}–{high:.3f} s"
+        )
+    # A trial that only removed units saw is of no use, but with no unit left it is not the trial's fault.
+    return covered & kept if kept.any() else covered, kept
+
+
+def merged_spans(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """Join the recorded spans [n, 2] (s) that touch or overlap."""
+    merged: list[tuple[float, float]] = []
+    for low, high in sorted(map(tuple, spans.tolist())):
+        if merged and low <= merged[-1][1]:
+            merged[-1] = (merged[-1][0], max(high, merged[-1][1]))
+        else:
+            merged.append((low, high))
+    return merged
+
+
+def _overlaps(edges: NDArray[np.float64], invalid: Table) -> NDArray[np.bool_]:
+    begin, end = invalid.times("start_time"), invalid.times("stop_time")
+    return np.asarray(((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1))
+
+
+def _rows_in_order(rows: NDArray[np.int64], table: Table) -> NDArray[np.int64]:
+    """Sort trials by start time, then id, so that the order of rows in the file changes nothing."""
+    starts, ids = table.times("start_time"), as_labels(table.ids()).tolist()
+    return np.array(sorted(rows.tolist(), key=lambda row: (starts[row], natural_key(ids[row]))), dtype=np.int64)
+
+
+def _units_in_order(rows: NDArray[np.int64], units: Table, spikes: list[NDArray[np.float64]]) -> NDArray[np.int64]:
+    """Sort units by id; equal ids (several probes) by their spikes."""
+    ids = as_labels(units.ids()).tolist()
+
+    def key(row: int) -> tuple[Any, ...]:
+        return natural_key(ids[row]), len(spikes[row]), spikes[row][:1].tolist()
+
+    return np.array(sorted(rows.tolist(), key=key), dtype=np.int64)
+
+
+def _unit_column(units: Table, name: str, kind: type, rows: NDArray[np.int64]) -> NDArray[Any]:
+    if name not in units:
+        return np.full(len(rows), np.nan) if kind is float else np.full(len(rows), "", dtype="U1")
+    values = units.column(name)[rows]
+    return values.astype(np.float64) if kind is float and values.dtype.kind in "biuf" else as_labels(values)

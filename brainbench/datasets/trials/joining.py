@@ -1,0 +1,140 @@
+"""Join the sessions that were read into one recordings data set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError
+from brainbench.core.files import content_hash
+from brainbench.datasets.sessions import natural_key
+from brainbench.datasets.trials.conditions import natural_vocabulary
+from brainbench.datasets.trials.counting import UNIT_COLUMNS, Part, Plan
+from brainbench.datasets.trials.covariates import COVARIATES
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def join(parts: list[Part], plan: Plan, *, source: str, recipe: str, notes: list[str]) -> xr.Dataset:
+    """Join the sessions' trials and units, block by block, in canonical order.
+
+    Args:
+        parts: what was read of each session, in any order.
+        plan: how it was read.
+        source: what the user asked for.
+        recipe: name of the recipe, with how it was chosen, or "".
+        notes: what was noted before the sessions were read.
+
+    Raises:
+        DataError: no trial, no unit or only one condition remains.
+    """
+    import xarray as xr
+
+    parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
+    removed = _total(part.tally.removed for part in parts)
+    everything, parts = parts, [part for part in parts if part.labels] or parts
+    notes = [*notes, *(_left_out(part) for part in everything if not part.labels)]
+    trials, units = sum(len(part.labels) for part in parts), sum(len(part.unit_ids) for part in parts)
+    if not trials or not units:
+        what = "trial" if not trials else "unit"
+        reasons = "; ".join(f"{rule} removed {number}" for rule, number in removed.items() if number)
+        raise DataError(f"No {what} remains of {source}: {reasons or 'the tables are empty'}.")
+    vocabulary = plan.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
+    present = {label for part in parts for label in part.labels}
+    if len(present) < 2:
+        raise DataError(
+            f"All {trials} trials of {source} that remain have the one condition {next(iter(present))!r} "
+            f"({plan.conditions}); comparing responses needs at least two, choose another column."
+        )
+    bins = max(part.counts.shape[1] for part in parts)
+    counts = np.full((trials, bins, units), np.nan, dtype=np.float32)
+    duration = np.zeros((trials, bins))
+    row = column = 0
+    for part in parts:
+        count, depth, width = part.counts.shape
+        counts[row : row + count, :depth, column : column + width] = part.counts
+        duration[row : row + count, :depth] = part.duration
+        row, column = row + count, column + width
+    edges = np.concatenate([part.edges for part in parts])
+    coordinates: dict[str, Any] = {
+        "time": ("time", np.arange(bins) * (plan.bin or 0.0)),
+        "stimulus": ("trial", [label for part in parts for label in part.labels]),
+        "subject": ("trial", [part.subject for part in parts for _ in part.labels]),
+        "session": ("trial", [part.session for part in parts for _ in part.labels]),
+        "trial_id": ("trial", [name for part in parts for name in part.trial_ids]),
+        "window_start": ("trial", edges[:, 0]),
+        "window_stop": ("trial", edges[:, 1]),
+        "unit_subject": ("unit", [part.subject for part in parts for _ in part.unit_ids]),
+        "unit_session": ("unit", [part.session for part in parts for _ in part.unit_ids]),
+        "unit_id": ("unit", [name for part in parts for name in part.unit_ids]),
+        **{name: ("unit", np.concatenate([part.columns[name] for part in parts])) for name in UNIT_COLUMNS},
+        **{name: ("trial", _covariate(parts, name)) for name in COVARIATES if any(name in p.covariates for p in parts)},
+    }
+    dataset = xr.Dataset(
+        {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}, coordinates
+    )
+    dataset.attrs = {
+        "vocabulary": list(vocabulary),
+        "conditions": str(plan.conditions),
+        "recipe": recipe,
+        "window": str(plan.window),
+        "bin": plan.bin,
+        "selection": {"name": plan.selection.name, "rules": list(plan.selection.lines())},
+        "removed": removed,
+        "missing": _missing(parts, vocabulary),
+        "sessions": [_about(part) for part in everything],
+        "notes": [*notes, *(note for part in everything for note in part.tally.notes)],
+        "source": source,
+        "synthetic": any(part.synthetic for part in everything),
+        "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
+    }
+    return dataset
+
+
+def _covariate(parts: list[Part], name: str) -> NDArray[np.float64]:
+    """Return one covariate of all trials; NaN in sessions that do not tell it."""
+    return np.concatenate([part.covariates.get(name, np.full(len(part.labels), np.nan)) for part in parts])
+
+
+def _left_out(part: Part) -> str:
+    return f"{part.source}: no trial is left, so its {len(part.unit_ids)} units are left out"
+
+
+def _content(part: Part) -> tuple[Any, ...]:
+    """What makes the data: all else (window, selection, file names) only says how they came about."""
+    names = (part.subject, part.session, part.labels, part.trial_ids, part.unit_ids)
+    return part.counts, part.duration, names
+
+
+def _about(part: Part) -> dict[str, Any]:
+    return {
+        "subject": part.subject,
+        "session": part.session,
+        "source": part.source,
+        "trials": len(part.labels),
+        "trials_in_file": part.trials,
+        "units": len(part.unit_ids),
+        "units_in_file": part.units,
+        "removed": dict(part.tally.removed),
+        "synthetic": part.synthetic,
+    }
+
+
+def _missing(parts: list[Part], vocabulary: tuple[str, ...]) -> dict[str, list[str]]:
+    have: dict[str, set[str]] = {}
+    for part in parts:
+        have.setdefault(part.subject, set()).update(part.labels)
+    gaps = {subject: [label for label in vocabulary if label not in labels] for subject, labels in have.items()}
+    return {subject: labels for subject, labels in gaps.items() if labels}
+
+
+def _total(tallies: Iterable[dict[str, int]]) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for tally in tallies:
+        for rule, number in tally.items():
+            total[rule] = total.get(rule, 0) + number
+    return total

@@ -1,0 +1,190 @@
+"""Which trials and units enter: rules that are stated, applied in order, and counted."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import UsageError
+from brainbench.datasets.sessions import Table, as_labels
+
+_TRUTH = {"true": ("true", "1"), "false": ("false", "0")}
+_RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(?P<sign>!=|=)\s*(?P<values>.+?)\s*$")
+_RANGE = re.compile(r"^(?P<low>[-+.\deE]*)\.\.(?P<high>[-+.\deE]*)$")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One condition on one column; rows that fail it are removed and counted.
+
+    Values are compared as text, so ``1``, ``"1"`` and ``1.0`` agree, and ``"true"`` also matches 1.
+    A row without a value fails ``allow``, ``low`` and ``high`` and passes ``refuse``.
+    """
+
+    column: str
+    allow: tuple[str, ...] = ()
+    """Keep only rows with one of these values."""
+    refuse: tuple[str, ...] = ()
+    """Remove rows with one of these values."""
+    low: float | None = None
+    """Smallest value kept."""
+    high: float | None = None
+    """Largest value kept."""
+    required: bool = True
+    """False: a table without the column passes, and the result says that the rule did not apply."""
+
+    def __str__(self) -> str:
+        parts = []
+        if self.allow:
+            parts.append(f"{self.column}={'|'.join(self.allow)}")
+        if self.refuse:
+            parts.append(f"{self.column}!={'|'.join(self.refuse)}")
+        if self.low is not None or self.high is not None:
+            low, high = ("" if bound is None else f"{bound:g}" for bound in (self.low, self.high))
+            parts.append(f"{self.column}={low}..{high}")
+        return " and ".join(parts)
+
+    def keep(self, table: Table) -> NDArray[np.bool_] | None:
+        """Return which rows of ``table`` pass [rows], or None where an optional column is absent.
+
+        Raises:
+            UsageError: a required column is absent (the nearest is named).
+            DataError: the column holds lists, or text where a range is asked for.
+        """
+        if self.column not in table:
+            if self.required:
+                table.require(self.column)
+            return None
+        values = table.column(self.column)
+        labels = np.char.lower(as_labels(values))
+        keep = np.ones(len(labels), dtype=bool)
+        if self.allow:
+            keep &= np.isin(labels, _spellings(self.allow))
+        if self.refuse:
+            keep &= ~np.isin(labels, _spellings(self.refuse))
+        if self.low is not None or self.high is not None:
+            numbers = table.times(self.column)
+            keep &= numbers >= (-np.inf if self.low is None else self.low)
+            keep &= numbers <= (np.inf if self.high is None else self.high)
+        return keep
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Rules for trials and units. Each row is counted under the first rule that removes it."""
+
+    trials: tuple[Rule, ...] = ()
+    units: tuple[Rule, ...] = ()
+    min_spikes: int = 1
+    """A unit needs this many spikes in its file; 0 keeps silent units."""
+    subjects: tuple[str, ...] = ()
+    """Keep only these subjects; empty keeps all."""
+    name: str = "custom"
+
+    @classmethod
+    def parse(cls, source: str) -> Selection:
+        """Read a selection from text, as the command line takes it.
+
+        Rules are separated by ``;``. ``COLUMN=a|b`` keeps values, ``COLUMN!=a|b`` removes them,
+        ``COLUMN=low..high`` keeps a range; a column is of the trial table unless it starts with
+        ``units.``. ``min_spikes=N`` and ``subjects=a|b`` are their own rules.
+
+        >>> Selection.parse("outcome=correct|error; units.layer=4; min_spikes=50").min_spikes
+        50
+
+        Raises:
+            UsageError: a part is not of this form.
+        """
+        trials: list[Rule] = []
+        units: list[Rule] = []
+        selection = cls(name=source.strip())
+        for part in filter(None, (item.strip() for item in source.split(";"))):
+            match = _RULE.match(part)
+            if match is None:
+                raise UsageError(
+                    f"The selection rule {part!r} cannot be read; write COLUMN=a|b, COLUMN!=a|b or COLUMN=low..high, "
+                    f"with units. before columns of the units table, and ';' between rules."
+                )
+            column, values = match["column"], match["values"]
+            if column == "min_spikes":
+                selection = replace(selection, min_spikes=_integer(values))
+            elif column == "subjects":
+                selection = replace(selection, subjects=_values(values))
+            else:
+                rule = _rule(column, match["sign"], values)
+                (units if match["scope"] == "units" else trials).append(rule)
+        return replace(selection, trials=tuple(trials), units=tuple(units))
+
+    def lines(self) -> Iterator[str]:
+        """Say every rule in one line each."""
+        yield from (f"trials: {rule}" for rule in self.trials)
+        yield from (f"units: {rule}" for rule in self.units)
+        if self.min_spikes:
+            yield f"units: at least {self.min_spikes} spike{'s' * (self.min_spikes > 1)} in the file"
+        if self.subjects:
+            yield f"subjects: {', '.join(self.subjects)}"
+
+
+EVERYTHING = Selection(min_spikes=0, name="none")
+"""No rule at all, silent units included."""
+DEFAULT = Selection(name="default")
+"""All trials; units with at least one spike."""
+
+
+@dataclass
+class Tally:
+    """How many rows each rule removed; trials and units stand under separate keys."""
+
+    removed: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def apply(self, kept: NDArray[np.bool_], passes: Any, rule: str) -> NDArray[np.bool_]:
+        """Return the rows that remain and count those that only now fell out."""
+        self.removed[rule] = self.removed.get(rule, 0) + int(np.sum(kept & ~passes))
+        return kept & passes
+
+    def select(self, table: Table, rules: tuple[Rule, ...], scope: str) -> NDArray[np.bool_]:
+        """Apply rules in order to all rows of a table; returns which remain [rows]."""
+        kept = np.ones(len(table), dtype=bool)
+        for rule in rules:
+            passes = rule.keep(table)
+            if passes is None:
+                self.notes.append(f"{table.label}: no column {rule.column!r}, so the rule {rule} did not apply")
+            else:
+                kept = self.apply(kept, passes, f"{scope}: {rule}")
+        return kept
+
+
+def _spellings(values: tuple[str, ...]) -> list[str]:
+    return [spelling for value in values for spelling in _TRUTH.get(value.lower(), (value.lower(),))]
+
+
+def _rule(column: str, sign: str, values: str) -> Rule:
+    span = _RANGE.match(values)
+    if span is None:
+        return Rule(column, allow=_values(values)) if sign == "=" else Rule(column, refuse=_values(values))
+    if sign == "!=":
+        raise UsageError(f"A range cannot be refused ({column}!={values}); state the range to keep.")
+    return Rule(column, low=_number(span["low"]), high=_number(span["high"]))
+
+
+def _values(source: str) -> tuple[str, ...]:
+    return tuple(item.strip() for item in source.split("|") if item.strip())
+
+
+def _number(source: str) -> float | None:
+    try:
+        return float(source) if source else None
+    except ValueError as error:
+        raise UsageError(f"{source!r} is not a number; a range is written low..high.") from error
+
+
+def _integer(source: str) -> int:
+    if not source.isdigit():
+        raise UsageError(f"min_spikes is a whole number from 0; received {source!r}.")
+    return int(source)

@@ -1,0 +1,146 @@
+"""When responses are read: from one event of each trial to another, in bins."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets.sessions import Session, Table
+
+FIRST_CONTACT = "first-contact"
+CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
+"""Names of the interval tables that hold one whisker's contacts."""
+_ANCHORS = {"start": "start_time", "stop": "stop_time", "choice": "choice_time"}
+_EDGE = re.compile(r"^(?P<name>.*?)(?P<offset>[+-]\d*\.?\d+)?$")
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of each trial that is read, [anchor + offset, end), in seconds.
+
+    An anchor is ``start``, ``stop``, ``choice`` (the trial table's start_time, stop_time and
+    choice_time), ``first-contact`` or any column of the trial table that holds times. The end is
+    ``length`` after the beginning, or ``stop`` + ``stop_offset``; with both, whichever comes first.
+
+    ``first-contact`` is the earliest contact of any whisker (tables ``contacts_by_whisker_*``) that
+    starts inside the trial and before the window's end.
+
+    Raises:
+        UsageError: it has no end, no positive length, or ends at the first contact.
+    """
+
+    anchor: str = "start"
+    offset: float = 0.0
+    stop: str | None = None
+    stop_offset: float = 0.0
+    length: float | None = None
+    shortest_contact: float = 0.0
+    """A contact counts if it lasts longer than this (s): rows of zero duration are empty intervals
+    and do not. A negative value counts them too."""
+    fallback: Window | None = None
+    """Used for all trials of a session that has no contact tables at all, and said in the notes."""
+
+    def __post_init__(self) -> None:
+        if self.stop is None and self.length is None:
+            raise UsageError(f"The window from {self.anchor!r} has no end; give stop (an anchor) or length (s).")
+        if self.length is not None and not self.length > 0:
+            raise UsageError(f"A window's length is positive; received {self.length} s.")
+        if self.stop == FIRST_CONTACT:
+            raise UsageError("A window cannot end at the first contact, which is sought before its end.")
+
+    @classmethod
+    def parse(cls, source: str) -> Window:
+        """Read a window from text ``FROM[±s]..TO[±s]`` or ``FROM[±s]..+LENGTH``.
+
+        >>> str(Window.parse("first-contact..choice"))
+        'first-contact..choice'
+        >>> Window.parse("start+0.2..+0.5").length
+        0.5
+
+        Raises:
+            UsageError: the text is not of this form.
+        """
+        first, dots, last = (part.strip() for part in source.partition(".."))
+        begin, end = _EDGE.match(first), _EDGE.match(last)
+        if not dots or begin is None or end is None or not begin["name"] or not last:
+            raise UsageError(
+                f"The window {source!r} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
+                f"'first-contact..choice' or 'start+0.2..+0.5'."
+            )
+        window = {"anchor": begin["name"], "offset": float(begin["offset"] or 0)}
+        if end["name"]:
+            return cls(**window, stop=end["name"], stop_offset=float(end["offset"] or 0))
+        return cls(**window, length=float(end["offset"]))
+
+    def __str__(self) -> str:
+        ends = [f"{self.stop}{_signed(self.stop_offset)}"] if self.stop else []
+        ends += [f"+{self.length:g}"] if self.length is not None else []
+        return f"{self.anchor}{_signed(self.offset)}..{' or '.join(ends)}"
+
+    def edges(self, session: Session, table: Table, notes: list[str]) -> NDArray[np.float64]:
+        """Return begin and end of the window of every row [rows, 2] (s); NaN where an event is missing.
+
+        Raises:
+            UsageError: an anchor is neither a known one nor a column of the table.
+            DataError: contacts are asked for and the session has no contact tables and no fallback.
+        """
+        contacts = {name: item for name, item in session.tables.items() if CONTACTS.match(name)}
+        if self.anchor == FIRST_CONTACT and not contacts:
+            if self.fallback is None:
+                raise DataError(
+                    f"{session.source} has no tables contacts_by_whisker_*, so there is no first contact; choose "
+                    f"another window, such as 'start..stop'."
+                )
+            notes.append(f"{session.source}: no contact tables; window {self.fallback} for its {len(table)} trials")
+            return self.fallback.edges(session, table, notes)
+        limit = np.full(len(table), np.inf)
+        if self.stop is not None:
+            limit = _event(table, self.stop) + self.stop_offset
+        if self.anchor == FIRST_CONTACT:
+            until = np.fmin(limit, _event(table, "stop")) if "stop_time" in table else limit
+            begin = self._first_contacts(session.source, contacts, _event(table, "start"), until, notes)
+        else:
+            begin = _event(table, self.anchor)
+        begin = begin + self.offset
+        if self.length is not None:
+            limit = np.minimum(limit, begin + self.length)
+        return np.stack([begin, limit], axis=1)
+
+    def _first_contacts(
+        self,
+        source: str,
+        contacts: dict[str, Table],
+        start: NDArray[np.float64],
+        until: NDArray[np.float64],
+        notes: list[str],
+    ) -> NDArray[np.float64]:
+        begin = np.concatenate([table.times("start_time") for table in contacts.values()])
+        end = np.concatenate([table.times("stop_time") for table in contacts.values()])
+        lasting = end - begin > self.shortest_contact
+        if not np.all(lasting):
+            notes.append(f"{source}: {np.sum(~lasting)} of {len(begin)} contacts too brief to be the first")
+        times = np.sort(begin[lasting])
+        where = np.searchsorted(times, start, side="left")
+        first = np.append(times, np.inf)[where]
+        return np.where(first < until, first, np.nan)
+
+
+WHOLE = Window("start", stop="stop")
+"""The whole interval of each row."""
+
+
+def resolve_window(window: Window | str) -> Window:
+    """Return a window from itself or from text."""
+    return Window.parse(window) if isinstance(window, str) else window
+
+
+def _event(table: Table, anchor: str) -> NDArray[np.float64]:
+    return table.times(_ANCHORS.get(anchor, anchor))
+
+
+def _signed(seconds: float) -> str:
+    return f"{seconds:+g}" if seconds else ""

@@ -1,0 +1,356 @@
+"""Read data sets of whisker sweeps for training: memory-mapped shards, shuffled batches, exact resume.
+
+The files are those of ``brainbench stimuli sweep --out``; their layout is described in ``docs/datasets.md``. Letters:
+B batch, T time step, S sub-step, C channel, W whisker, H×W whisker grid, N sweep.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.files import cache_dir, content_hash, read_json, write_json
+from brainbench.datasets.whisking.files import open_shard, read_manifest, verify_shard
+from brainbench.datasets.whisking.memory import Buffers, Maps
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+View = Literal["grid", "raw"]
+Unstable = Literal["skip", "zero", "error"]
+
+SPLITS = ("train", "validation", "test", "all")
+"""What ``split`` may be; ``all`` is the three together."""
+
+_AHEAD = 2
+_BLOCK = 64
+
+
+class Batch(NamedTuple):
+    """Some sweeps, on the device."""
+
+    input: torch.Tensor
+    """[B, T, S·C, H, W], or [B, frame, W, C] as stored; float32, N and N·m."""
+    label: torch.Tensor
+    """[B] int64 index into the classes."""
+
+
+@dataclass(frozen=True)
+class ChannelStatistics:
+    """What a normaliser needs to know of the six channels (Fx … Mz; N and N·m), over all whiskers and frames."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    """Standard deviation; whiskers that touch nothing count as zeros."""
+    largest: tuple[float, ...]
+    """Largest magnitude."""
+    values: int
+    """Numbers per channel that were read."""
+
+
+class WhiskingDataset:
+    """Batches of sweeps of one split, in an order drawn anew in every epoch.
+
+    Iterating runs through one epoch from where the last iteration stopped; the state can be saved between any two
+    batches and loaded again: then the same batches follow.
+
+    >>> data = WhiskingDataset("sweeps", split="train", batch_size=256, device="cuda")  # doctest: +SKIP
+    >>> for x, y in data: ...  # doctest: +SKIP
+
+    Args:
+        folder: where ``brainbench stimuli sweep`` wrote.
+        split: one of :data:`SPLITS`.
+        batch_size: B.
+        view: ``grid`` gives [B, T, S·C, H, W] as ``to_grid`` of a stimulus set does; ``raw`` [B, frame, W, C].
+        substeps: frames S that make one time step of the grid.
+        shuffle: draw the order from seed and epoch; in the order of the files when False.
+        seed: of the order.
+        device: where batches go, in the words of torch.
+        unstable: sweeps with a whisker whose simulation failed are left out (``skip``), their missing numbers read as
+            zero (``zero``), or refused (``error``). Sweeps without any forces are always left out.
+        drop_last: leave out the last batch of an epoch when it is smaller.
+        part: (rank, number of processes): each process reads another part of every epoch, all equally many batches.
+
+    Raises:
+        UsageError: an argument is out of range; the message names the nearest.
+        DataError: the folder holds no finished data set, a shard is missing or damaged, or the split is empty.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        split: str = "train",
+        batch_size: int = 256,
+        view: View = "grid",
+        substeps: int = 5,
+        shuffle: bool = True,
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+        unstable: Unstable = "skip",
+        drop_last: bool = False,
+        part: tuple[int, int] = (0, 1),
+    ) -> None:
+        for kind, value, allowed in (
+            ("split", split, SPLITS),
+            ("view", view, get_args(View)),
+            ("treatment of unstable sweeps", unstable, get_args(Unstable)),
+        ):
+            if value not in allowed:
+                raise unknown_name(kind, str(value), allowed)
+        if batch_size < 1 or not 0 <= part[0] < part[1]:
+            raise UsageError(
+                f"A batch has at least one sweep and a part is (rank, number) with 0 ≤ rank < number; received "
+                f"batch_size {batch_size!r} and part {part!r}."
+            )
+        self.folder = Path(folder)
+        self.split, self.view, self.substeps, self.unstable = split, view, substeps, unstable
+        self.batch_size, self.shuffle, self.seed, self.device = batch_size, shuffle, seed, device
+        self.drop_last, self.part = drop_last, part
+        self.manifest: Mapping[str, Any] = read_manifest(self.folder)
+        self.classes = tuple(str(name) for name in self.manifest["classes"])
+        entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]
+        self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
+        self._choose()
+        self._buffers = Buffers(2 * (_AHEAD + 2))
+        self._maps = Maps(self._shards)
+        self.epoch = 0
+        """Number of the epoch that the next batch belongs to, from 0."""
+        self._batch = 0
+        if view == "grid":
+            self._check_grid()
+        if not len(self):
+            raise UsageError(
+                f"The {self.sweeps} sweeps of the split {split!r} make no batch of {batch_size} for each of {part[1]} "
+                "processes; choose a smaller batch, or keep the last one."
+            )
+
+    def _choose(self) -> None:
+        """List the sweeps that can be used."""
+        if not self._shards:
+            have = listing(name for name, item in self.manifest["splits"].items() if item["sweeps"])
+            raise DataError(f"The split {self.split!r} of {str(self.folder)!r} has no sweeps; it has {have}.")
+        bad = [shard.broken for shard in self._shards]
+        if self.unstable == "error" and any(broken.any() for broken in bad):
+            count = sum(int(broken.sum()) for broken in bad)
+            raise DataError(
+                f"{count} sweeps of {str(self.folder)!r} have unstable whiskers (status in the shards says which): "
+                "leave them out with unstable='skip', or simulate with a finer fidelity."
+            )
+        kept = [
+            np.flatnonzero(~shard.empty & (~shard.broken if self.unstable == "skip" else True))
+            for shard in self._shards
+        ]
+        self._where = np.concatenate([np.full(len(rows), i) for i, rows in enumerate(kept)])
+        self._row = np.concatenate(kept)
+        self.skipped = sum(shard.sweeps for shard in self._shards) - len(self._row)
+        """Sweeps of the split that are left out because they are unstable."""
+        if not len(self._row):
+            raise DataError(f"All sweeps of the split {self.split!r} of {str(self.folder)!r} are unstable.")
+
+    @property
+    def sweeps(self) -> int:
+        """Number N of sweeps that can be used."""
+        return len(self._row)
+
+    @cached_property
+    def labels(self) -> NDArray[np.int64]:
+        """[N] class of each sweep, an index into :attr:`classes`."""
+        return self._gathered([shard.labels for shard in self._shards]).astype(np.int64)
+
+    @cached_property
+    def objects(self) -> NDArray[np.str_]:
+        """[N] name of the object of each sweep."""
+        return self._gathered([shard.objects for shard in self._shards])
+
+    @cached_property
+    def indices(self) -> NDArray[np.int64]:
+        """[N] number of each sweep in the whole grid of sweeps and objects."""
+        return self._gathered([shard.indices for shard in self._shards])
+
+    def __len__(self) -> int:
+        """Count the batches of an epoch."""
+        each = self.sweeps // self.part[1]
+        return each // self.batch_size if self.drop_last else -(-each // self.batch_size)
+
+    def __repr__(self) -> str:
+        return (
+            f"WhiskingDataset({str(self.folder)!r}, {self.split}: {self.sweeps} sweeps of {len(self.classes)} classes, "
+            f"{len(self)} batches of {self.batch_size}; {self.skipped} unstable sweeps left out)"
+        )
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield the batches of the epoch that are still to come."""
+        if self._batch >= len(self):  # a state saved after the last batch of an epoch
+            self.epoch, self._batch = self.epoch + 1, 0
+        order, first = self.order(self.epoch), self._batch
+        parts = [order[i * self.batch_size : (i + 1) * self.batch_size] for i in range(first, len(self))]
+        coming: deque[Any] = deque()
+        # One thread makes batches while the caller computes; copies release the interpreter.
+        with ThreadPoolExecutor(1) as pool:
+            try:
+                for part in (*parts, *[None] * _AHEAD):
+                    if part is not None:
+                        coming.append(pool.submit(self.batch, part))
+                    if len(coming) > (_AHEAD if part is not None else 0):
+                        ready = coming.popleft().result()
+                        self._batch += 1
+                        yield ready
+            finally:
+                for future in coming:
+                    future.cancel()
+        self.epoch, self._batch = self.epoch + 1, 0
+
+    def order(self, epoch: int) -> NDArray[np.int64]:
+        """Return the sweeps of this part of an epoch, numbers from 0 to N − 1, in their order."""
+        count = self.sweeps
+        every = np.random.default_rng([self.seed, epoch]).permutation(count) if self.shuffle else np.arange(count)
+        rank, parts = self.part
+        return every[: count // parts * parts][rank::parts]
+
+    def batch(self, sweeps: Sequence[int] | NDArray[np.integer]) -> Batch:
+        """Return chosen sweeps, numbers from 0 to N − 1, as a batch on the device."""
+        import torch
+
+        sweeps = np.asarray(sweeps)
+        device = torch.device(self.device)
+        shape = (len(sweeps), *self._shards[0].shape)
+        if device.type == "cuda":
+            raw = torch.empty(shape, dtype=torch.float32, pin_memory=True)
+        else:
+            raw = torch.from_numpy(self._buffers.take(shape))
+        self.read(sweeps, out=raw.numpy())
+        label = torch.from_numpy(self.labels[sweeps]).to(device)
+        moved = raw.to(device, non_blocking=True)
+        return Batch(self._to_grid(moved) if self.view == "grid" else moved, label)
+
+    def read(
+        self, sweeps: Sequence[int] | NDArray[np.integer], *, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Return the forces of chosen sweeps, numbers from 0 to N − 1: [n, frame, W, C] (N, N·m).
+
+        Args:
+            sweeps: which.
+            out: array to fill, of that shape.
+        """
+        sweeps = np.asarray(sweeps)
+        result = np.empty((len(sweeps), *self._shards[0].shape), np.float32) if out is None else out
+        for place, (shard, row) in enumerate(
+            zip(self._where[sweeps].tolist(), self._row[sweeps].tolist(), strict=True)
+        ):
+            np.copyto(result[place], self._maps.forces(shard)[row])
+        if self.unstable == "zero":
+            np.nan_to_num(result, copy=False, nan=0.0)
+        return result
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return where the iteration stands, for :meth:`load_state_dict`; plain values."""
+        return {**self._identity(), "epoch": self.epoch, "batch": self._batch}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where another data set of the same files and options stood.
+
+        Raises:
+            UsageError: it had other files or options; the message says which.
+        """
+        mine = self._identity()
+        other = [key for key, value in mine.items() if state.get(key) != value]
+        if other:
+            told = ", ".join(f"{key} {state.get(key)!r} (here {mine[key]!r})" for key in other)
+            raise UsageError(f"The saved state belongs to other batches: {told}.")
+        self.epoch, self._batch = int(state["epoch"]), int(state["batch"])
+
+    def verify(self) -> None:
+        """Read every byte of the split and compare hashes.
+
+        Raises:
+            DataError: a shard is not what was generated; the message names it.
+        """
+        for shard in self._shards:
+            verify_shard(shard)
+
+    def statistics(self) -> ChannelStatistics:
+        """Return mean, spread and largest value of each channel over the sweeps of the split.
+
+        All of them are read once; the result is kept in the cache.
+        """
+        key = content_hash([self.manifest["content_hash"], self.split, self.unstable], length=24)
+        path = cache_dir("whisking") / f"{key}.json"
+        if path.exists():
+            stored = read_json(path)
+            mean, std, largest = (tuple(stored[name]) for name in ("mean", "std", "largest"))
+            return ChannelStatistics(mean, std, largest, stored["values"])
+        channels = len(CHANNELS)
+        total, squares, largest, values = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
+        for first in range(0, self.sweeps, _BLOCK):
+            block = self.read(np.arange(first, min(first + _BLOCK, self.sweeps))).reshape(-1, channels).astype(float)
+            total += block.sum(axis=0)
+            squares += np.einsum("ij,ij->j", block, block)
+            largest = np.maximum(largest, np.abs(block).max(axis=0))
+            values += len(block)
+        mean = total / values
+        std = np.sqrt(np.maximum(squares / values - mean**2, 0.0))
+        found = ChannelStatistics(tuple(mean.tolist()), tuple(std.tolist()), tuple(largest.tolist()), values)
+        write_json(path, found)
+        return found
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "content_hash": self.manifest["content_hash"],
+            "split": self.split,
+            "unstable": self.unstable,
+            "seed": self.seed,
+            "shuffle": self.shuffle,
+            "batch_size": self.batch_size,
+            "drop_last": self.drop_last,
+            "part": list(self.part),
+        }
+
+    def _gathered(self, columns: list[NDArray[Any]]) -> NDArray[Any]:
+        """Put per-shard columns together for the sweeps that can be used."""
+        starts = np.cumsum([0, *(len(column) for column in columns)])
+        return np.concatenate(columns)[starts[self._where] + self._row]
+
+    def _check_grid(self) -> None:
+        frames = self._shards[0].shape[0]
+        if self.substeps < 1 or frames % self.substeps:
+            raise UsageError(f"{frames} frames do not divide into time steps of {self.substeps} sub-steps.")
+        if len(np.unique(self._shards[0].cells)) < len(self._shards[0].cells):
+            raise UsageError("The data set has two whiskers in one cell of the grid; read it with view='raw'.")
+
+    @cached_property
+    def _columns(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where each number of a frame's grid [C·H·W] stands in the frame [W·C], and the cells without a whisker."""
+        import torch
+
+        cells, size = self._shards[0].cells, GRID_SHAPE[0] * GRID_SHAPE[1]
+        source = np.zeros((len(CHANNELS), size), dtype=np.int64)
+        source[:, cells] = np.arange(len(cells)) * len(CHANNELS) + np.arange(len(CHANNELS))[:, None]
+        empty = np.setdiff1d(np.arange(size), cells)
+        return torch.from_numpy(source.reshape(-1)).to(self.device), torch.from_numpy(empty).to(self.device)
+
+    def _to_grid(self, raw: torch.Tensor) -> torch.Tensor:
+        """Return [B, T, S·C, H, W] of [B, frame, W, C]: sub-step major, cells without a whisker zero."""
+        import torch
+
+        source, empty = self._columns
+        count, frames = raw.shape[:2]
+        rows = raw.view(count * frames, -1)
+        if raw.device.type == "cpu":
+            grid = torch.from_numpy(self._buffers.take((len(rows), len(source))))
+            torch.index_select(rows, 1, source, out=grid)
+        else:
+            grid = rows.index_select(1, source)
+        grid.view(-1, GRID_SHAPE[0] * GRID_SHAPE[1]).index_fill_(1, empty, 0.0)
+        return grid.view(count, frames // self.substeps, self.substeps * len(CHANNELS), *GRID_SHAPE)

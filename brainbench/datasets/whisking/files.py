@@ -1,0 +1,134 @@
+"""The files of a data set of sweeps: manifest and shards, as ``docs/datasets.md`` describes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SWEEPS_FORMAT, SWEEPS_SCHEMA
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.files import hash_arrays, read_json
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_UNUSABLE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Shard:
+    """One shard: where its forces are, and what they belong to."""
+
+    path: Path
+    offset: int
+    """Where in the file the forces begin [bytes]."""
+    sweeps: int
+    shape: tuple[int, int, int]
+    """(frames, whiskers, channels) of one sweep."""
+    cells: NDArray[np.int64]
+    """[whisker] flat index row·7 + col in the grid."""
+    labels: NDArray[np.int32]
+    objects: NDArray[np.str_]
+    indices: NDArray[np.int64]
+    broken: NDArray[np.bool_]
+    """[sweep] whether any whisker is not ok."""
+    empty: NDArray[np.bool_]
+    """[sweep] whether there are no forces at all."""
+    content_hash: str
+    """As the manifest has it."""
+
+
+def read_manifest(folder: Path) -> Mapping[str, Any]:
+    """Read the manifest of a finished data set.
+
+    Raises:
+        DataError: there is none, or it is of a newer layout.
+    """
+    path = folder / "manifest.json"
+    if not path.is_file():
+        if (folder / "config.json").is_file():
+            raise DataError(
+                f"The data set in {str(folder)!r} is not finished: give the command that began it again; it goes on."
+            )
+        raise DataFileNotFoundError(
+            f"There is no data set of sweeps in {str(folder)!r} (no manifest.json); make one with: brainbench stimuli "
+            "sweep thesis-low --objects procedural-24:10 --out FOLDER."
+        )
+    manifest = read_json(path)
+    found = (manifest.get("format"), manifest.get("schema")) if isinstance(manifest, dict) else (None, None)
+    if found != (SWEEPS_FORMAT, SWEEPS_SCHEMA):
+        raise DataError(
+            f"{str(path)!r} has format {found[0]!r} version {found[1]!r}; this brainbench reads {SWEEPS_FORMAT!r} "
+            f"version {SWEEPS_SCHEMA}: generate the data again or use the version that wrote it."
+        )
+    return manifest
+
+
+def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> Shard:
+    """Read what stands beside the forces of a shard that the manifest names.
+
+    Raises:
+        DataError: the file is missing, damaged, or another one.
+    """
+    import h5py
+
+    again = "remove it and give the command that made the data set again"
+    if not path.is_file():
+        raise DataFileNotFoundError(f"The shard {str(path)!r} of the manifest is missing; {again}.")
+    try:
+        opened: Any = h5py.File(path, "r")
+        with opened as file:
+            wrench = file["wrench"]
+            sweeps, *rest = wrench.shape
+            offset = wrench.id.get_offset()
+            end = offset + wrench.size * 4
+            channels = tuple(file["channel"].asstr()[:])
+            names = file["object"].asstr()[:].astype(str)
+            status = file["status"][:]
+            shard = Shard(
+                path=path,
+                offset=offset,
+                sweeps=sweeps,
+                shape=(rest[0], rest[1], rest[2]),
+                cells=file["row"][:].astype(np.int64) * GRID_SHAPE[1] + file["col"][:],
+                labels=file["label"][:],
+                objects=names[file["owner"][:]],
+                indices=file["sweep"][:],
+                broken=(status != 0).any(axis=1),
+                empty=(status == _UNUSABLE).all(axis=1),
+                content_hash=str(entry["content_hash"]),
+            )
+            config = str(file.attrs["config_hash"])
+    except (OSError, KeyError, ValueError, IndexError) as error:
+        raise DataError(f"The shard {str(path)!r} is damaged ({error}); {again}.") from error
+    if path.stat().st_size < end:
+        raise DataError(f"The shard {str(path)!r} is damaged: it ends before its last force; {again}.")
+    if config != manifest["config_hash"] or sweeps != entry["sweeps"] or channels != CHANNELS:
+        raise DataError(f"The shard {str(path)!r} does not belong to the manifest beside it; {again}.")
+    return shard
+
+
+def verify_shard(shard: Shard) -> None:
+    """Compare what a shard holds with the hash in the manifest.
+
+    Raises:
+        DataError: it differs.
+    """
+    import h5py
+
+    try:
+        opened: Any = h5py.File(shard.path, "r")
+        with opened as file:
+            arrays = {name: file[name][()] for name in file if name != "wrench"}
+    except (OSError, KeyError) as error:
+        raise DataError(f"The shard {str(shard.path)!r} is damaged ({error}); generate it again.") from error
+    arrays["wrench"] = np.memmap(shard.path, "<f4", "r", shard.offset, (shard.sweeps, *shard.shape))
+    if hash_arrays(arrays) != shard.content_hash:
+        raise DataError(
+            f"The numbers in {str(shard.path)!r} do not match the hash in the manifest: it was damaged or edited; "
+            "remove it and give the command that made the data set again."
+        )

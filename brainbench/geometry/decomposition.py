@@ -1,0 +1,275 @@
+"""Convex decomposition of meshes, in a process of its own with limits, cached, with its deviation measured."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from brainbench.core.errors import DataError, UsageError, missing_dependency, unknown_name
+from brainbench.core.files import atomic_path, cache_dir, content_hash
+from brainbench.geometry.distance import Deviation, deviation, hausdorff
+from brainbench.geometry.mesh import Mesh, convex_hull
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_LOG = logging.getLogger(__name__)
+
+METHODS = {
+    "coacd": ("coacd", "coacd", "mesh", "Convex decomposition by CoACD"),
+    "vhacd": ("pybullet", "pybullet", "bullet", "Convex decomposition by V-HACD"),
+}
+"""Method → module, distribution and extra that it needs, and what it is for."""
+
+_OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Unable to allocate", "allocate memory", "Thread creation failed")
+
+REDUCTION = 5
+"""A mesh of too many triangles is simplified to the limit over this: CoACD's time grows with their number."""
+
+_VERSION = 1
+"""Raised when results of this module change, so that cached ones are made again."""
+
+
+@dataclass(frozen=True)
+class DecompositionSettings:
+    """How a mesh is cut into convex pieces.
+
+    Raises:
+        UsageError: a value lies outside its range.
+    """
+
+    method: Literal["coacd", "vhacd"] = "coacd"
+    """``coacd`` (Wei et al. 2022) or ``vhacd`` (Mamou 2016, as PyBullet carries it; what the thesis used)."""
+    threshold: float = 0.05
+    """Concavity that may remain, relative to the size of the mesh, 0.01 (fine) … 1; CoACD only."""
+    most_pieces: int | None = None
+    """Largest number of pieces; None for as many as the threshold asks for; CoACD only."""
+    seed: int = 0
+    """Of CoACD's search."""
+    most_faces: int = 50_000
+    """A mesh of more triangles is first simplified, to a fifth of this many; the deviation of the pieces is still
+    measured against the original."""
+    seconds: float = 120.0
+    """Limit of wall time; the work is stopped beyond it. Does not change a result."""
+    memory: float = 4e9
+    """Limit of memory [bytes]; the work is stopped beyond it. Does not change a result."""
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise unknown_name("decomposition method", self.method, METHODS)
+        if not 0.01 <= self.threshold <= 1:
+            raise UsageError(f"The threshold of a decomposition lies between 0.01 and 1; received {self.threshold!r}.")
+        if self.most_pieces is not None and self.most_pieces < 1:
+            raise UsageError(f"A decomposition has at least 1 piece; received {self.most_pieces!r}.")
+        if self.most_pieces is not None and self.method == "vhacd":
+            raise UsageError("V-HACD in PyBullet has no limit on the number of pieces; use method = 'coacd' for one.")
+        if self.most_faces < 500:
+            raise UsageError(f"most_faces must be at least 500; received {self.most_faces!r}.")
+        if not (self.seconds > 0 and self.memory > 0):
+            raise UsageError("The limits of time and memory must be positive.")
+
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine the pieces."""
+        if self.method == "vhacd":
+            return {"method": self.method, "most_faces": self.most_faces}
+        names = ("method", "threshold", "most_pieces", "seed", "most_faces")
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True, eq=False)
+class Decomposition:
+    """Convex pieces that stand for a mesh."""
+
+    pieces: tuple[Mesh, ...]
+    """Convex, closed, outward."""
+    deviation: Deviation
+    """Of the union of the pieces from the solid inside the mesh [m]."""
+    notes: tuple[str, ...]
+    """What was done and how far it is from the mesh, in words; relative, so scaling keeps them true."""
+    settings: DecompositionSettings = field(default_factory=DecompositionSettings)
+    key: str = ""
+    """Names what the pieces were computed from: the shape of the mesh, the settings, the versions of the packages."""
+    cached: bool = False
+    """Whether the pieces were found in the cache."""
+
+
+def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cache: bool = True) -> Decomposition:
+    """Cut a mesh into convex pieces.
+
+    The pieces are computed for the mesh at a diagonal of 1 and kept under
+    ``brainbench.core.files.cache_dir("collision")`` by the hash of that mesh, the settings and the versions
+    of the packages, so that one decomposition serves every size.
+
+    Args:
+        mesh: any surface; holes are closed by CoACD's remeshing.
+        settings: how; the defaults when None.
+        cache: read and keep results.
+
+    Raises:
+        MissingDependencyError: the package of the method is not installed.
+        DataError: the limit of time or memory was passed, or the method failed; the message says what to do.
+    """
+    settings = settings or DecompositionSettings()
+    diagonal = mesh.diagonal
+    centre = mesh.bounds.mean(axis=0)
+    # Rounded, so that one shape at two sizes has one name in the cache.
+    unit = Mesh(np.round((mesh.vertices - centre) / diagonal, 9), mesh.faces, mesh.name)
+    key = _key(unit, settings)
+    path = cache_dir("collision") / f"{key}.npz" if cache else None
+    found = _read(path, mesh.name)
+    pieces, numbers = found or _compute(unit, settings, path)
+    outward, inward, samples, decimated = (float(value) for value in numbers)
+    placed = tuple(Mesh(piece.vertices * diagonal + centre, piece.faces, mesh.name) for piece in pieces)
+    return Decomposition(
+        pieces=placed,
+        deviation=Deviation(outward * diagonal, inward * diagonal, int(samples)),
+        notes=_notes(unit, settings, len(pieces), (outward, inward, decimated)),
+        settings=settings,
+        key=key,
+        cached=found is not None,
+    )
+
+
+def _compute(unit: Mesh, settings: DecompositionSettings, path: Path | None) -> tuple[tuple[Mesh, ...], Any]:
+    module, distribution, extra, purpose = METHODS[settings.method]
+    if find_spec(module) is None:
+        raise missing_dependency(distribution, extra=extra, purpose=purpose)
+    reduced, decimated = _decimated(unit, settings.most_faces)
+    pieces = tuple(convex_hull(points, unit.name) for points in _run(reduced, settings))
+    found = deviation(unit, pieces, inside=reduced)
+    numbers = np.array([found.outward, found.inward, found.samples, decimated])
+    if path is not None:
+        _write(path, pieces, numbers)
+    return pieces, numbers
+
+
+def _decimated(mesh: Mesh, most: int) -> tuple[Mesh, float]:
+    """Return a mesh of at most ``most`` triangles and its distance from ``mesh``, NaN when nothing was done."""
+    if len(mesh.faces) <= most:
+        return mesh, np.nan
+    if find_spec("fast_simplification") is None:
+        purpose = f"Decomposing a mesh of {len(mesh.faces):,} triangles, which is first simplified,"
+        raise missing_dependency("fast-simplification", extra="mesh", purpose=purpose)
+    import fast_simplification
+
+    vertices, faces = fast_simplification.simplify(
+        np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int32), target_count=most // REDUCTION
+    )[:2]
+    reduced = Mesh(np.asarray(vertices, float), np.asarray(faces), mesh.name)
+    return reduced, hausdorff(mesh, reduced)
+
+
+def _run(mesh: Mesh, settings: DecompositionSettings) -> list[np.ndarray]:
+    """Run the worker and return the points of each piece."""
+    worker = Path(__file__).with_name("decomposition_worker.py")
+    with tempfile.TemporaryDirectory(prefix="brainbench-") as folder:
+        source, target = Path(folder, "mesh.npz"), Path(folder, "pieces.npz")
+        np.savez(source, vertices=mesh.vertices, faces=mesh.faces)
+        words = [settings.method, settings.threshold, settings.most_pieces or -1, settings.seed, int(settings.memory)]
+        # One arena of the allocator per thread would count against the limit without being used.
+        environment = {**os.environ, "MALLOC_ARENA_MAX": "2", "OMP_NUM_THREADS": str(min(8, os.cpu_count() or 1))}
+        started = time.monotonic()
+        try:
+            done = subprocess.run(
+                [sys.executable, os.fspath(worker), os.fspath(source), os.fspath(target), *map(str, words)],
+                capture_output=True,
+                cwd=folder,
+                env=environment,
+                timeout=settings.seconds,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise DataError(
+                f"The decomposition of {mesh.name!r} ({len(mesh.faces):,} triangles) took longer than"
+                f" {settings.seconds:g} s and was stopped; {_advice(settings)}."
+            ) from None
+        if done.returncode or not target.exists():
+            raise DataError(_failure(mesh, settings, done.returncode, done.stderr.decode(errors="replace")))
+        _LOG.info("%s decomposed in %.1f s", mesh.name, time.monotonic() - started)
+        with np.load(target, allow_pickle=False) as stored:
+            ends = np.cumsum(stored["sizes"])[:-1]
+            return np.split(stored["points"], ends)
+
+
+def _failure(mesh: Mesh, settings: DecompositionSettings, status: int, errors: str) -> str:
+    what = f"The decomposition of {mesh.name!r} ({len(mesh.faces):,} triangles)"
+    if any(word in errors for word in _OUT_OF_MEMORY):
+        return f"{what} needed more than {settings.memory / 1e9:.3g} GB of memory and was stopped; {_advice(settings)}."
+    last = (errors.strip().splitlines() or ["no message"])[-1]
+    return f"{what} by {settings.method} failed with exit status {status} ({last[:200]}); {_advice(settings)}."
+
+
+def _advice(settings: DecompositionSettings) -> str:
+    return (
+        f"raise the threshold ({settings.threshold:g}), lower most_faces ({settings.most_faces:,}), raise the limit,"
+        " or use collision = 'hull'"
+    )
+
+
+def _notes(
+    unit: Mesh, settings: DecompositionSettings, pieces: int, numbers: tuple[float, float, float]
+) -> tuple[str, ...]:
+    outward, inward, decimated = numbers
+    notes = []
+    if np.isfinite(decimated):
+        notes.append(
+            f"{len(unit.faces):,} triangles were simplified to {settings.most_faces // REDUCTION:,} before the"
+            f" decomposition; the surface moved by at most {decimated:.2%} of the diagonal (sampled)"
+        )
+    notes.append(
+        f"whiskers touch {pieces} convex pieces ({settings.method}), which stand out from the mesh by at most"
+        f" {outward:.2%} and fall short of it by at most {inward:.2%} of its diagonal (sampled)"
+    )
+    return tuple(notes)
+
+
+def _key(unit: Mesh, settings: DecompositionSettings) -> str:
+    versions = []
+    for distribution in (METHODS[settings.method][1], "fast-simplification"):
+        try:
+            versions.append(metadata.version(distribution))
+        except metadata.PackageNotFoundError:
+            versions.append("")
+    return content_hash(_VERSION, unit.content_hash, settings.config(), versions, length=24)
+
+
+def _read(path: Path | None, name: str) -> tuple[tuple[Mesh, ...], Any] | None:
+    import zipfile
+
+    if path is None or not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            vertices = np.split(stored["vertices"], np.cumsum(stored["vertex_counts"])[:-1])
+            faces = np.split(stored["faces"], np.cumsum(stored["face_counts"])[:-1])
+            numbers = stored["numbers"]
+        return tuple(Mesh(v, f, name) for v, f in zip(vertices, faces, strict=True)), numbers
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        _LOG.warning("the cached decomposition %s is damaged and is made again (%s)", path.name, error)
+        return None
+
+
+def _write(path: Path, pieces: Sequence[Mesh], numbers: np.ndarray) -> None:
+    try:
+        with atomic_path(path) as temporary:
+            np.savez_compressed(
+                temporary,
+                vertices=np.concatenate([piece.vertices for piece in pieces]),
+                vertex_counts=[len(piece.vertices) for piece in pieces],
+                faces=np.concatenate([piece.faces for piece in pieces]),
+                face_counts=[len(piece.faces) for piece in pieces],
+                numbers=numbers,
+            )
+    except OSError as error:
+        _LOG.warning("the decomposition could not be kept in the cache (%s)", error)

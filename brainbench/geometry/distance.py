@@ -1,0 +1,200 @@
+"""How far surfaces and solids lie apart, by sampling. Lengths in the units of the meshes (metres).
+
+Letters: n sample, F face.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from brainbench.geometry.mesh import Mesh
+
+_NEIGHBOURS = 24
+_BLOCK = 4_000_000
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far an approximation of a solid departs from it, as largest distances over samples."""
+
+    outward: float
+    """Largest distance of a point of the approximation from the solid: matter that was added [m]."""
+    inward: float
+    """Largest distance of a point of the solid's surface from the approximation: matter that was lost [m]."""
+    samples: int
+    """Points looked at in each direction; a spike between them is missed."""
+
+    @property
+    def largest(self) -> float:
+        """The two-sided (Hausdorff) distance [m]."""
+        return max(self.outward, self.inward)
+
+
+def deviation(
+    solid: Mesh, pieces: Sequence[Mesh], *, samples: int = 4000, seed: int = 0, inside: Mesh | None = None
+) -> Deviation:
+    """Measure how far the union of convex ``pieces`` departs from the solid inside a mesh.
+
+    Sampled Hausdorff distance between the two as filled bodies, so faces that pieces share inside the
+    solid do not count, and a hollow that they fill counts by its depth. Points lie on the surfaces and,
+    for the pieces, on chords through their inside as well.
+
+    Args:
+        solid: the mesh; inside is where its winding number exceeds one half.
+        pieces: convex meshes.
+        samples: points in each direction, on top of the vertices of the pieces.
+        seed: of the sampling; equal seeds give equal numbers.
+        inside: a coarser mesh of the same solid that decides what is inside, to save time.
+    """
+    rng = np.random.default_rng(seed)
+    areas = np.array([_areas(piece).sum() for piece in pieces])
+    shares = np.maximum(8, np.ceil(samples * areas / areas.sum())).astype(int)
+    points = []
+    for piece, share in zip(pieces, shares, strict=True):
+        surface = sample_surface(piece, share, rng)
+        some = surface[: max(4, share // 4)]
+        chords = some - rng.random((len(some), 1)) * (some - rng.permutation(surface)[: len(some)])
+        points += [surface, chords, piece.vertices]
+    outward = _farthest_outside(solid, inside or solid, np.concatenate(points), rng)
+    return Deviation(outward, _farthest_from(pieces, sample_surface(solid, samples, rng)), samples)
+
+
+def hausdorff(first: Mesh, second: Mesh, *, samples: int = 4000, seed: int = 0) -> float:
+    """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them)."""
+    rng = np.random.default_rng(seed)
+    there = _Surface(second, rng).distance(sample_surface(first, samples, rng))
+    back = _Surface(first, rng).distance(sample_surface(second, samples, rng))
+    return float(max(there.max(), back.max()))
+
+
+def winding_number(mesh: Mesh, points: ArrayLike) -> NDArray[np.float64]:
+    """Return how often the surface wraps around each point [n, 3]: 1 inside an outward closed surface, 0 outside.
+
+    The sum of signed solid angles (van Oosterom & Strackee 1983) over 4π; of an open surface it is a
+    fraction, so "above one half" is the best guess at inside (Jacobson et al. 2013).
+    """
+    points = np.asarray(points, dtype=float).reshape(-1, 3)
+    triangles = mesh.vertices[mesh.faces]
+    total = np.zeros(len(points))
+    block = max(1, _BLOCK // len(triangles) // 9)
+    for start in range(0, len(points), block):
+        a, b, c = np.moveaxis(triangles[None] - points[start : start + block, None, None], 2, 0)
+        la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+        ab, bc, ca = (np.einsum("nfi,nfi->nf", u, v) for u, v in ((a, b), (b, c), (c, a)))
+        volume = np.einsum("nfi,nfi->nf", a, np.cross(b, c))
+        total[start : start + block] = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1)
+    return total / (2 * np.pi)
+
+
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return ``count`` points [count, 3] spread evenly by area over a surface."""
+    return _sample(mesh, count, rng)[0]
+
+
+class _Surface:
+    """Distances to a surface: near samples choose candidate triangles, whose distance is exact."""
+
+    def __init__(self, mesh: Mesh, rng: np.random.Generator, *, spots: int = 20_000) -> None:
+        from scipy.spatial import KDTree
+
+        self._triangles = mesh.vertices[mesh.faces]
+        points, owner = _sample(mesh, spots, rng)
+        # Centres as well, so that no small triangle is out of every list.
+        self._tree = KDTree(np.concatenate([points, self._triangles.mean(axis=1)]))
+        self._owner = np.concatenate([owner, np.arange(len(mesh.faces))])
+
+    def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distances [n] of points [n, 3]."""
+        candidates = self._owner[self._tree.query(points, k=min(_NEIGHBOURS, self._tree.n))[1]]
+        best = np.full(len(points), np.inf)
+        for column in candidates.T:
+            best = np.minimum(best, point_triangle_distance(points, self._triangles[column]))
+        return best
+
+
+def point_triangle_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances [n] of points [n, 3] from one triangle each [n, 3, 3]."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    normal = np.cross(b - a, c - a)
+    square = np.einsum("ni,ni->n", normal, normal)
+    flat = square <= 0
+    height = np.einsum("ni,ni->n", points - a, normal)
+    inside = ~flat
+    for start, end in ((a, b), (b, c), (c, a)):
+        inside &= np.einsum("ni,ni->n", np.cross(end - start, points - start), normal) >= 0
+    plane = np.abs(height) / np.sqrt(np.where(flat, 1.0, square))
+    edges = np.min([_segment_distance(points, s, e) for s, e in ((a, b), (b, c), (c, a))], axis=0)
+    return np.where(inside, plane, edges)
+
+
+def _segment_distance(points: NDArray, start: NDArray, end: NDArray) -> NDArray[np.float64]:
+    along = end - start
+    square = np.einsum("ni,ni->n", along, along)
+    share = np.einsum("ni,ni->n", points - start, along) / np.where(square > 0, square, 1.0)
+    return np.linalg.norm(points - start - np.clip(share, 0, 1)[:, None] * along, axis=1)
+
+
+def _farthest_outside(solid: Mesh, inside: Mesh, points: NDArray, rng: np.random.Generator) -> float:
+    """Largest distance from the solid of those points that lie outside it, as ``inside`` tells."""
+    distance = _Surface(solid, rng).distance(points)
+    order = np.argsort(-distance)
+    # Most far points of a good approximation lie inside, so look at few at a time until one does not.
+    for start in range(0, len(order), 256):
+        chosen = order[start : start + 256]
+        outside = winding_number(inside, points[chosen]) < 0.5
+        if outside.any():
+            return float(distance[chosen[outside]].max())
+    return 0.0
+
+
+def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
+    """Largest distance of points [n, 3] from the union of convex pieces; 0 when all lie inside."""
+    # The height over the highest face plane bounds the distance from below, and is it above that face.
+    bounds = np.empty((len(points), len(pieces)))
+    for index, piece in enumerate(pieces):
+        corner, normal = _planes(piece)
+        bounds[:, index] = (points @ normal.T - np.einsum("fi,fi->f", corner, normal)).max(axis=1)
+    size = max(piece.diagonal for piece in pieces)
+    left = bounds.min(axis=1) > 1e-7 * size
+    if not left.any():
+        return 0.0
+    points, bounds = points[left], bounds[left]
+    best = np.full(len(points), np.inf)
+    for index in np.argsort(bounds, axis=1)[:, : min(4, len(pieces))].T:
+        for chosen in np.unique(index):
+            mine = np.flatnonzero(index == chosen)
+            triangles = pieces[chosen].vertices[pieces[chosen].faces]
+            pairs = np.repeat(points[mine], len(triangles), axis=0), np.tile(triangles, (len(mine), 1, 1))
+            near = point_triangle_distance(*pairs).reshape(len(mine), -1).min(axis=1)
+            best[mine] = np.minimum(best[mine], near)
+    return float(best.max())
+
+
+def _planes(piece: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A corner [F, 3] and the outward unit normal [F, 3] of every face with an area."""
+    a, b, c = np.moveaxis(piece.vertices[piece.faces], 1, 0)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    good = length > 1e-12 * piece.diagonal**2
+    return a[good], normal[good] / length[good, None]
+
+
+def _areas(mesh: Mesh) -> NDArray[np.float64]:
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def _sample(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points [count, 3] and the faces [count] they lie on."""
+    ends = np.cumsum(_areas(mesh))
+    face = np.minimum(np.searchsorted(ends, rng.random(count) * ends[-1]), len(ends) - 1)
+    u, v = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[face]], 1, 0)
+    return (1 - u) * a + u * (1 - v) * b + u * v * c, face

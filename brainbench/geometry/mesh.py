@@ -1,0 +1,245 @@
+"""Triangle meshes: loading with units, diagnosis, scaling, convex hull and content hash. Metres inside."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+
+if TYPE_CHECKING:
+    import trimesh
+    from numpy.typing import ArrayLike, NDArray
+
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
+"""Length units of mesh files in metres."""
+
+
+WRITABLE = (".obj", ".stl", ".ply", ".glb", ".off")
+"""Mesh formats that :func:`save_mesh` writes; :func:`load_mesh` reads more."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is wrong with a mesh as a solid."""
+
+    open_edges: int
+    """Edges that do not join exactly two triangles; 0 for a watertight surface."""
+    degenerate_faces: int
+    """Triangles without area."""
+    bodies: int
+    """Connected pieces."""
+    inconsistent: bool
+    """Whether neighbouring triangles disagree on which side is out."""
+    duplicate_faces: int = 0
+    """Triangles that another triangle with the same corners repeats."""
+    inside_out: bool = False
+    """Whether the closed surface faces inward."""
+
+    @property
+    def watertight(self) -> bool:
+        """Whether the surface encloses a volume."""
+        return self.open_edges == 0
+
+    def __str__(self) -> str:
+        faults = [
+            f"{self.open_edges} open edges (not watertight)" if self.open_edges else "",
+            f"{self.degenerate_faces} triangles without area" if self.degenerate_faces else "",
+            f"{self.bodies} separate pieces" if self.bodies > 1 else "",
+            f"{self.duplicate_faces} duplicate triangles" if self.duplicate_faces else "",
+            "triangles that disagree on inside and outside" if self.inconsistent else "",
+            "a surface that is inside out" if self.inside_out else "",
+        ]
+        return ", ".join(fault for fault in faults if fault) or "watertight"
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh.
+
+    Raises:
+        DataError: a vertex is not finite, a face names a missing vertex, or there is no face.
+    """
+
+    vertices: NDArray[np.float64]
+    """[V, 3] m."""
+    faces: NDArray[np.int64]
+    """[F, 3] vertex indices, counter-clockwise seen from outside."""
+    name: str = field(default="mesh", compare=False)
+
+    def __post_init__(self) -> None:
+        vertices = np.array(self.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.array(self.faces, dtype=np.int64).reshape(-1, 3)
+        if not len(faces):
+            raise DataError(f"The mesh {self.name!r} has no faces.")
+        if not np.isfinite(vertices).all():
+            raise DataError(f"The mesh {self.name!r} has vertices that are not finite numbers.")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise DataError(f"The mesh {self.name!r} has faces that name missing vertices.")
+        for name, array in (("vertices", vertices), ("faces", faces)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [2, 3] (m) of the used vertices."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding-box diagonal [m]."""
+        low, high = self.bounds
+        return float(np.linalg.norm(high - low))
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis:
+        """Faults of this mesh as a solid."""
+        solid = self.to_trimesh()
+        edges = solid.edges_sorted.astype(np.int64)
+        counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
+        open_edges = int((counts != 2).sum())
+        consistent = bool(solid.is_winding_consistent)
+        distinct = len(np.unique(np.sort(self.faces, axis=1), axis=0))
+        return Diagnosis(
+            open_edges=open_edges,
+            degenerate_faces=int((solid.area_faces <= 1e-12 * self.diagonal**2).sum()),
+            bodies=len(np.unique(face_owners(self))),
+            inconsistent=not consistent,
+            duplicate_faces=len(self.faces) - distinct,
+            inside_out=open_edges == 0 and consistent and self.volume < 0,
+        )
+
+    @cached_property
+    def volume(self) -> float:
+        """Signed volume inside a closed surface [m³]; negative when it is inside out, meaningless when open."""
+        a, b, c = np.moveaxis(self.vertices[self.faces] - self.bounds.mean(axis=0), 1, 0)
+        return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Hash of vertices and faces; the name does not count."""
+        from brainbench.core.files import content_hash
+
+        return content_hash(self.vertices, self.faces)
+
+    def scaled(self, factor: float) -> Mesh:
+        """Return the mesh scaled about its origin."""
+        if not (np.isfinite(factor) and factor > 0):
+            raise UsageError(f"A mesh is scaled by a positive factor; received {factor!r}.")
+        return Mesh(self.vertices * factor, self.faces, self.name)
+
+    def to_diagonal(self, diagonal: float) -> Mesh:
+        """Return the mesh scaled about its origin to a bounding-box diagonal [m]."""
+        return self.scaled(diagonal / self.diagonal)
+
+    def transformed(self, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
+        """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m)."""
+        return Mesh(self.vertices @ np.asarray(rotation).T + np.asarray(translation), self.faces, self.name)
+
+    def hull(self) -> Mesh:
+        """Return the convex hull.
+
+        Raises:
+            DataError: the mesh is flat and has no volume.
+        """
+        return convex_hull(self.vertices, self.name)
+
+    def pieces(self) -> tuple[Mesh, ...]:
+        """Return the connected pieces of the surface, in the order of their first faces."""
+        owner = face_owners(self)
+        found = []
+        for piece in dict.fromkeys(owner.tolist()):
+            used, faces = np.unique(self.faces[owner == piece], return_inverse=True)
+            found.append(Mesh(self.vertices[used], faces.reshape(-1, 3), self.name))
+        return tuple(found)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """Return a :class:`trimesh.Trimesh` with the same vertices and faces."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
+    """Return the convex hull of points [n, 3] as a closed outward mesh.
+
+    Raises:
+        DataError: the points lie in a plane.
+    """
+    from scipy.spatial import ConvexHull
+
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if spread[2] < 1e-9 * spread[0]:
+        raise DataError(f"The mesh {name!r} has no volume: its points lie in a plane.")
+    hull = ConvexHull(points)
+    faces = np.array(hull.simplices)
+    # Qhull orders the corners of a facet as it likes; its equations know the way out.
+    first, second, third = (points[faces[:, corner]] for corner in range(3))
+    inward = np.einsum("fi,fi->f", np.cross(second - first, third - first), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return Mesh(points[used], renumbered.reshape(-1, 3), name)
+
+
+def face_owners(mesh: Mesh) -> NDArray[np.int64]:
+    """Number [F] of the connected piece that each face belongs to."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    size = len(mesh.vertices)
+    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
+    return connected_components(links, directed=False)[1][mesh.faces[:, 0]]
+
+
+def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
+    """Read a mesh file (OBJ, STL, PLY, GLB, OFF, …); equal vertices are merged, nothing else is repaired.
+
+    Args:
+        path: the file; a scene with several meshes is joined into one.
+        unit: length unit of the file's numbers, one of :data:`UNITS` (most formats carry none).
+
+    Raises:
+        UsageError: the unit is unknown.
+        DataError: the file is missing or holds no readable triangle mesh.
+    """
+    import trimesh
+
+    if unit not in UNITS:
+        raise unknown_name("length unit", unit, UNITS)
+    path = Path(path)
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no mesh file {os.fspath(path)!r}.")
+    try:
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:
+        raise DataError(f"{os.fspath(path)!r} cannot be read as a mesh ({error}).") from error
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise DataError(f"{os.fspath(path)!r} holds no triangles.")
+    # Exactly equal vertices only: a tolerance would depend on the unit.
+    vertices, merged = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_inverse=True)
+    return Mesh(vertices * UNITS[unit], merged.reshape(-1)[np.asarray(loaded.faces)], path.stem)
+
+
+def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
+    """Write a mesh file in the format that its suffix names, so that readers see all of it or nothing.
+
+    Raises:
+        UsageError: the unit or the format is unknown.
+    """
+    from brainbench.core.files import atomic_path
+
+    if unit not in UNITS:
+        raise unknown_name("length unit", unit, UNITS)
+    path = Path(path)
+    if path.suffix.lower() not in WRITABLE:
+        raise unknown_name("mesh format", path.suffix or path.name, WRITABLE, hint="The suffix of the file chooses it.")
+    with atomic_path(path) as temporary:
+        mesh.scaled(1 / UNITS[unit]).to_trimesh().export(temporary, file_type=path.suffix[1:].lower())
+    return path

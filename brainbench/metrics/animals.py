@@ -1,0 +1,118 @@
+"""The animals behind a score: which of them count, and how much each one's noise is corrected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Ceiling, Interval, Status
+from brainbench.metrics.inference.intervals import VERIFIED_ANIMALS, t_interval
+from brainbench.metrics.rdms.pairs import Floats, stimulus_count
+from brainbench.metrics.reliability.ceiling import noise_ceiling
+from brainbench.metrics.reliability.noise_correction import Corrected, noise_corrected
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
+
+
+@dataclass(frozen=True)
+class Animals:
+    """Subjects in the order of their names, and the indices of those whose RDM can be used."""
+
+    subjects: tuple[SubjectRDM, ...]
+    corrections: tuple[Corrected, ...]
+    """Correction of a raw comparison of 1: the factor for each subject."""
+    usable: tuple[int, ...]
+    """Subjects with a factor."""
+    scored: tuple[int, ...]
+    """Subjects that the score averages: the reliable ones, else (unreliable score) all usable ones."""
+    reliable: bool
+    reasons: tuple[str, ...]
+
+    def rdms(self, index: Sequence[int]) -> Floats:
+        """Return RDMs [len(index), P]."""
+        return np.stack([self.subjects[i].rdm for i in index])
+
+    def factors(self, index: Sequence[int]) -> Floats:
+        """Return correction factors [len(index)]."""
+        return np.array([self.corrections[i].value for i in index])
+
+    def status(self, index: int) -> Status:
+        """Return the status of one subject."""
+        return self.corrections[index].status
+
+
+def gather(subjects: Sequence[SubjectRDM], *, estimator: str, comparison: str, pairs: int) -> Animals:
+    """Sort subjects by name, correct each for noise and decide who is scored.
+
+    Raises:
+        UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
+    """
+    if not subjects:
+        raise UsageError("There are no animals to score against; give at least one SubjectRDM.")
+    ordered = tuple(sorted(subjects, key=lambda subject: subject.subject))
+    names = [subject.subject for subject in ordered]
+    if len(set(names)) < len(names):
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise UsageError(f"Subject {repeated!r} appears twice; join the sessions of an animal in one SubjectRDM.")
+    for subject in ordered:
+        if len(subject.rdm) != pairs:
+            raise UsageError(
+                f"Subject {subject.subject!r} has an RDM of {stimulus_count(len(subject.rdm))} stimuli; "
+                f"{stimulus_count(pairs)} are scored."
+            )
+    corrections = tuple(_correction(subject, estimator, comparison) for subject in ordered)
+    usable = tuple(i for i, found in enumerate(corrections) if found.status != "undefined")
+    good = tuple(i for i in usable if corrections[i].status == "ok")
+    # The published estimators knew no gate: they average whatever has a value.
+    scored = good if good and estimator == "default" else usable
+    # Whoever is not averaged is named, so no animal disappears in silence.
+    left_out = [i for i in range(len(ordered)) if i not in scored]
+    reasons = [f"{names[i]} left out: {corrections[i].reason}" for i in left_out]
+    reliable = bool(scored) and all(corrections[i].status == "ok" for i in scored)
+    if scored and not reliable:
+        reasons += [f"{names[i]}: {corrections[i].reason}" for i in scored if corrections[i].status != "ok"]
+    reasons += [f"{ordered[i].subject}: {note}" for i in usable for note in ordered[i].notes]
+    return Animals(ordered, corrections, usable, scored, reliable, tuple(reasons))
+
+
+def _correction(subject: SubjectRDM, estimator: str, comparison: str) -> Corrected:
+    if subject.problem is not None:
+        return Corrected(math.nan, "undefined", subject.problem)
+    if is_flat(subject.rdm):
+        return Corrected(math.nan, "undefined", "its RDM has missing pairs or no differences between pairs")
+    return noise_corrected(1.0, subject.split_half_by(comparison), estimator=estimator)
+
+
+def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
+    """Return the mean reliability over the scored animals with its interval (one animal: its spread)."""
+    values = np.array([animals.corrections[i].reliability for i in animals.scored])
+    if not values.size:
+        return math.nan, None
+    if len(values) == 1:
+        return float(values[0]), animals.subjects[animals.scored[0]].spread
+    return float(values.mean()), t_interval(values)
+
+
+def interval_reasons(count: int) -> tuple[str, ...]:
+    """Say what the number of animals means for the interval."""
+    if count == 1:
+        return ("one animal: no confidence interval, since nothing is known about other animals",)
+    if count < VERIFIED_ANIMALS:
+        return (f"interval from {count} animals is unreliable: coverage not verified below {VERIFIED_ANIMALS}",)
+    return ()
+
+
+def ceiling_of(animals: Animals, comparison: str) -> Ceiling | None:
+    """Return the raw noise ceiling of the scored animals, or None for fewer than two."""
+    if len(animals.scored) < 2:
+        return None
+    found = noise_ceiling(animals.rdms(animals.scored), method=comparison)
+    return None if found.reason else Ceiling(found.lower, found.upper)
+
+
+def mean_rdm(animals: Animals) -> tuple[float, ...]:
+    """Return the mean RDM of the scored animals [P]; empty without any."""
+    return tuple(animals.rdms(animals.scored).mean(axis=0).tolist()) if animals.scored else ()

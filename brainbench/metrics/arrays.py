@@ -1,0 +1,107 @@
+"""Where the heavy products are computed: numpy on the processor, or torch on any device, by the same code.
+
+Functions of distances use only what both libraries spell alike; :func:`library` names the one that an
+array belongs to. Everything is float64 on either side, so the numbers agree to rounding.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+Array = Any
+"""A numpy array or a torch tensor."""
+
+
+def is_tensor(values: Any) -> bool:
+    """Whether ``values`` is a torch tensor; torch is not imported for that."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(values, torch.Tensor)
+
+
+def library(values: Array) -> Any:
+    """Return ``numpy``, or ``torch`` for a tensor."""
+    return sys.modules["torch"] if is_tensor(values) else np
+
+
+def find_device(device: Any, *arrays: Any) -> Any:
+    """Return the torch device to compute on: ``device``, else where a tensor among ``arrays`` lies; None for numpy.
+
+    Raises:
+        UsageError: not a device, one that is not there, or one without float64.
+    """
+    if device is None:
+        device = next((array.device for array in arrays if is_tensor(array)), None)
+        if device is None:
+            return None
+    import torch
+
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise UsageError(f"{device!r} is no torch device; give 'cuda', 'cuda:1' or 'cpu'.") from error
+    if found.type == "cuda" and (not torch.cuda.is_available() or (found.index or 0) >= torch.cuda.device_count()):
+        raise UsageError(
+            f"There is no device {str(found)!r} here ({torch.cuda.device_count()} CUDA devices); leave device out to "
+            "compute on the processor."
+        )
+    if found.type == "mps":
+        raise UsageError("The device 'mps' has no float64, which RDMs need; leave device out.")
+    return found
+
+
+def place(values: Any, device: Any) -> Array:
+    """Return ``values`` in float64: as a tensor on ``device``, or where and what they are for None."""
+    if is_tensor(values):
+        return values.detach().to(device or values.device).to(library(values).float64)
+    if device is None:
+        return np.asarray(values).astype(np.float64, copy=False)
+    import torch
+
+    # A copy, since torch refuses memory that numpy may not write to.
+    return torch.from_numpy(np.array(values, order="C")).to(device).to(torch.float64)
+
+
+def fetch(values: Array) -> Any:
+    """Return a numpy array of what may be a tensor on any device."""
+    return values.detach().cpu().numpy() if is_tensor(values) else np.asarray(values)
+
+
+def slices(values: Any, elements: int, device: Any) -> Iterator[tuple[slice, Array]]:
+    """Yield slices of the last axis with at most ``elements`` entries, in float64 on the device.
+
+    The whole is never copied, so what is wider than the device's memory is computed all the same.
+    """
+    rows = max(1, int(np.prod(tuple(values.shape[:-1]))))
+    step = max(1, elements // rows)
+    for start in range(0, values.shape[-1], step):
+        part = slice(start, start + step)
+        yield part, place(values[..., part], device)
+
+
+def cholesky(matrix: Array) -> Array | None:
+    """Return the lower Cholesky factor [N, N], or None where the matrix has none."""
+    if is_tensor(matrix):
+        factor, info = library(matrix).linalg.cholesky_ex(matrix)
+        return None if int(info) else factor
+    from scipy.linalg import LinAlgError
+    from scipy.linalg import cholesky as factorise
+
+    try:
+        return factorise(matrix, lower=True, check_finite=False)
+    except LinAlgError:
+        return None
+
+
+def solve_lower(factor: Array, right: Array) -> Array:
+    """Return the solution [N, M] of a lower triangular system."""
+    if is_tensor(factor):
+        return library(factor).linalg.solve_triangular(factor, right, upper=False)
+    from scipy.linalg import solve_triangular
+
+    return solve_triangular(factor, right, lower=True, check_finite=False)

@@ -1,0 +1,1 @@
+"""What can be concluded: permutation tests, bootstrap, intervals, multiple comparisons, power."""

@@ -1,0 +1,196 @@
+"""Power analysis: how often would an experiment find a model that is truly alike?
+
+Experiments are simulated at the level of RDMs. Every RDM is a standardised vector of correlation
+distances between random patterns, so distances that share a stimulus are dependent as they are in
+data. With s shared by all animals and the other terms drawn anew for each:
+
+    animal      t = √c · s + √(1 − c) · own        c: consistency between animals' noiseless RDMs
+    measured    √q · t + √(1 − q) · noise          q: reliability of an animal's RDM
+    model       (e/√c) · s + √(1 − e²/c) · other   e: the effect, the noise-corrected score that is true
+
+Each experiment goes through the permutation test of :func:`brainbench.metrics.score_rdms`, with the
+choice among ``layers`` of which one has the effect and the others know nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Interval
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, label_orders, smallest_p
+from brainbench.metrics.layers import held_out
+from brainbench.metrics.rdms.comparison import features
+from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, upper
+
+SIMULATIONS = 1000
+STIMULUS_COUNTS = (4, 5, 6, 7, 8, 10, 12, 16, 20, 24, 32)
+ANIMAL_COUNTS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 20, 30, 50, 100)
+"""Numbers that :func:`needed` tries, in order."""
+
+_DIMENSIONS = 10
+_ORDERS = 999
+_EXACT_STIMULI = 6
+_CHUNK_ELEMENTS = 1 << 21
+
+
+@dataclass(frozen=True)
+class Design:
+    """An experiment, and the truth it is to find.
+
+    Raises:
+        UsageError: a number is out of range, or the effect is larger than what the animals share allows.
+    """
+
+    stimuli: int = 6
+    animals: int = 11
+    effect: float = 0.5
+    """True noise-corrected score of the model, −1 … 1; 0 gives the rate of false alarms."""
+    consistency: float = 0.8
+    """Correlation of two animals' noiseless RDMs, 0 … 1."""
+    reliability: float = 0.8
+    """Reliability of one animal's RDM, 0 … 1."""
+    layers: int = 1
+    alpha: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Refuse what no experiment can be."""
+        if self.stimuli < 2 or self.animals < 1 or self.layers < 1:
+            raise UsageError(
+                f"A design needs at least 2 stimuli, 1 animal and 1 layer; received {self.stimuli}, {self.animals} and "
+                f"{self.layers}."
+            )
+        for name, low, high in (("consistency", 0, 1), ("reliability", 0, 1), ("alpha", 0, 1), ("effect", -1, 1)):
+            value = getattr(self, name)
+            if not low <= value <= high or (name == "alpha" and value in (0, 1)):
+                raise UsageError(f"{name} lies between {low} and {high}; received {value}.")
+        if self.effect**2 > self.consistency + 1e-12:
+            raise UsageError(
+                f"No model can score {self.effect:g} on animals whose consistency is {self.consistency:g}: "
+                f"what they share bounds it by √consistency = {math.sqrt(self.consistency):.3g}; lower the effect."
+            )
+
+
+@dataclass(frozen=True)
+class Power:
+    """How often a design finds its effect."""
+
+    design: Design
+    power: float
+    """Share of simulated experiments with p ≤ α; 0 where no p can be that small."""
+    interval: Interval | None
+    """Wilson interval from the number of simulations."""
+    simulations: int
+    p_smallest: float
+    mean_score: float = math.nan
+    """Mean raw comparison in the simulated experiments, after the choice of layer."""
+    reason: str = ""
+    """Why no simulation was needed."""
+
+
+def power(design: Design, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
+    """Simulate experiments of one design.
+
+    Args:
+        design: What is measured and what is true.
+        simulations: Number of experiments; the interval says what it is good for.
+        seed: Seed of the experiments.
+
+    Raises:
+        UsageError: no positive number of simulations.
+    """
+    if simulations < 1:
+        raise UsageError(f"A power analysis needs at least 1 simulation; received {simulations}.")
+    smallest = smallest_p(design.stimuli)
+    if design.stimuli < SMALLEST_STIMULI or smallest > design.alpha:
+        reason = f"{design.stimuli} stimuli allow no p below {smallest:.3g}, whatever is true"
+        return Power(design, 0.0, None, 0, smallest, reason=reason)
+    generator = np.random.default_rng(seed)
+    pairs = permuted_pairs(_orders(design.stimuli, seed))
+    found, total = 0, 0.0
+    for size in _chunks(simulations, design, len(pairs)):
+        model, brain = _experiments(generator, design, size)
+        null = _statistics(model, brain, pairs)
+        p = (null >= null[:, :1] - TIE).mean(axis=1)
+        found += int((p <= design.alpha).sum())
+        total += float(null[:, 0].sum())
+    interval = _wilson(found, simulations)
+    return Power(design, found / simulations, interval, simulations, smallest, total / simulations)
+
+
+def needed(
+    design: Design, vary: str = "stimuli", *, target: float = 0.8, simulations: int = SIMULATIONS, seed: int = 0
+) -> int | None:
+    """Return the smallest tried number of stimuli or animals whose power reaches ``target``; None if none does.
+
+    Raises:
+        UsageError: ``vary`` is neither, or a target outside (0, 1).
+    """
+    tried = {"stimuli": STIMULUS_COUNTS, "animals": ANIMAL_COUNTS}
+    if vary not in tried:
+        raise UsageError(f"A power analysis varies 'stimuli' or 'animals'; received {vary!r}.")
+    if not 0 < target < 1:
+        raise UsageError(f"A target power lies between 0 and 1; received {target}.")
+    for number in tried[vary]:
+        changed = replace(design, **{vary: number})
+        if power(changed, simulations=simulations, seed=seed).power >= target:
+            return number
+    return None
+
+
+def _orders(stimuli: int, seed: int) -> np.ndarray:
+    """Return orders [N, K], the given one first: all up to six stimuli, else 999 random ones."""
+    if stimuli <= _EXACT_STIMULI:
+        return np.concatenate(list(label_orders(stimuli, 1 << 20, seed)))
+    random = np.random.default_rng(seed).permuted(np.tile(np.arange(stimuli), (_ORDERS, 1)), axis=1)
+    return np.concatenate([np.arange(stimuli)[None], random])
+
+
+def _chunks(simulations: int, design: Design, orders: int) -> Iterator[int]:
+    pairs = design.stimuli * (design.stimuli - 1) // 2
+    step = max(
+        1, _CHUNK_ELEMENTS // (orders * max(pairs, design.layers * (design.animals if design.layers > 1 else 1)))
+    )
+    for start in range(0, simulations, step):
+        yield min(step, simulations - start)
+
+
+def _experiments(generator: np.random.Generator, design: Design, size: int) -> tuple[Floats, Floats]:
+    """Return models [S, L, P] and measured animals [S, A, P]."""
+
+    def rdms(*shape: int) -> Floats:
+        patterns = generator.standard_normal((*shape, design.stimuli, _DIMENSIONS))
+        patterns -= patterns.mean(axis=-1, keepdims=True)
+        patterns /= np.linalg.norm(patterns, axis=-1, keepdims=True)
+        # Correlations of random patterns have mean 0 and variance 1/(D − 1).
+        return -upper(patterns @ patterns.swapaxes(-1, -2)) * math.sqrt(_DIMENSIONS - 1)
+
+    c, q = design.consistency, design.reliability
+    weight = design.effect / math.sqrt(c) if c else 0.0
+    shared = rdms(size, 1)
+    model = rdms(size, design.layers)
+    model[:, :1] = weight * shared + math.sqrt(max(0.0, 1 - weight**2)) * model[:, :1]
+    animals = math.sqrt(c) * shared + math.sqrt(1 - c) * rdms(size, design.animals)
+    return model, math.sqrt(q) * animals + math.sqrt(1 - q) * rdms(size, design.animals)
+
+
+def _statistics(model: Floats, brain: Floats, pairs: np.ndarray) -> Floats:
+    """Return the mean comparison [S, N] under every order, the layer chosen on the other animals each time."""
+    left, right = features(model, "pearson"), features(brain, "pearson")
+    if model.shape[1] == 1:
+        return np.einsum("snp,sp->sn", left[:, 0][:, pairs], right.mean(axis=1))
+    r = np.einsum("slnp,sap->snla", left[:, :, pairs], right, optimize=True)
+    return (held_out(r) if brain.shape[1] > 1 else r.max(axis=2)).mean(axis=-1)
+
+
+def _wilson(found: int, count: int) -> Interval:
+    """Return the 95 % Wilson score interval of a share."""
+    z = 1.959963984540054
+    share, square = found / count, z**2 / count
+    centre = (share + square / 2) / (1 + square)
+    half = z * math.sqrt(share * (1 - share) / count + square / (4 * count)) / (1 + square)
+    return Interval(centre - half, centre + half, 0.95, f"Wilson, {count:,} simulated experiments")

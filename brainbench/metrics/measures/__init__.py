@@ -1,0 +1,1 @@
+"""The metrics: RSA, CKA, ridge, decoding, Procrustes, partial RSA, and their registry."""

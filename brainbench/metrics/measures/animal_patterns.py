@@ -1,0 +1,81 @@
+"""An animal's mean responses and their noise, for metrics of patterns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.reliability.split_half import TrialBlock, usable_sessions
+from brainbench.metrics.stimulus_labels import stimulus_means
+
+
+@dataclass(frozen=True)
+class AnimalPatterns:
+    """An animal's mean responses."""
+
+    subject: str
+    patterns: Floats = field(repr=False)
+    """[K, U] mean over trials, units of all sessions joined; units lacking a stimulus are left out."""
+    noise: Floats = field(repr=False)
+    """[K, U] variance of those means, from the spread over trials."""
+    units: int = 0
+    trials: int = 0
+    problem: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def reliability(self) -> float:
+        """Share of the variance between stimuli that is not trial noise, over all units; can be negative."""
+        if self.problem is not None:
+            return math.nan
+        between = float(self.patterns.var(axis=0, ddof=1).sum())
+        return 1 - float(self.noise.mean(axis=0).sum()) / between if between > 0 else math.nan
+
+
+def animal_patterns(
+    subject: str, blocks: Sequence[TrialBlock], n_stimuli: int, *, stimuli: Sequence[str] | None = None
+) -> AnimalPatterns:
+    """Average an animal's trials, leaving out by the rules of :mod:`brainbench.metrics.reliability.split_half`.
+
+    Raises:
+        UsageError: bad shapes or labels.
+        DataError: infinite responses.
+    """
+    names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
+    sessions, problem, notes = usable_sessions(blocks, n_stimuli, names, least=2)
+    trials = sum(len(session.codes) for session in sessions)
+    if problem is not None:
+        empty = np.empty((n_stimuli, 0))
+        return AnimalPatterns(subject, empty, empty, 0, trials, problem, notes)
+    means, noise = [], []
+    for session in sessions:
+        mean = stimulus_means(session.responses, session.codes, n_stimuli)
+        square = stimulus_means((session.responses - mean[session.codes]) ** 2, session.codes, n_stimuli)
+        member = np.zeros((n_stimuli, len(session.codes)))
+        member[session.codes, np.arange(len(session.codes))] = 1.0
+        number = member @ np.isfinite(session.responses)
+        means.append(mean)
+        noise.append(square / (number - 1))
+    joined = np.concatenate(means, axis=1)
+    return AnimalPatterns(subject, joined, np.concatenate(noise, axis=1), joined.shape[1], trials, None, notes)
+
+
+class OfMeanResponses:
+    """Base of metrics that need no more of an animal than its mean responses."""
+
+    def animal(
+        self,
+        subject: str,
+        blocks: Sequence[TrialBlock],
+        n_stimuli: int,
+        *,
+        stimuli: Sequence[str] | None = None,
+        seed: int = 0,
+        draws: int = 0,
+    ) -> AnimalPatterns:
+        """Return the animal's mean responses; nothing here is random."""
+        return animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)

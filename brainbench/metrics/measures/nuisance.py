@@ -1,0 +1,165 @@
+"""What else could explain the animals' geometry: nuisance RDMs, partial correlation, shared variance.
+
+Stimuli also differ in how often they were touched, licked for or chosen. An RDM of such a quantity is
+a rival model: :func:`variance_partition` says how much of each animal's RDM the model explains that the
+nuisances do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, canonical_order, label_orders
+from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, rdm_stack, stimulus_count, upper
+from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
+
+
+@dataclass(frozen=True)
+class VariancePartition:
+    """Shares of the variance of animals' RDMs, averaged over animals; they add up to ``total``."""
+
+    total: float
+    """R² of model and nuisances together."""
+    unique_model: float
+    """R² that is lost without the model, never negative in a fit to the same pairs."""
+    unique_nuisance: float
+    """R² that is lost without the nuisances."""
+    shared: float
+    """R² that either explains; negative where one hides the other (suppression)."""
+    partial_r: float
+    """Mean correlation of model and animals, both without what the nuisances explain linearly."""
+    p: float
+    """P(partial r under relabelled stimuli of the model ≥ observed); NaN below 4 stimuli."""
+    chance: float
+    """Mean unique share of the model under relabelling: what fitting few pairs gives for nothing."""
+    nuisances: tuple[str, ...]
+    reason: str = ""
+    """Why p is undefined."""
+
+
+def nuisance_rdm(values: ArrayLike, labels: ArrayLike) -> Floats:
+    """Return the RDM [P] of a quantity measured in every trial: absolute differences of its stimulus means.
+
+    Args:
+        values: [R] one number per trial (contacts, licks, choice as 0 and 1), NaN where unknown.
+        labels: [R] stimulus of each trial, as in :func:`brainbench.metrics.rdm`.
+
+    Raises:
+        UsageError: not one value and one label per trial.
+        DataError: an infinite value, or a stimulus without any.
+
+    >>> nuisance_rdm([2, 4, 5, 5, 0], ["a", "a", "b", "b", "c"]).tolist()
+    [2.0, 3.0, 5.0]
+    """
+    numbers = np.asarray(values, dtype=np.float64)
+    codes, names = stimulus_codes(labels)
+    if numbers.ndim != 1 or len(numbers) != len(codes):
+        raise UsageError(f"A nuisance has one value per trial [{len(codes)}]; received shape {numbers.shape}.")
+    means = stimulus_means(numbers[:, None], codes, len(names))[:, 0]
+    if not np.isfinite(means).all():
+        raise DataError(f"The nuisance has no value for stimulus {names[int(np.argmin(np.isfinite(means)))]!r}.")
+    return upper(np.abs(means[:, None] - means))
+
+
+def variance_partition(
+    model_rdm: ArrayLike, nuisance_rdms: Mapping[str, ArrayLike], brain_rdms: ArrayLike, *, seed: int = 0
+) -> VariancePartition:
+    """Partition the variance of animals' RDMs [A, P] between a model's RDM [P] and nuisance RDMs.
+
+    Ordinary least squares per animal, with an intercept; the R² are averaged over animals. The p-value
+    relabels the model's stimuli, as in :func:`permutation_test`, and tests the partial correlation.
+
+    Raises:
+        UsageError: no nuisances, or RDMs of different numbers of stimuli.
+        DataError: missing pairs, or too few pairs for so many nuisances.
+    """
+    if not nuisance_rdms:
+        raise UsageError("There are no nuisances; give the RDM of at least one, or use permutation_test.")
+    model = rdm_stack(model_rdm, "model_rdm")
+    brain = np.atleast_2d(rdm_stack(brain_rdms, "brain_rdms"))
+    rivals = np.stack([rdm_stack(rdm, f"The nuisance {name!r}") for name, rdm in nuisance_rdms.items()])
+    pairs = brain.shape[1]
+    if model.shape != (pairs,) or rivals.shape[1:] != (pairs,):
+        raise UsageError(
+            f"The RDMs have different numbers of stimuli: {model.shape}, {rivals.shape[1:]} and {(pairs,)}."
+        )
+    if not all(np.isfinite(part).all() for part in (model, brain, rivals)):
+        raise DataError("An RDM has missing pairs; variance can be partitioned over complete RDMs only.")
+    if pairs < len(rivals) + 3:
+        raise DataError(f"{pairs} pairs are too few to fit {len(rivals)} nuisances and a model; use fewer nuisances.")
+    stimuli = stimulus_count(pairs)
+    order = permuted_pairs(canonical_order(brain)[None])[0]
+    model, brain, rivals = model[order], brain[:, order], rivals[:, order]
+    rest = _without(rivals)
+    residual = brain @ rest
+    scale = ((brain - brain.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        by_nuisance = 1 - (residual**2).sum(axis=1) / scale
+        partial, unique = _partial(model[None], rest, residual, scale)
+        centred = model - model.mean()
+        by_model = (brain @ centred) ** 2 / (centred @ centred) / scale
+    total = by_nuisance + unique[0]
+    reason, p, chance = "", math.nan, math.nan
+    if stimuli < SMALLEST_STIMULI:
+        reason = f"{stimuli} stimuli are too few to permute; at least {SMALLEST_STIMULI} are needed"
+    elif not np.isfinite(partial).all():
+        reason = "the model or an animal varies no more than the nuisances explain"
+    else:
+        found = [
+            _partial(model[permuted_pairs(orders)], rest, residual, scale)
+            for orders in label_orders(stimuli, 4096, seed)
+        ]
+        null = np.concatenate([item[0] for item in found]).mean(axis=1)
+        p = float((null >= null[0] - TIE).mean())
+        chance = float(np.concatenate([item[1] for item in found]).mean())
+    return VariancePartition(
+        total=float(total.mean()),
+        unique_model=float(unique[0].mean()),
+        unique_nuisance=float((total - by_model).mean()),
+        shared=float((by_model - unique[0]).mean()),
+        partial_r=float(partial[0].mean()),
+        p=p,
+        chance=chance,
+        nuisances=tuple(nuisance_rdms),
+        reason=reason,
+    )
+
+
+def partial_correlations(models: Floats, nuisances: Floats, brain: Floats) -> Floats:
+    """Return correlations [N] of models [N, P] with an animal [P], both without what nuisances [J, P] explain linearly.
+
+    NaN where nothing is left of either, or where the pairs are too few for so many nuisances.
+    """
+    if len(brain) < len(nuisances) + 3:
+        return np.full(len(models), np.nan)
+    rest = _without(nuisances)
+    residual = (brain @ rest)[None]
+    centred = brain - brain.mean()
+    if not (residual**2).sum() > 1e-20 * (centred**2).sum():
+        return np.full(len(models), np.nan)
+    return _partial(models, rest, residual, np.array([(centred**2).sum()]))[0][:, 0]
+
+
+def _without(rivals: Floats) -> Floats:
+    """Return the symmetric projection [P, P] that takes away an intercept and the nuisances."""
+    pairs = rivals.shape[1]
+    basis = np.concatenate([np.ones((1, pairs)), rivals - rivals.mean(axis=1, keepdims=True)])
+    basis /= np.maximum(np.linalg.norm(basis, axis=1, keepdims=True), np.finfo(float).tiny)
+    left, values, _ = np.linalg.svd(basis.T, full_matrices=False)
+    left = left[:, values > values[0] * 1e-10]
+    return np.eye(pairs) - left @ left.T
+
+
+def _partial(models: Floats, rest: Floats, residual: Floats, scale: Floats) -> tuple[Floats, Floats]:
+    """Return partial correlations and unique shares [N, A] of models [N, P] with animals' residuals [A, P]."""
+    left = models @ rest
+    size = (left**2).sum(axis=1)[:, None]
+    size = np.where(size > 1e-20 * (models**2).sum(axis=1)[:, None], size, np.nan)
+    product = left @ residual.T
+    return product / np.sqrt(size * (residual**2).sum(axis=1)), product**2 / size / scale

@@ -1,0 +1,82 @@
+"""Procrustes similarity: how well the best rotation carries one set of patterns onto another.
+
+Patterns are centred over stimuli and scaled to unit size; the value is the cosine of the angular
+Procrustes distance of Williams et al. 2021, ‖XᵀY‖∗ (sum of singular values): 1 when a rotation and a
+scale make the patterns equal. It is not corrected for noise and is well above 0 for unrelated patterns
+(the permutation's mean score stands beside it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.core.errors import UsageError
+from brainbench.metrics.measures.animal_patterns import AnimalPatterns
+from brainbench.metrics.measures.patterns import PatternMetric
+from brainbench.metrics.measures.registry import register_metric
+from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.stimulus_labels import response_matrix
+
+
+class Procrustes(PatternMetric):
+    """Similarity of patterns up to rotation and scale."""
+
+    name = "procrustes"
+    title = "cosine of the angular Procrustes distance between mean patterns"
+
+    def similarity(self, model: Floats, brain: Floats) -> float:
+        """Return ‖XᵀY‖∗ of centred, scaled patterns."""
+        if not np.isfinite(model).all() or not np.isfinite(brain).all():
+            return math.nan
+        return float(_similarities(_unit(model), _unit(brain)[None])[0])
+
+    def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
+        """Return values [N, A] with the model's stimuli in each order [N, K]."""
+        place = np.argsort(orders, axis=1)
+        left = _unit(model)
+        columns = [_similarities(left, _unit(a.patterns)[place[:, :, None], place[:, None, :]]) for a in animals]
+        return np.stack(columns, axis=1)
+
+
+def procrustes_distance(a: ArrayLike, b: ArrayLike) -> float:
+    """Return the angular Procrustes distance [rad] of patterns [K, F] and [K, U], a metric in the strict sense.
+
+    Raises:
+        UsageError: not two matrices with the same number of rows.
+
+    >>> import numpy as np
+    >>> patterns, turn = np.array([[0., 0], [1, 0], [0, 2]]), np.array([[0., 1], [-1, 0]])
+    >>> bool(procrustes_distance(patterns, 3 * patterns @ turn + 7) < 1e-7)
+    True
+    """
+    left, right = response_matrix(a, "stimuli"), response_matrix(b, "stimuli")
+    if len(left) != len(right):
+        raise UsageError(f"Patterns of {len(left)} and {len(right)} stimuli cannot be compared.")
+    value = Procrustes().similarity(left.astype(np.float64), right.astype(np.float64))
+    # Rounding may give 1 + 2e-16, which has no angle.
+    return math.acos(min(value, 1.0)) if math.isfinite(value) else math.nan
+
+
+def _unit(patterns: Floats) -> Floats:
+    """Return the products [K, K] of centred patterns of unit size; NaN for constant ones."""
+    centred = patterns - patterns.mean(axis=0)
+    products = centred @ centred.T
+    size = float(np.trace(products))
+    return products / size if size > 0 else np.full(products.shape, np.nan)
+
+
+def _similarities(left: Floats, right: Floats) -> Floats:
+    """Return tr √(√L R √L) [N], the sum of singular values, from products [K, K] and [N, K, K]."""
+    if not np.isfinite(left).all() or not np.isfinite(right).all():
+        return np.full(len(right), np.nan)
+    values, vectors = np.linalg.eigh(left)
+    root = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+    inner = np.linalg.eigvalsh(root @ right @ root)
+    return np.sqrt(np.maximum(inner, 0)).sum(axis=-1)
+
+
+register_metric(Procrustes())

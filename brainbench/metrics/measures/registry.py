@@ -1,0 +1,146 @@
+"""What a metric is, and the registry of metrics.
+
+A metric prepares each animal once (:meth:`Metric.animal`) and then scores any number of models against
+them. A new one needs a single file: subclass :class:`brainbench.metrics.measures.patterns.PatternMetric`, write
+``similarity`` and name it in ``brainbench score --metric mine.py:MyMetric``, or call
+:func:`register_metric`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from numpy.typing import ArrayLike
+
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.records import Score
+from brainbench.metrics.reliability.split_half import TrialBlock
+
+
+class Metric(Protocol):
+    """A way to compare a model's activations with animals' trials."""
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """One line on what is compared, how, and what corrects it for noise."""
+        ...
+
+    def animal(
+        self,
+        subject: str,
+        blocks: Sequence[TrialBlock],
+        n_stimuli: int,
+        *,
+        stimuli: Sequence[str] | None = None,
+        seed: int = 0,
+        draws: int = 0,
+    ) -> Any:
+        """Prepare one animal from the trials of its sessions; what cannot be used says so in the score."""
+        ...
+
+    def score(
+        self,
+        features: Mapping[str, ArrayLike],
+        animals: Sequence[Any],
+        *,
+        name: str,
+        stimuli: Sequence[str],
+        estimator: str = "default",
+        seed: int = 0,
+    ) -> Score:
+        """Score a model by the features [K, F] of its layers."""
+        ...
+
+    def score_animals(
+        self, animals: Sequence[Any], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
+    ) -> Score:
+        """Score the animals against one another, by the same estimator."""
+        ...
+
+
+_METRICS: dict[str, Metric] = {}
+
+
+def register_metric(metric: Metric) -> Metric:
+    """Add a metric under its name and return it.
+
+    Raises:
+        UsageError: the name is taken, or something that a metric needs is missing.
+    """
+    check_metric(metric)
+    if metric.name in _METRICS:
+        raise UsageError(f"A metric named {metric.name!r} exists already; choose another name.")
+    _METRICS[metric.name] = metric
+    return metric
+
+
+def get_metric(name: str) -> Metric:
+    """Return a registered metric.
+
+    Raises:
+        UsageError: nothing has this name.
+    """
+    if name not in list_metrics():
+        raise unknown_name("metric", name, list_metrics(), hint="Your own: FILE.py:CLASS.")
+    return _METRICS[name]
+
+
+def find_metric(name: str) -> Metric:
+    """Return a registered metric, or the one named NAME in the file FILE.py for ``FILE.py:NAME``.
+
+    NAME is a metric, or a class or function that makes one without arguments.
+
+    Raises:
+        UsageError: nothing has this name, or it is no metric.
+        DataError: the file cannot be run.
+    """
+    if ".py" not in name:
+        return get_metric(name)
+    path, _, attribute = name.rpartition(":")
+    if not Path(path).is_file() or not attribute:
+        raise UsageError(f"A metric of your own is FILE.py:NAME with an existing file; received {name!r}.")
+    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+    if spec is None or spec.loader is None:
+        raise UsageError(f"{path!r} is no Python file.")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise DataError(f"Running {path} failed: {type(error).__name__}: {error}.") from error
+    if not hasattr(module, attribute):
+        public = [item for item in vars(module) if not item.startswith("_")]
+        raise unknown_name(f"name in {path}", attribute, public)
+    found: Any = getattr(module, attribute)
+    # A class has the names of its instances, so it must be told from an instance first.
+    made: Any = found() if isinstance(found, type) or (not hasattr(found, "title") and callable(found)) else found
+    check_metric(made)
+    return made
+
+
+def list_metrics() -> tuple[str, ...]:
+    """Return the names of the registered metrics, ours first."""
+    # Ours register themselves when their module is imported.
+    import brainbench.metrics.measures.decoding
+    import brainbench.metrics.measures.partial_rsa
+    import brainbench.metrics.measures.procrustes
+    import brainbench.metrics.measures.ridge
+    import brainbench.metrics.measures.rsa  # noqa: F401
+
+    return tuple(sorted(_METRICS, key=lambda name: (name != "rsa", name)))
+
+
+def check_metric(metric: Any) -> None:
+    """Raise UsageError naming what an object lacks to be a metric."""
+    lacking = [part for part in ("name", "title", "animal", "score", "score_animals") if not hasattr(metric, part)]
+    if lacking:
+        raise UsageError(
+            f"{metric!r} is no metric: it lacks {', '.join(lacking)}; subclass brainbench.metrics.PatternMetric."
+        )

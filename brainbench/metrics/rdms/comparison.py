@@ -1,0 +1,243 @@
+"""Comparison of RDMs, broadcast over layers, permutations and animals at once.
+
+Every method is an inner product of two transformed vectors, so many comparisons are one matrix
+product. Definitions equal scipy's and rsatoolbox 0.3.2's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.metrics.rdms.pairs import Floats, rdm_stack, square, stimulus_count
+
+_CONSTANT = 64 * np.finfo(np.float64).eps
+"""An RDM whose spread is below this share of its size is constant up to rounding."""
+
+_SIGN_LIMIT = 128
+"""Above this many pairs Kendall's tau sorts (P log P) instead of comparing all pairs of pairs (P²)."""
+
+
+def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
+    """Compare RDMs ``a`` [..., P] with ``b`` [..., P]; leading axes broadcast as in numpy.
+
+    Pairs that are NaN in either RDM are left out of that comparison. A comparison without a value
+    (an RDM constant over the pairs that are left, fewer than 2 pairs) is NaN, except that ``rho-a`` and
+    ``tau-a`` of a constant RDM are 0 by definition and the cosines need only a non-zero RDM. Nothing is
+    clipped: rounding may give 1 + 2e-16.
+
+    Args:
+        a: RDMs, upper triangles.
+        b: RDMs of the same stimuli in the same order.
+        method: ``pearson``; ``spearman``; ``rho-a`` (Spearman, expected over random breaking of ties);
+            ``tau-a``, ``tau-b`` (Kendall); ``cosine``; ``whitened-cosine``, ``whitened-pearson``
+            (Diedrichsen 2021: weighted by the covariance of distances that share a stimulus).
+
+    Returns:
+        [...], float64; a scalar array for two vectors.
+
+    Raises:
+        UsageError: unknown method, or RDMs of different numbers of stimuli.
+
+    >>> round(float(compare([1, 2, 4], [2, 4, 8])), 6)
+    1.0
+    >>> layers, animals = [[1, 2, 3], [3, 2, 1]], [[1, 3, 4], [2, 3, 5], [4, 2, 1]]
+    >>> compare([[layer] for layer in layers], animals, method="spearman").round(6).tolist()
+    [[1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]
+    """
+    check_comparison(method)
+    left, right = rdm_stack(a, "a"), rdm_stack(b, "b")
+    if left.shape[-1] != right.shape[-1]:
+        raise UsageError(
+            f"RDMs of {stimulus_count(left.shape[-1])} and {stimulus_count(right.shape[-1])} stimuli cannot be "
+            "compared; give both for the same stimuli."
+        )
+    try:
+        shape = np.broadcast_shapes(left.shape, right.shape)
+    except ValueError as error:
+        raise UsageError(f"RDMs of shapes {left.shape} and {right.shape} do not broadcast.") from error
+    if not (np.isfinite(left).all() and np.isfinite(right).all()):
+        return _compare_present(np.broadcast_to(left, shape), np.broadcast_to(right, shape), method)
+    if method in _BY_SORTING and left.shape[-1] > _SIGN_LIMIT:
+        return _each(np.broadcast_to(left, shape), np.broadcast_to(right, shape), _BY_SORTING[method])
+    # The broadcast product of all comparisons and all pairs is never formed.
+    return np.einsum("...p,...p->...", features(left, method), features(right, method))
+
+
+def compare_all(a: Floats, b: Floats, *, method: str = "pearson") -> Floats:
+    """Compare every ``a`` [N, P] with every ``b`` [A, P] by one matrix product: [N, A]."""
+    if a.shape[-1] > _SIGN_LIMIT and method in _BY_SORTING:
+        return compare(a[:, None], b[None], method=method)
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return compare(a[:, None], b[None], method=method)
+    return features(a, method) @ features(b, method).T
+
+
+def features(rdms: Floats, method: str) -> Floats:
+    """Return vectors whose inner product is the comparison; NaN where it has no value."""
+    return _FEATURES[method](rdms)
+
+
+def check_comparison(method: str) -> None:
+    """Raise UsageError with the nearest name unless ``method`` is a comparison."""
+    if method not in _FEATURES:
+        raise unknown_name("RDM comparison", method, _FEATURES)
+
+
+def pooling(method: str) -> Callable[[Floats], Floats]:
+    """Return the transform [..., P] → [..., P] of RDMs before they are averaged to predict one another.
+
+    Nili 2014: unit vectors for the cosines, standardised ones for the correlations (the whitened ones
+    too, as in rsatoolbox), ranks for the rank correlations (approximate for Kendall's tau).
+    """
+    return _POOLING[method]
+
+
+def _unit(vectors: Floats, size: Floats | None = None) -> Floats:
+    length = np.sqrt(np.einsum("...p,...p->...", vectors, vectors))[..., None]
+    floor = 0.0 if size is None else _CONSTANT * np.sqrt(np.einsum("...p,...p->...", size, size))[..., None]
+    return np.divide(vectors, length, out=np.full(vectors.shape, np.nan), where=length > floor)
+
+
+def _centred(vectors: Floats) -> Floats:
+    return vectors - vectors.mean(axis=-1, keepdims=True)
+
+
+def _ranks(vectors: Floats) -> Floats:
+    from scipy.stats import rankdata
+
+    return rankdata(vectors, axis=-1)
+
+
+def _pearson(rdms: Floats) -> Floats:
+    return _unit(_centred(rdms), rdms)
+
+
+def _spearman(rdms: Floats) -> Floats:
+    return _pearson(_ranks(rdms))
+
+
+def _rho_a(rdms: Floats) -> Floats:
+    count = rdms.shape[-1]
+    if count < 2:
+        return np.full(rdms.shape, np.nan)
+    return _centred(_ranks(rdms)) * np.sqrt(12.0 / (count**3 - count))
+
+
+def _signs(rdms: Floats) -> Floats:
+    rows, cols = np.triu_indices(rdms.shape[-1], k=1)
+    return np.sign(rdms[..., rows] - rdms[..., cols])
+
+
+def _tau_a(rdms: Floats) -> Floats:
+    count = rdms.shape[-1]
+    return _signs(rdms) / np.sqrt(count * (count - 1) / 2) if count > 1 else np.full((*rdms.shape[:-1], 1), np.nan)
+
+
+def _tau_b(rdms: Floats) -> Floats:
+    return _unit(_signs(rdms)) if rdms.shape[-1] > 1 else np.full((*rdms.shape[:-1], 1), np.nan)
+
+
+def _second_moment(rdms: Floats) -> Floats:
+    """Return the doubly centred −½D, flattened: its inner product is dᵀV⁻¹d up to a constant."""
+    matrix = -0.5 * square(rdms)
+    matrix -= matrix.mean(axis=-1, keepdims=True)
+    matrix -= matrix.mean(axis=-2, keepdims=True)
+    return matrix.reshape(*rdms.shape[:-1], -1)
+
+
+def _whitened_cosine(rdms: Floats) -> Floats:
+    return _unit(_second_moment(rdms))
+
+
+def _whitened_pearson(rdms: Floats) -> Floats:
+    return _unit(_second_moment(_centred(rdms)), rdms)
+
+
+_FEATURES: dict[str, Callable[[Floats], Floats]] = {
+    "pearson": _pearson,
+    "spearman": _spearman,
+    "rho-a": _rho_a,
+    "tau-a": _tau_a,
+    "tau-b": _tau_b,
+    "cosine": _unit,
+    "whitened-cosine": _whitened_cosine,
+    "whitened-pearson": _whitened_pearson,
+}
+
+COMPARISONS = tuple(_FEATURES)
+"""Names that ``method`` of :func:`compare` takes."""
+
+
+_POOLING: dict[str, Callable[[Floats], Floats]] = {
+    "pearson": _pearson,
+    "spearman": _ranks,
+    "rho-a": _ranks,
+    "tau-a": _ranks,
+    "tau-b": _ranks,
+    "cosine": _unit,
+    "whitened-cosine": _unit,
+    "whitened-pearson": _pearson,
+}
+
+
+def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
+    """Compare over the pairs present in both RDMs, together for all comparisons that lack the same pairs."""
+    shape = left.shape[:-1]
+    left, right = left.reshape(-1, left.shape[-1]), right.reshape(-1, right.shape[-1])
+    present = np.isfinite(left) & np.isfinite(right)
+    result = np.full(len(left), np.nan)
+    patterns, member = np.unique(present, axis=0, return_inverse=True)
+    for index, keep in enumerate(patterns):
+        if not keep.any():
+            continue
+        rows = np.flatnonzero(member.ravel() == index)
+        a, b = left[np.ix_(rows, np.flatnonzero(keep))], right[np.ix_(rows, np.flatnonzero(keep))]
+        if method in _BY_SORTING and keep.sum() > _SIGN_LIMIT:
+            result[rows] = _each(a, b, _BY_SORTING[method])
+        elif method.startswith("whitened") and not keep.all():
+            result[rows] = _whitened_present(a, b, keep, centre=method == "whitened-pearson")
+        else:
+            result[rows] = np.einsum("np,np->n", features(a, method), features(b, method))
+    return result.reshape(shape)
+
+
+def _whitened_present(a: Floats, b: Floats, keep: np.ndarray, *, centre: bool) -> Floats:
+    """Whiten with the covariance V of the pairs that are left (Diedrichsen 2021, eq. for Σ_K = I)."""
+    from scipy.linalg import cho_factor, cho_solve
+
+    rows, cols = np.triu_indices(stimulus_count(len(keep)), k=1)
+    contrast = np.zeros((int(keep.sum()), stimulus_count(len(keep))))
+    contrast[np.arange(len(contrast)), rows[keep]] = 1.0
+    contrast[np.arange(len(contrast)), cols[keep]] = -1.0
+    factor = cho_factor((contrast @ contrast.T) ** 2)
+    x, y = (_centred(a), _centred(b)) if centre else (a, b)
+    solved_x, solved_y = cho_solve(factor, x.T).T, cho_solve(factor, y.T).T
+    size = np.einsum("np,np->n", x, solved_x) * np.einsum("np,np->n", y, solved_y)
+    floor = (_CONSTANT**2 * (a * a).sum(axis=1)) * (_CONSTANT**2 * (b * b).sum(axis=1))
+    product = np.einsum("np,np->n", x, solved_y)
+    return np.divide(product, np.sqrt(size), out=np.full(len(x), np.nan), where=size > floor)
+
+
+def _each(left: Floats, right: Floats, one: Callable[[Floats, Floats], float]) -> Floats:
+    shape = left.shape[:-1]
+    left, right = left.reshape(-1, left.shape[-1]), right.reshape(-1, right.shape[-1])
+    return np.array([one(x, y) for x, y in zip(left, right, strict=True)]).reshape(shape)
+
+
+def _sorted_tau_b(x: Floats, y: Floats) -> float:
+    from scipy.stats import kendalltau
+
+    return float(np.asarray(kendalltau(x, y))[0])
+
+
+def _sorted_tau_a(x: Floats, y: Floats) -> float:
+    pairs = len(x) * (len(x) - 1) // 2
+    untied = [pairs - sum(n * (n - 1) // 2 for n in np.unique(v, return_counts=True)[1].tolist()) for v in (x, y)]
+    return _sorted_tau_b(x, y) * float(np.sqrt(untied[0] / pairs) * np.sqrt(untied[1] / pairs)) if all(untied) else 0.0
+
+
+_BY_SORTING: dict[str, Callable[[Floats, Floats], float]] = {"tau-a": _sorted_tau_a, "tau-b": _sorted_tau_b}

@@ -1,0 +1,281 @@
+"""Representational dissimilarity matrices (RDMs).
+
+Conventions are those of rsatoolbox 0.3.2: distances are squared and divided by the number of units,
+correlation distance is 1 − r, and the result is the upper triangle [P], row by row.
+
+Responses may be numpy arrays or torch tensors on any device. Tensors are computed where they lie and
+numpy arrays on the processor, unless ``device`` says otherwise; everything is float64 in slices of units,
+so the numbers are the same and little memory is needed there. RDMs come back as numpy arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.metrics.arrays import Array, fetch, find_device, library, place
+from brainbench.metrics.rdms.distances import (
+    correlation_distances,
+    product_distances,
+    products_from_gram,
+    without_shift,
+)
+from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.rdms.precision import NOISE_METHODS, estimate_noise
+from brainbench.metrics.stimulus_labels import listed, response_matrix, stimulus_codes, stimulus_means, tensor_means
+
+POISSON_PRIOR_MEAN = 1.0
+POISSON_PRIOR_WEIGHT = 0.1
+"""Gamma prior that keeps the logarithm of a silent unit finite (rsatoolbox's defaults)."""
+
+
+@dataclass(frozen=True)
+class _Trials:
+    """What a method may use: responses of K stimuli as given, and for labelled trials their codes."""
+
+    responses: Array
+    count: int
+    codes: Ints | None
+    folds: ArrayLike | None
+    precision: ArrayLike | str | None
+    device: Any
+    """Torch device, or None for numpy."""
+
+    @property
+    def missing(self) -> bool:
+        """Whether NaN means not recorded; a NaN activation makes its pattern useless instead."""
+        return self.codes is not None
+
+    def patterns(self) -> Array:
+        """Return patterns [K, U], unlabelled ones as given."""
+        return self.responses if self.codes is None else self.means(self.codes, self.count)
+
+    def placed(self) -> Array:
+        """Return patterns [K, U] in float64 on the device."""
+        return place(self.patterns(), self.device)
+
+    def means(self, cells: Ints, count: int) -> Array:
+        """Return the mean response [count, U] to the trials of each cell."""
+        if self.device is None:
+            return stimulus_means(self.responses, cells, count)
+        return tensor_means(self.responses, cells, count, self.device)
+
+    def sides(self, left: Array, right: Array) -> tuple[Array, Array]:
+        """Return vectors whose inner products are those of ``left`` and ``right`` with the precision between."""
+        if self.precision is None:
+            return left, right
+        if isinstance(self.precision, str):
+            if self.codes is None:
+                raise UsageError(
+                    f"The noise covariance {self.precision!r} is estimated from trials: give labels, or a matrix as "
+                    "precision."
+                )
+            return estimate_noise(self.responses, self.codes, self.count, self.precision, device=self.device).sides(
+                left, right
+            )
+        units = left.shape[-1]
+        shape = tuple(np.shape(self.precision))
+        if shape != (units, units):
+            raise UsageError(f"The noise precision of {units} units has shape ({units}, {units}); received {shape}.")
+        return left, right @ place(self.precision, self.device)
+
+
+def rdm(
+    responses: ArrayLike,
+    labels: ArrayLike | None = None,
+    *,
+    method: str = "correlation",
+    folds: ArrayLike | None = None,
+    precision: ArrayLike | str | None = None,
+    device: Any = None,
+) -> Floats:
+    """Return the RDM of stimulus patterns, upper triangle [P].
+
+    Without ``labels`` each row of ``responses`` [K, U] is one stimulus' complete pattern. With
+    ``labels`` [R] the rows are trials [R, U], averaged per stimulus; NaN is a missing entry, and a
+    pair of stimuli uses the units that have a value for both (with ``precision`` a stimulus that lacks
+    a unit has NaN pairs). Integer labels are positions 0 … K−1, strings are sorted.
+
+    Args:
+        responses: [K, U] or [R, U], any real type; computed in float64.
+        labels: Stimulus of each trial, or None.
+        method: ``correlation`` 1 − Pearson r; ``sqeuclidean``; ``mahalanobis`` (with ``precision``;
+            squared Euclidean without); ``crossnobis`` cross-validated Mahalanobis distance, mean over
+            pairs of folds (Walther 2016; unbiased, can be negative); ``poisson`` symmetrised
+            Kullback-Leibler divergence of Poisson rates (Schütt 2023).
+        folds: Cross-validation fold of each trial [R]; needed by ``crossnobis`` only. Every fold weighs
+            the same; fold pairs in which a stimulus is missing are left out of its pairs.
+        precision: Inverse noise covariance [U, U] between units, symmetric, or the name of an estimator of
+            :func:`noise_precision`, which then takes these trials. By name is faster by far: no matrix of
+            units × units is inverted, nor made at all where trials are fewer than units.
+        device: Torch device to compute on (``"cuda"``, ``"cpu"``); by default where ``responses`` lie.
+
+    Returns:
+        Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no
+        trials) is NaN; :func:`rdm_problem` says why.
+
+    Raises:
+        UsageError: unknown method or device, shapes that do not fit, folds missing or not wanted.
+        DataError: infinite trials, negative rates for ``poisson``, or a singular noise covariance.
+
+    >>> rdm([[1, 2, 3], [2, 4, 6], [3, 2, 1]]).round(3).tolist()
+    [0.0, 2.0, 2.0]
+    >>> rdm([[1, 2], [3, 2], [5, 5]], ["b", "b", "a"], method="sqeuclidean").tolist()
+    [9.0]
+    """
+    if method not in _METHODS:
+        raise unknown_name("RDM method", method, _METHODS)
+    if folds is not None and method != "crossnobis":
+        raise UsageError(f"folds are for method='crossnobis'; method={method!r} averages all trials; leave them out.")
+    if precision is not None and method not in ("mahalanobis", "crossnobis"):
+        raise UsageError(f"A noise precision is for 'mahalanobis' and 'crossnobis'; method={method!r} does not use it.")
+    if isinstance(precision, str) and precision not in NOISE_METHODS:
+        raise unknown_name("noise covariance method", precision, NOISE_METHODS)
+    given = _prepare(responses, labels, folds, precision, device)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return fetch(_METHODS[method](given))
+
+
+def rdm_problem(responses: ArrayLike, labels: ArrayLike | None = None) -> str | None:
+    """Say in words why some pairs of the RDM of ``responses`` have no distance; None if none does.
+
+    Constant patterns matter to correlation distance only.
+    """
+    matrix = fetch(response_matrix(responses, "stimuli" if labels is None else "trials"))
+    if labels is None:
+        patterns, names = matrix, tuple(str(row) for row in range(len(matrix)))
+    else:
+        codes, names = stimulus_codes(labels)
+        patterns = stimulus_means(matrix, codes, len(names))
+        empty = np.asarray(~np.isfinite(patterns).any(axis=1))
+        if empty.any():
+            return f"no trials of stimulus {listed(names, empty)}"
+    broken = np.asarray(~np.isfinite(patterns).all(axis=1))
+    if labels is None and broken.any():
+        return f"activations that are not finite for stimulus {listed(names, broken)}"
+    with np.errstate(invalid="ignore"):
+        spread = np.nanmax(patterns, axis=1) - np.nanmin(patterns, axis=1)
+        constant = np.asarray(spread <= 8 * np.finfo(np.float64).eps * np.nanmax(np.abs(patterns), axis=1))
+    if constant.any():
+        return f"a constant response across units to stimulus {listed(names, constant)}"
+    return None
+
+
+def _prepare(
+    responses: ArrayLike,
+    labels: ArrayLike | None,
+    folds: ArrayLike | None,
+    precision: ArrayLike | str | None,
+    device: Any,
+) -> _Trials:
+    where = find_device(device, responses, precision)
+    if labels is None:
+        matrix, codes = response_matrix(responses, "stimuli"), None
+        count = len(matrix)
+    else:
+        matrix = response_matrix(responses, "trials")
+        codes, names = stimulus_codes(labels)
+        count = len(names)
+        if len(codes) != len(matrix):
+            raise UsageError(f"There are {len(matrix)} trials but {len(codes)} labels; give one label per trial.")
+    if count < 2:
+        raise UsageError(f"An RDM compares at least 2 stimuli; received {count}.")
+    return _Trials(matrix, count, codes, folds, precision, where)
+
+
+def _correlation(given: _Trials) -> Array:
+    return correlation_distances(given.patterns(), missing=given.missing, device=given.device)
+
+
+def _sqeuclidean(given: _Trials) -> Array:
+    patterns = given.patterns()
+    return product_distances(patterns, patterns, missing=given.missing, device=given.device)
+
+
+def _mahalanobis(given: _Trials) -> Array:
+    if given.precision is None:
+        return _sqeuclidean(given)
+    patterns = given.placed()
+    # The shift per unit must go before the product mixes units.
+    centred = without_shift(patterns)
+    left, right = given.sides(centred, centred)
+    return products_from_gram(left @ right.T, patterns.shape[1])
+
+
+def _crossnobis(given: _Trials) -> Array:
+    if given.codes is None or given.folds is None:
+        raise UsageError(
+            "method='crossnobis' needs labels and folds: one stimulus and one cross-validation fold per trial."
+        )
+    folds = fetch(given.folds)
+    if folds.shape != given.codes.shape:
+        raise UsageError(f"There are {len(given.codes)} trials but folds of shape {folds.shape}; give one per trial.")
+    names = np.unique(folds)
+    if len(names) < 2:
+        raise UsageError(f"method='crossnobis' compares at least 2 folds; received {len(names)}.")
+    units, count, number = given.responses.shape[1], given.count, len(names)
+    # Fold and stimulus together number the cells, so one pass over the trials averages all of them.
+    flat = given.means(np.searchsorted(names, folds) * count + given.codes, number * count)
+    xp = library(flat)
+    if not xp.isfinite(flat).all():
+        return _crossnobis_of_present(given, flat.reshape(number, count, units))
+    flat = flat - flat.mean(0)
+    # Products of all folds with all, less those of each with itself, are those of all pairs of folds.
+    if number == 2:
+        left, right = given.sides(flat[:count], flat[count:])
+        return products_from_gram(left @ right.T, units)
+    left, right = (side.reshape(number, count, -1) for side in given.sides(flat, flat))
+    gram = left.sum(0) @ right.sum(0).T - (left @ right.swapaxes(-1, -2)).sum(0)
+    return products_from_gram(gram, units) / (number * (number - 1))
+
+
+def _crossnobis_of_present(given: _Trials, means: Array) -> Array:
+    """Average over the pairs of folds in which both stimuli have a value."""
+    xp, (folds, _, units) = library(means), means.shape
+    left = right = means
+    if given.precision is not None:
+        # A cell that lacks a unit has no product with any other.
+        left, right = (s.reshape(*means.shape[:2], -1) for s in given.sides(*[means.reshape(-1, units)] * 2))
+    total = found = 0.0
+    for first in range(folds):
+        for second in range(first + 1, folds):
+            if given.precision is None:
+                distance = product_distances(left[first], right[second], missing=True)
+            else:
+                distance = products_from_gram(left[first] @ right[second].T, units)
+            known = xp.isfinite(distance)
+            total = total + xp.where(known, distance, 0.0)
+            found = found + xp.where(known, xp.ones_like(distance), 0.0)
+    return xp.where(found > 0, total / xp.where(found > 0, found, 1.0), np.nan)
+
+
+def _poisson(given: _Trials) -> Array:
+    patterns = given.placed()
+    known = patterns[~library(patterns).isnan(patterns)]
+    low = float(known.min()) if len(known) else 0.0
+    if low < 0:
+        raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
+    rates = poisson_rates(patterns)
+    return product_distances(rates, library(rates).log(rates), missing=given.missing)
+
+
+def poisson_rates(rates: Array) -> Array:
+    """Return rates under the gamma prior, which are never zero."""
+    return (rates + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
+
+
+_METHODS: dict[str, Callable[[_Trials], Array]] = {
+    "correlation": _correlation,
+    "sqeuclidean": _sqeuclidean,
+    "mahalanobis": _mahalanobis,
+    "crossnobis": _crossnobis,
+    "poisson": _poisson,
+}
+
+RDM_METHODS = tuple(_METHODS)
+"""Names that ``method`` of :func:`rdm` takes."""

@@ -1,0 +1,83 @@
+"""Stimulus pairs: the order of an RDM's upper triangle and what permuting stimuli does to it.
+
+Pair p of K stimuli is the p-th entry of the upper triangle read row by row:
+(0, 1), (0, 2) … (0, K−1), (1, 2) … so P = K(K−1)/2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.core.errors import UsageError
+from brainbench.metrics.arrays import is_tensor, library
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def stimulus_count(pairs: int) -> int:
+    """Return K for P = K(K−1)/2 pairs.
+
+    Raises:
+        UsageError: ``pairs`` is not such a number.
+    """
+    count = (1 + math.isqrt(1 + 8 * pairs)) // 2
+    if pairs < 1 or count * (count - 1) // 2 != pairs:
+        raise UsageError(
+            f"An RDM vector has K(K−1)/2 entries (1, 3, 6, 10, 15 …); this one has {pairs}; "
+            f"give the upper triangle without the diagonal."
+        )
+    return count
+
+
+def upper(matrix: Any) -> Any:
+    """Return the upper triangle [..., P] of square matrices [..., K, K], numpy arrays or tensors."""
+    count = matrix.shape[-1]
+    if is_tensor(matrix):
+        rows, cols = library(matrix).triu_indices(count, count, offset=1, device=matrix.device)
+    else:
+        rows, cols = np.triu_indices(count, k=1)
+    return matrix[..., rows, cols]
+
+
+def square(rdm: ArrayLike) -> Floats:
+    """Return symmetric matrices [..., K, K] with a zero diagonal from upper triangles [..., P]."""
+    vector = np.asarray(rdm, dtype=np.float64)
+    count = stimulus_count(vector.shape[-1])
+    rows, cols = np.triu_indices(count, k=1)
+    matrix = np.zeros((*vector.shape[:-1], count, count))
+    matrix[..., rows, cols] = vector
+    matrix[..., cols, rows] = vector
+    return matrix
+
+
+def permuted_pairs(orders: Ints) -> Ints:
+    """Return indices [N, P] such that ``rdm[indices[n]]`` is the RDM of stimuli in ``orders[n]`` [N, K]."""
+    count = orders.shape[-1]
+    rows, cols = np.triu_indices(count, k=1)
+    table = np.zeros((count, count), dtype=np.int64)
+    table[rows, cols] = table[cols, rows] = np.arange(len(rows))
+    return table[orders[..., rows], orders[..., cols]]
+
+
+def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
+    """Return float64 RDM vectors [..., P], checked.
+
+    Raises:
+        UsageError: not numbers, no pair axis, or a length that is no K(K−1)/2.
+    """
+    try:
+        array = np.asarray(rdms, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"{what} must be RDM vectors of one length; received {type(rdms).__name__} ({error})."
+        ) from error
+    if array.ndim == 0:
+        raise UsageError(f"{what} must be an RDM vector [P]; received a single number.")
+    stimulus_count(array.shape[-1])
+    return array

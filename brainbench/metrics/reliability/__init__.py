@@ -1,0 +1,1 @@
+"""Reliability of the animals' RDMs: split halves, noise correction, ceilings, units."""

@@ -1,0 +1,165 @@
+"""Correction of an RDM comparison for noise in the brain's RDM.
+
+A noisy RDM can correlate with the best model by no more than the square root of its reliability
+(Spearman 1904), so r is divided by that. Reliability comes from split halves, lengthened to all
+trials by Spearman and Brown's formula, which assumes that the noise variance halves as the trials
+double. The noise of a distance can fall up to twice as fast where single units are very noisy; then
+the corrected value errs upwards, by at most 15 % at a reliability of .5, 5 % at .8 and 3 % at .9.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.records import Status
+from brainbench.metrics.rdms.pairs import Floats
+
+RELIABILITY_GATE = 0.5
+"""Smallest Spearman-Brown reliability of an animal's RDM whose corrected score is trusted.
+
+From 13,258 simulated animals (6 stimuli, 60 units, 20 trials each, true r about .74): with estimated
+reliability in .5–.6 the bias of ``default`` is +.02 and the root mean square error of one animal .21;
+in .3–.4 it is .35, in .1–.2 .65 with a bias of +.28, in 0–.1 3.3 with a bias of +1.1. The mean and the
+median of ratios fare no better there, so a low reliability is reported instead of corrected cleverly.
+"""
+
+THESIS_FILTER = 0.5
+"""The published estimator drops split halves whose raw correlation is below this."""
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """A noise-corrected comparison."""
+
+    value: float
+    """NaN exactly when ``status`` is ``undefined``."""
+    status: Status
+    reason: str = ""
+    r: float = math.nan
+    """Mean raw comparison."""
+    reliability: float = math.nan
+    """Spearman-Brown reliability of the mean split-half correlation (the product's square root when
+    two sides are corrected)."""
+    splits: int = 0
+    """Split halves that entered the value."""
+
+
+def spearman_brown(r: ArrayLike) -> Floats:
+    """Return the reliability 2r/(1 + r) of all trials from the correlation of their halves; r = −1 is NaN."""
+    half = np.asarray(r, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(half == -1.0, np.nan, 2 * half / (1 + half))
+
+
+def corrected_splits(
+    r_xy: ArrayLike, split_half_r: ArrayLike, other_split_half_r: ArrayLike | None = None
+) -> tuple[Floats, Floats]:
+    """Return each split's ratio r_xy/√(SB(r_xx) SB(r_yy)) and its denominator, as published; NaN where it is imaginary.
+
+    As published, two negative reliabilities have a positive product and pass.
+    """
+    other = 1.0 if other_split_half_r is None else spearman_brown(other_split_half_r)
+    product = spearman_brown(split_half_r) * other
+    denominator = np.sqrt(np.where(product > 0, product, np.nan))
+    return np.asarray(r_xy, dtype=np.float64) / denominator, denominator
+
+
+def noise_corrected(
+    r_xy: ArrayLike,
+    split_half_r: ArrayLike,
+    *,
+    estimator: str = "default",
+    other_split_half_r: ArrayLike | None = None,
+) -> Corrected:
+    """Correct the comparison of a model with a brain for the brain's noise.
+
+    Args:
+        r_xy: Comparison of the two RDMs: a number, or one per split half [S].
+        split_half_r: Raw correlations [S] between the brain's split-half RDMs, one per random split.
+        estimator: ``default`` mean(r_xy)/√SB(mean split_half_r), ``unreliable`` below
+            :data:`RELIABILITY_GATE`, ``undefined`` without positive reliability. ``thesis``: ratio per
+            split, splits with raw r below :data:`THESIS_FILTER` dropped, mean of the rest (published for
+            models). ``thesis-input``: ratio per split, no filter, median (published for the raw input).
+        other_split_half_r: The same for the other side when it is a noisy brain too (animal to animal);
+            None for models, which have no trial noise.
+
+    Raises:
+        UsageError: unknown estimator, or numbers of splits that do not fit.
+
+    >>> round(noise_corrected(0.6, [0.7, 0.8, 0.6]).value, 3)
+    0.661
+    >>> noise_corrected(0.6, [0.1, 0.2]).reason
+    'reliability 0.26 is below 0.5, where no noise correction is trustworthy'
+    """
+    if estimator not in _ESTIMATORS:
+        raise unknown_name("estimator", estimator, _ESTIMATORS)
+    comparison = np.asarray(r_xy, dtype=np.float64).ravel()
+    halves = np.asarray(split_half_r, dtype=np.float64).ravel()
+    others = None if other_split_half_r is None else np.asarray(other_split_half_r, dtype=np.float64).ravel()
+    sizes = {len(part) for part in (comparison, halves, others) if part is not None and len(part) != 1}
+    if len(sizes) > 1 or 0 in sizes:
+        raise UsageError(
+            f"r_xy and the split-half correlations are single numbers or one per split; received {len(comparison)}, "
+            f"{len(halves)}{'' if others is None else f', {len(others)}'}."
+        )
+    r = _mean(comparison)
+    sides = [float(spearman_brown(_mean(side))) for side in (halves, others) if side is not None]
+    reliability = sides[0] if len(sides) == 1 else math.sqrt(math.prod(sides)) if min(sides) > 0 else min(sides)
+    value, splits, reason = _ESTIMATORS[estimator](comparison, halves, others)
+    if math.isnan(r):
+        value, reason = math.nan, "the comparison of the RDMs is undefined (a constant or missing RDM)"
+    if math.isnan(value):
+        return Corrected(math.nan, "undefined", reason, r, reliability, splits)
+    # The noisier side decides: one good side does not make up for a bad one.
+    lowest = min(sides)
+    if not lowest >= RELIABILITY_GATE:
+        text = f"reliability {lowest:.2f} is below {RELIABILITY_GATE}, where no noise correction is trustworthy"
+        return Corrected(value, "unreliable", text, r, reliability, splits)
+    return Corrected(value, "ok", "", r, reliability, splits)
+
+
+def _default(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
+    sides = [float(spearman_brown(_mean(side))) for side in (halves, others) if side is not None]
+    lowest = min(sides) if not any(map(math.isnan, sides)) else math.nan
+    if math.isnan(lowest):
+        return math.nan, 0, "the split-half reliability is undefined"
+    if lowest <= 0:
+        return math.nan, 0, f"the reliability is {lowest:.2f}, not positive: the split halves share no geometry"
+    return _mean(r_xy) / math.sqrt(math.prod(sides)), int(np.isfinite(halves).sum()), ""
+
+
+def _thesis(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
+    ratio, _ = corrected_splits(r_xy, halves, others)
+    kept = ratio[np.broadcast_to(halves >= THESIS_FILTER, ratio.shape) & np.isfinite(ratio)]
+    if not kept.size:
+        return math.nan, 0, f"no split half has a raw correlation of at least {THESIS_FILTER}"
+    return float(kept.mean()), kept.size, ""
+
+
+def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
+    ratio, _ = corrected_splits(r_xy, halves, others)
+    kept = ratio[np.isfinite(ratio)]
+    if not kept.size:
+        return math.nan, 0, "no split half has a positive reliability"
+    return float(np.median(kept)), kept.size, ""
+
+
+def _mean(values: Floats) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else math.nan
+
+
+_ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None], tuple[float, int, str]]] = {
+    "default": _default,
+    "thesis": _thesis,
+    "thesis-input": _thesis_input,
+}
+
+ESTIMATORS = tuple(_ESTIMATORS)
+"""Names that ``estimator`` takes."""

@@ -1,0 +1,80 @@
+"""Reliability of single units' tuning, and leaving unreliable units out.
+
+A unit's reliability is that of its mean responses over stimuli: the correlation between random halves
+of its own trials, averaged over splits, then lengthened by Spearman and Brown's formula. (The published
+filter used one number per animal.) Filtering is a choice made on the data that are then scored: it
+raises reliability also where there is nothing to find, so report it with the score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.metrics.rdms.comparison import features
+from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.reliability.halves import Session, split_members, weighted_patterns
+from brainbench.metrics.reliability.noise_correction import spearman_brown
+from brainbench.metrics.reliability.split_half import TrialBlock, trial_hashes
+from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes
+
+UNIT_GATE = 0.5
+"""Smallest reliability of a unit that :func:`reliable_units` keeps (published)."""
+
+_SPLITS = 100
+_CHUNK = 20
+
+
+def unit_reliability(
+    blocks: Sequence[TrialBlock], n_stimuli: int, *, splits: int = _SPLITS, seed: int = 0
+) -> tuple[Floats, ...]:
+    """Return the reliability of every unit's tuning [F], for each session; NaN where it has none.
+
+    A unit without variation over stimuli, or with fewer than two trials of some stimulus in every split,
+    has no reliability. Values can be negative.
+
+    Raises:
+        UsageError: fewer than 3 stimuli or 1 split, bad shapes or labels.
+    """
+    if n_stimuli < 3 or splits < 1:
+        raise UsageError(f"A unit's tuning needs at least 3 stimuli and 1 split; received {n_stimuli} and {splits}.")
+    found = []
+    for block in blocks:
+        responses = response_matrix(block.responses, "trials").astype(np.float64)
+        codes, _ = stimulus_codes(block.labels, n_stimuli)
+        session = Session(responses, codes, trial_hashes(block, responses, codes))
+        total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
+        for start in range(0, splits, _CHUNK):
+            member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
+            halves = [weighted_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
+            first, second = (features(half.swapaxes(-1, -2), "pearson") for half in halves)
+            r = np.einsum("sfk,sfk->sf", first, second)
+            known = np.isfinite(r)
+            total += np.where(known, r, 0.0).sum(axis=0)
+            number += known.sum(axis=0)
+        mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+        found.append(spearman_brown(mean))
+    return tuple(found)
+
+
+def reliable_units(
+    blocks: Sequence[TrialBlock], n_stimuli: int, *, least: float = UNIT_GATE, splits: int = _SPLITS, seed: int = 0
+) -> tuple[tuple[TrialBlock, ...], str]:
+    """Return the sessions with the units whose reliability is at least ``least``, and what was left out in words.
+
+    A session without such a unit is left out.
+
+    Raises:
+        UsageError: as :func:`unit_reliability`.
+    """
+    values = unit_reliability(blocks, n_stimuli, splits=splits, seed=seed)
+    kept = []
+    for block, value in zip(blocks, values, strict=True):
+        good = value >= least
+        if good.any():
+            kept.append(TrialBlock(np.asarray(block.responses)[:, good], block.labels, block.keys, block.covariates))
+    every = sum(len(value) for value in values)
+    left = sum(int((~(value >= least)).sum()) for value in values)
+    return tuple(kept), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

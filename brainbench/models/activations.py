@@ -1,0 +1,277 @@
+"""Activations of a model's layers for a set of stimuli.
+
+Letters: K stimulus, T time step, F feature.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import BrainbenchError, UsageError, unknown_name
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
+
+_log = logging.getLogger(__name__)
+
+OUTPUT = "output"
+"""Layer name of a user model's own output."""
+
+
+class Activations(dict[str, np.ndarray]):
+    """``{layer: [K, T, F] float32}``; values that are not finite are kept and counted in :attr:`nonfinite`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.nonfinite: dict[str, int] = {}
+        """Number of NaN and infinite values of each layer that has any."""
+
+
+def extract(
+    model: nn.Module,
+    stimuli: Any,
+    *,
+    layers: Collection[str] | None = None,
+    chunk: int = 16,
+    folder: str | os.PathLike[str] | None = None,
+) -> Activations:
+    """Return the activations of a model's layers.
+
+    A model with ``layers`` and ``activations`` (all of ours) gives its named layers. Any other module is
+    read by hooks at its leaf modules, and at its output under the name ``output``. A hooked layer that is
+    called once has the time axis of the stimuli if its tensor is [B, T, ...], [T, B, ...] or [B·T, ...],
+    else T = 1; one called several times per sweep is stacked over calls as time (over calls of unequal
+    shape: ``name[0]``, ``name[1]``, …). Of a tuple or mapping the first tensor counts.
+
+    The model runs in evaluation mode without gradients; modes are put back and no hook stays. Memory
+    beyond the result is that of ``chunk`` stimuli; with ``folder`` the result lies on disk, and so may the
+    stimuli (``numpy.load(…, mmap_mode="r")``).
+
+    Args:
+        model: Maps [B, T, C, H, W] to anything.
+        stimuli: Array or tensor [K, T, C, H, W], or an object whose ``input`` is one.
+        layers: Layers wanted; for a module without named layers any of its submodules. None: all.
+        chunk: Stimuli processed at once.
+        folder: Keep every layer as ``<folder>/<layer>.npy``, which replaces an earlier one, and return them mapped
+            into memory.
+
+    Raises:
+        UsageError: a layer does not exist or gives nothing per stimulus, no layer does, or the model cannot
+            process the stimuli; the message says what it was given and what it failed with.
+    """
+    import torch
+
+    given = getattr(stimuli, "input", stimuli)
+    values: Any = given if isinstance(given, torch.Tensor) else np.asanyarray(given)
+    if values.ndim < 2 or len(values) < 1 or chunk < 1:
+        raise UsageError(
+            f"Extraction needs stimuli [stimulus, time, ...] and a chunk of at least 1; received stimuli of shape "
+            f"{list(values.shape)} and chunk {chunk}."
+        )
+    like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
+    reader = _named_reader(model, layers) or _HookReader(model, _hooked(model, layers), layers is not None)
+    result = Activations()
+    with evaluating(model), torch.no_grad():
+        for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
+            part = torch.as_tensor(_writable(values[start:stop])).to(device=like.device, dtype=like.dtype)
+            for name, activity in _run(reader, part, model, values).items():
+                rows = activity.detach().to("cpu", dtype=torch.float32).flatten(2).numpy()
+                if name not in result:
+                    result[name] = _room(name, (len(values), *rows.shape[1:]), folder)
+                elif result[name].shape[1:] != rows.shape[1:]:
+                    raise UsageError(
+                        f"Layer {name!r} changed its shape between stimuli, from {list(result[name].shape[1:])} to "
+                        f"{list(rows.shape[1:])}; give stimuli of one length or leave this layer out."
+                    )
+                result[name][start:stop] = rows
+    if not result:
+        raise UsageError(
+            f"Nothing in {type(model).__name__} gives an activation per stimulus: no output of it or of its parts has "
+            f"the {len(values)} stimuli as its first axis. Return [B, ...] for stimuli [B, T, C, H, W]."
+        )
+    for name, activity in result.items():
+        if isinstance(activity, np.memmap):
+            activity.flush()
+        count = sum(part.size - int(np.isfinite(part).sum()) for part in np.array_split(activity, len(activity)))
+        if count:
+            result.nonfinite[name] = count
+            _log.warning("%d of %d activations of layer %r are not finite.", count, activity.size, name)
+    return result
+
+
+def _writable(values: Any) -> Any:
+    """Return stimuli that PyTorch may read in place: its tensors cannot be read-only."""
+    if isinstance(values, np.ndarray):
+        return np.array(values) if not values.flags.writeable else np.ascontiguousarray(values)
+    return values
+
+
+def _room(name: str, shape: tuple[int, ...], folder: str | os.PathLike[str] | None) -> np.ndarray:
+    """Return where a layer's activations go: memory, or a file."""
+    if folder is None:
+        return np.empty(shape, np.float32)
+    path = Path(folder) / f"{name.replace('/', '-')}.npy"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+
+
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Put a model into evaluation mode and every submodule back into its own mode afterwards."""
+    modes = {module: module.training for module in model.modules()}
+    try:
+        model.eval()
+        yield
+    finally:
+        for module, mode in modes.items():
+            module.training = mode
+
+
+def _chunks(count: int, chunk: int, *, avoid: int) -> Iterator[tuple[int, int]]:
+    """Yield ranges, none as long as the time axis: such a batch could not be told from time."""
+    start = 0
+    while start < count:
+        stop = min(start + chunk, count)
+        if stop - start == avoid and avoid > 1:
+            stop -= 1
+        yield start, stop
+        start = stop
+
+
+def _run(reader: Any, part: torch.Tensor, model: nn.Module, stimuli: torch.Tensor) -> dict[str, torch.Tensor]:
+    import torch
+
+    try:
+        return reader(part)
+    except torch.OutOfMemoryError:
+        raise
+    except (RuntimeError, ValueError, TypeError, IndexError, AssertionError, NotImplementedError) as error:
+        if isinstance(error, _LayerError) or (isinstance(error, BrainbenchError) and not isinstance(error, UsageError)):
+            raise
+        reason = str(error).strip().partition("\n")[0]
+        if not isinstance(error, UsageError):
+            reason = f"{type(error).__name__}: {reason}"
+        raise UsageError(
+            f"{type(model).__name__} cannot process stimuli of shape {list(stimuli.shape)} "
+            f"[stimulus, time, channel, row, column]: {reason}"
+        ) from error
+
+
+class _LayerError(UsageError):
+    """A layer, not the stimulus, is what does not fit."""
+
+
+def _named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
+    """Return a function from stimuli to activations if the model names its layers itself."""
+    named = getattr(model, "layers", None)
+    if not isinstance(named, tuple) or not all(isinstance(name, str) for name in named):
+        return None
+    read = getattr(model, "activations", None)
+    if not callable(read):
+        return None
+    for name in layers or ():
+        if name not in named:
+            raise unknown_name("layer", name, named)
+    wanted = named if layers is None else tuple(name for name in named if name in layers)
+    return lambda part: read(part, wanted)
+
+
+def _hooked(model: nn.Module, layers: Collection[str] | None) -> dict[str, nn.Module]:
+    """Return the submodules to read by name."""
+    every = {name: module for name, module in model.named_modules() if name}
+    if layers is None:
+        leaves = {name: module for name, module in every.items() if not any(True for _ in module.children())}
+        return leaves | {OUTPUT: model}
+    choices = every if OUTPUT in every else {**every, OUTPUT: model}
+    for name in layers:
+        if name not in choices:
+            raise unknown_name("layer", name, choices)
+    return {name: choices[name] for name in choices if name in layers}
+
+
+@dataclass(frozen=True)
+class _HookReader:
+    """Reads submodules of any module by forward hooks."""
+
+    model: nn.Module
+    modules: dict[str, nn.Module]
+    strict: bool
+    """Layers were asked for by name, so one that gives nothing per stimulus is an error."""
+
+    def __call__(self, part: torch.Tensor) -> dict[str, torch.Tensor]:
+        calls: dict[str, list[torch.Tensor]] = {name: [] for name in self.modules}
+        handles = []
+        try:
+            for name, module in self.modules.items():
+                handles.append(module.register_forward_hook(_recorder(calls[name])))
+            self.model(part)
+        finally:
+            for handle in handles:
+                handle.remove()
+        batch, steps = part.shape[:2]
+        found = {}
+        for name, outputs in calls.items():
+            activity = _over_calls(name, outputs, batch, steps)
+            if not activity and self.strict:
+                seen = [list(output.shape) for output in outputs] or "nothing"
+                raise _LayerError(
+                    f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps: no activation per stimulus."
+                )
+            found |= activity
+        return found
+
+
+def _recorder(calls: list[torch.Tensor]) -> Any:
+    def record(module: nn.Module, inputs: Any, output: Any) -> None:
+        del module, inputs
+        tensor = _first_tensor(output)
+        if tensor is not None:
+            # A later in-place operation must not change what was recorded.
+            calls.append(tensor.detach().clone())
+
+    return record
+
+
+def _first_tensor(value: Any) -> torch.Tensor | None:
+    import torch
+
+    if isinstance(value, torch.Tensor):
+        return value
+    if isinstance(value, dict):
+        value = tuple(value.values())
+    if isinstance(value, (tuple, list)):
+        return next((tensor for item in value if (tensor := _first_tensor(item)) is not None), None)
+    return None
+
+
+def _over_calls(name: str, outputs: list[torch.Tensor], batch: int, steps: int) -> dict[str, torch.Tensor]:
+    """Return named activations [B, T, ...]; none if the outputs do not belong to the stimuli."""
+    import torch
+
+    if len(outputs) == 1:
+        activity = _with_time(outputs[0], batch, steps)
+        return {} if activity is None else {name: activity}
+    if len({output.shape for output in outputs}) == 1:
+        return {name: torch.stack(outputs, 1)} if outputs[0].shape[:1] == (batch,) else {}
+    timed = [_with_time(output, batch, steps) for output in outputs]
+    return {f"{name}[{index}]": activity for index, activity in enumerate(timed) if activity is not None}
+
+
+def _with_time(output: torch.Tensor, batch: int, steps: int) -> torch.Tensor | None:
+    shape = tuple(output.shape)
+    if len(shape) >= 3 and shape[:2] == (batch, steps):
+        return output
+    if len(shape) >= 3 and shape[:2] == (steps, batch):
+        return output.transpose(0, 1)
+    if shape[:1] == (batch * steps,) and steps > 1:
+        return output.unflatten(0, (batch, steps))
+    return output.unsqueeze(1) if shape[:1] == (batch,) else None

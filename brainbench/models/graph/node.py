@@ -1,0 +1,83 @@
+"""One node of a temporal graph as a module."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from brainbench.models.cells import CELLS, Cell, TimeDecay
+from brainbench.models.graph.spec import Convolution, Memory, Node, Pool, Shape
+from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear, activation
+
+
+class NodeModule(nn.Module):
+    """Operation, memory, activation and pool of one node."""
+
+    def __init__(self, node: Node, shape: Shape) -> None:
+        super().__init__()
+        self.node = node
+        self.grid = shape[1:]
+        self.operation, channels = _operation(node, shape)
+        self.memory = _memory(node.memory, channels)
+        self.dropout = nn.Dropout(node.operation.dropout if node.operation is not None else 0.0)
+        self.before = activation(node.operation.activation if node.operation is not None else None)
+        self.after = nn.Sequential(activation(node.activation), *_pool(node.pool))
+
+    def gather(self, inputs: list[torch.Tensor]) -> torch.Tensor:
+        """Resize inputs [B, C, H, W] to the node's grid and concatenate them on channels."""
+        fitted = [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
+        return fitted[0] if len(fitted) == 1 else torch.cat(fitted, 1)
+
+    def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
+        """Return what the memory sees [B, ...]."""
+        if isinstance(self.operation, Conv2d) and not (self.training and self.dropout.p):
+            fitted = [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
+            return self.before(self.operation.join(fitted))
+        x = self.dropout(self.gather(inputs))
+        if isinstance(self.operation, Linear):
+            x = x.flatten(1)
+        return self.before(self.operation(x))
+
+
+def _operation(node: Node, shape: Shape) -> tuple[nn.Module, int]:
+    """Build a node's operation for its concatenated input shape; return it with its output channels."""
+    what = node.operation
+    if what is None:
+        return nn.Identity(), shape[0]
+    options = {"use_bias": what.use_bias, "bias": what.bias, "method": what.initialiser}
+    if isinstance(what, Convolution):
+        layer = Conv2d(
+            shape[0],
+            what.channels,
+            kernel_size=what.kernel_size,
+            stride=what.stride,
+            padding=what.padding,
+            **options,
+        )
+        return layer, what.channels
+    return Linear(math.prod(shape), what.features, gain=RECTIFIER_GAIN, **options), what.features
+
+
+def _memory(memory: Memory | None, channels: int) -> Cell | None:
+    if memory is None:
+        return None
+    if memory.kind == "time-decay":
+        return TimeDecay(channels, channels, tau=memory.tau, layer_norm=memory.layer_norm)
+    return CELLS[memory.kind](channels, channels, kernel_size=memory.kernel_size, layer_norm=memory.layer_norm)
+
+
+def _pool(pool: Pool | None) -> list[nn.Module]:
+    if pool is None:
+        return []
+    if pool.kind == "max":
+        layer: nn.Module = nn.MaxPool2d(pool.size, pool.stride, pool.padding, ceil_mode=pool.ceil_mode)
+    else:
+        layer = nn.AdaptiveAvgPool2d(pool.size)
+    return [layer, nn.Flatten()] if pool.flatten else [layer]
+
+
+def _resize(x: torch.Tensor, grid: Shape) -> torch.Tensor:
+    return functional.interpolate(x, size=grid, mode="bilinear", align_corners=False, antialias=True)

@@ -1,0 +1,356 @@
+"""What a temporal graph is made of: frozen, validated descriptions of nodes and edges.
+
+A node concatenates its inputs on channels, applies an operation, then a memory, an activation and a
+pool. Shapes are (C, H, W), or (F,) after a dense operation. Importing this module imports no framework.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+from brainbench.core.errors import UsageError, listing, unknown_name
+
+Shape = tuple[int, ...]
+Unroll = Literal["biological", "full"]
+UNROLLS: tuple[Unroll, ...] = ("biological", "full")
+MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """2-D convolution of the concatenated inputs."""
+
+    channels: int
+    """Of the output."""
+    kernel_size: tuple[int, int] = (2, 2)
+    """Rows, columns."""
+    stride: tuple[int, int] = (1, 1)
+    """Rows, columns."""
+    padding: Literal["same", "valid"] | tuple[int, int] = "same"
+    """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
+    use_bias: bool = True
+    bias: float | None = 0.0
+    """Initial bias; None draws it within 1/√fan_in."""
+    dropout: float = 0.0
+    """Share dropped while training."""
+    activation: str | None = None
+    """Applied before the memory."""
+    initialiser: Mapping[str, Any] | None = None
+    """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return (C, H, W) for an input (C, H, W)."""
+        size = []
+        for axis, length in enumerate(shape[1:]):
+            if self.padding == "same":
+                size.append(length)
+                continue
+            padding = 0 if self.padding == "valid" else self.padding[axis]
+            size.append((length + 2 * padding - self.kernel_size[axis]) // self.stride[axis] + 1)
+        return (self.channels, *size)
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Linear layer of the flattened, concatenated inputs."""
+
+    features: int
+    """Of the output."""
+    use_bias: bool = True
+    bias: float | None = 0.1
+    """Initial bias; None draws it within 1/√fan_in."""
+    dropout: float = 0.0
+    """Share dropped while training."""
+    activation: str | None = None
+    """Applied before the memory."""
+    initialiser: Mapping[str, Any] | None = None
+    """As in :class:`Convolution`."""
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return (features,)."""
+        del shape
+        return (self.features,)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged.
+
+    Raises:
+        UsageError: there is no such cell.
+    """
+
+    kind: str = "time-decay"
+    """One of :data:`MEMORIES`."""
+    kernel_size: tuple[int, int] = (2, 2)
+    """Of the gates, rows and columns."""
+    layer_norm: bool = False
+    """Normalise each gate over channels."""
+    tau: float = 0.0
+    """Initial time decay; other kinds ignore it."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in MEMORIES:
+            raise unknown_name("memory", self.kind, MEMORIES)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size."""
+
+    kind: Literal["max", "average"]
+    size: tuple[int, int]
+    """Window of a maximum; output size of an average."""
+    stride: tuple[int, int] | None = None
+    """Of a maximum; None is its window."""
+    padding: tuple[int, int] = (0, 0)
+    """Of a maximum: cells added at every edge."""
+    ceil_mode: bool = False
+    """Of a maximum: a window may reach beyond the edge."""
+    flatten: bool = False
+    """Give one vector in place of a grid."""
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return the shape after pooling (C, H, W)."""
+        if self.kind == "average":
+            size = list(self.size)
+        else:
+            stride = self.stride or self.size
+            size = []
+            for length, window, step, padding in zip(shape[1:], self.size, stride, self.padding, strict=True):
+                span = length + 2 * padding - window
+                count = math.ceil(span / step) if self.ceil_mode else span // step
+                # A window that would start in the padding beyond the input does not count (as in PyTorch).
+                if self.ceil_mode and count * step >= length + padding:
+                    count -= 1
+                size.append(count + 1)
+        return (shape[0] * math.prod(size),) if self.flatten else (shape[0], *size)
+
+
+@dataclass(frozen=True)
+class Node:
+    """One area of the network."""
+
+    name: str
+    operation: Convolution | Dense | None
+    """None passes the concatenated inputs on."""
+    memory: Memory | None = None
+    activation: str | None = "relu"
+    pool: Pool | None = None
+    shape_from: str | None = None
+    """Predecessor whose grid size the inputs are resized to; None: the stimulus for an input node, else
+    the latest feedforward predecessor."""
+    resize: bool = True
+    """Resize inputs to the node's grid (bilinear, antialiased); otherwise sizes must agree."""
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return the node's output shape for its concatenated input."""
+        if self.operation is not None:
+            shape = self.operation.output_shape(shape)
+        return self.pool.output_shape(shape) if self.pool is not None else shape
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A connection; feedback is delayed by one step in every unrolling."""
+
+    source: str
+    target: str
+    feedback: bool = False
+
+
+@dataclass(frozen=True)
+class GraphSpec:
+    """Nodes, edges and the shape of one time step of the stimulus.
+
+    Raises:
+        UsageError: names repeat or do not exist, a node is out of the stimulus' reach, or the
+            feedforward edges form a cycle; the message names the culprits.
+    """
+
+    nodes: tuple[Node, ...]
+    edges: tuple[Edge, ...]
+    inputs: tuple[str, ...]
+    """Nodes that see the stimulus."""
+    output: str
+    input_shape: tuple[int, int, int]
+    """(C, H, W) of one time step."""
+    order: tuple[str, ...] = field(init=False)
+    """Nodes sorted along the feedforward edges, as listed where these leave a choice."""
+
+    def __post_init__(self) -> None:
+        names = [node.name for node in self.nodes]
+        for name in names:
+            if not name or "." in name or names.count(name) > 1:
+                reason = "appears more than once" if names.count(name) > 1 else "is empty or contains a dot"
+                raise UsageError(f"The node name {name!r} {reason}; give every node its own plain name.")
+        referenced = [(name, "input node") for name in self.inputs] + [(self.output, "output node")]
+        referenced += [(end, "node of an edge") for edge in self.edges for end in (edge.source, edge.target)]
+        referenced += [(node.shape_from, "shape_from node") for node in self.nodes if node.shape_from is not None]
+        for name, kind in referenced:
+            if name not in names:
+                raise unknown_name(kind, name, names)
+        ends = [(edge.source, edge.target) for edge in self.edges]
+        for end in ends:
+            if ends.count(end) > 1:
+                raise UsageError(f"The edge {end[0]} → {end[1]} appears more than once.")
+        if len(self.input_shape) != 3 or min(self.input_shape) < 1:
+            raise UsageError(f"The input shape must be (channels, rows, columns); received {self.input_shape!r}.")
+        reached = self._reached()
+        if len(reached) < len(names):
+            lost = [name for name in names if name not in reached]
+            raise UsageError(f"No path leads from the input nodes {list(self.inputs)} to {listing(lost)}.")
+        object.__setattr__(self, "order", self._sorted())
+
+    def _reached(self) -> set[str]:
+        reached, frontier = set(self.inputs), list(self.inputs)
+        while frontier:
+            current = frontier.pop()
+            new = [edge.target for edge in self.edges if edge.source == current and edge.target not in reached]
+            reached.update(new)
+            frontier.extend(new)
+        return reached
+
+    def _sorted(self) -> tuple[str, ...]:
+        waiting = {
+            node.name: {e.source for e in self.edges if e.target == node.name and not e.feedback} for node in self.nodes
+        }
+        order: list[str] = []
+        while waiting:
+            ready = next((name for name, sources in waiting.items() if not sources - set(order)), None)
+            if ready is None:
+                raise UsageError(
+                    f"The feedforward edges among {listing(waiting)} form a cycle; mark the edges that lead back "
+                    "with feedback=True."
+                )
+            order.append(ready)
+            del waiting[ready]
+        return tuple(order)
+
+    @cached_property
+    def by_name(self) -> Mapping[str, Node]:
+        """Nodes by name."""
+        return {node.name: node for node in self.nodes}
+
+    def predecessors(self, name: str) -> tuple[Edge, ...]:
+        """Return the edges into a node, sorted by the name of their source."""
+        return tuple(sorted((edge for edge in self.edges if edge.target == name), key=lambda edge: edge.source))
+
+    def shapes(self, input_shape: Shape | None = None) -> tuple[dict[str, Shape], dict[str, Shape]]:
+        """Return each node's concatenated input shape and output shape.
+
+        Raises:
+            UsageError: shapes do not fit one another; the message names the node.
+        """
+        stimulus = tuple(input_shape or self.input_shape)
+        # Feedback reaches back to nodes whose grid is known only later, so outputs come first: they
+        # depend on the shape_from predecessor's grid and on no other input.
+        outputs: dict[str, Shape] = {}
+        grids: dict[str, Shape] = {}
+        for name in self.order:
+            grids[name] = self._grid(name, stimulus, outputs)
+            node = self.by_name[name]
+            channels = self._channels(name, stimulus, outputs) if node.operation is None else 1
+            outputs[name] = node.output_shape((channels, *grids[name]))
+            if min(outputs[name]) < 1:
+                raise UsageError(
+                    f"Node {name!r} has nothing left of a grid of {list(grids[name])}: its output would be "
+                    f"{list(outputs[name])}; the stimulus {list(stimulus)} is too small."
+                )
+        inputs: dict[str, Shape] = {}
+        for name in self.order:
+            self._check_grids(name, grids[name], stimulus, outputs)
+            inputs[name] = (self._channels(name, stimulus, outputs), *grids[name])
+        return inputs, outputs
+
+    def _grid(self, name: str, stimulus: Shape, outputs: Mapping[str, Shape]) -> Shape:
+        source = self.by_name[name].shape_from
+        if source is None:
+            if name in self.inputs:
+                return stimulus[1:]
+            source = max(
+                (e.source for e in self.predecessors(name) if not e.feedback), key=self.order.index, default=None
+            )
+            if source is None:
+                raise UsageError(f"Node {name!r} has only feedback inputs; say with shape_from whose grid it takes.")
+        if source not in outputs:
+            raise UsageError(
+                f"Node {name!r} takes its shape from {source!r}, which comes later in the feedforward order."
+            )
+        return outputs[source][1:]
+
+    def _channels(self, name: str, stimulus: Shape, outputs: Mapping[str, Shape]) -> int:
+        seen = stimulus[0] if name in self.inputs else 0
+        try:
+            return seen + sum(outputs[edge.source][0] for edge in self.predecessors(name))
+        except KeyError as error:
+            raise UsageError(
+                f"Node {name!r} has no operation and receives feedback from {error}; give it one."
+            ) from None
+
+    def _check_grids(self, name: str, grid: Shape, stimulus: Shape, outputs: Mapping[str, Shape]) -> None:
+        node = self.by_name[name]
+        arriving = {edge.source: outputs[edge.source][1:] for edge in self.predecessors(name)}
+        if name in self.inputs:
+            arriving["the stimulus"] = stimulus[1:]
+        for source, size in arriving.items():
+            if len(size) != len(grid) or (size != grid and not node.resize):
+                raise UsageError(
+                    f"Node {name!r} works on a grid of {list(grid)} and receives {list(size)} from {source}; "
+                    "dense outputs cannot be resized, and grids only with resize=True."
+                )
+        if isinstance(node.operation, Convolution) and len(grid) != 2:
+            raise UsageError(f"Node {name!r} is a convolution but its inputs have no grid.")
+        gated = node.memory is not None and node.memory.kind != "time-decay"
+        if gated and (isinstance(node.operation, Dense) or len(grid) != 2):
+            raise UsageError(f"Node {name!r} has no grid, so it cannot carry the convolutional memory {node.memory}.")
+
+    def first_response(self, unroll: Unroll = "biological") -> dict[str, int]:
+        """Return for each node the step at which it first responds to the stimulus at step 0."""
+        check_unroll(unroll)
+        delay = {edge: 1 if unroll == "biological" or edge.feedback else 0 for edge in self.edges}
+        first = dict.fromkeys(self.inputs, 0)
+        for _ in self.nodes:
+            for edge in self.edges:
+                if edge.source in first:
+                    step = first[edge.source] + delay[edge]
+                    first[edge.target] = min(step, first.get(edge.target, step))
+        return {name: first[name] for name in self.order}
+
+    def receptive_field(self, unroll: Unroll = "biological") -> int | None:
+        """Return how many steps back the output can see, its own step included; None: all of them."""
+        check_unroll(unroll)
+        if any(node.memory is not None for node in self.nodes) or any(len(group) > 1 for group in self.groups()):
+            return None
+        if any(edge.source == edge.target for edge in self.edges):
+            return None
+        last = dict.fromkeys(self.inputs, 1)
+        for name in (name for group in self.groups() for name in group):
+            for edge in self.predecessors(name):
+                delay = 1 if unroll == "biological" or edge.feedback else 0
+                last[name] = max(last.get(name, 0), last[edge.source] + delay)
+        return last[self.output]
+
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """Return the strongly connected components in the order in which they can be computed."""
+        reach = {node.name: {node.name} for node in self.nodes}
+        for _ in self.nodes:
+            for edge in self.edges:
+                reach[edge.source] |= reach[edge.target]
+        components = {
+            name: tuple(other for other in self.order if other in reach[name] and name in reach[other])
+            for name in self.order
+        }
+        # A component that reaches another comes first, and it reaches strictly more nodes.
+        unique = dict.fromkeys(components.values())
+        return tuple(sorted(unique, key=lambda group: -len(reach[group[0]])))
+
+
+def check_unroll(unroll: str) -> None:
+    """Raise :class:`UsageError` unless ``unroll`` is one of :data:`UNROLLS`."""
+    if unroll not in UNROLLS:
+        raise unknown_name("unrolling", unroll, UNROLLS)

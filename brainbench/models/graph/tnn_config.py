@@ -1,0 +1,224 @@
+"""PyTorchTNN's graph configuration (JSON) as a :class:`~brainbench.models.graph.spec.GraphSpec`.
+
+Everything a configuration says is either honoured or refused; nothing is skipped silently.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from brainbench.core.errors import DataError, listing, unknown_name
+from brainbench.core.files import read_json
+from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Pool
+
+_MEMORIES = {
+    "TimeDecayRecurrentCell": "time-decay",
+    "UGRNNCell": "ugrnn",
+    "IntersectionRNNCell": "intersection",
+    "GRUCell": "gru",
+    "LSTMCell": "lstm",
+}
+_REQUIRED = object()
+# Keys that PyTorchTNN accepts and overwrites while it builds the graph.
+_OVERWRITTEN = ("in_channels", "input_in_channels", "input_shape", "num_timesteps", "state_shape")
+
+
+class _Section:
+    """One JSON object whose keys are taken one by one; what remains at the end is refused."""
+
+    def __init__(self, data: Any, where: str) -> None:
+        if not isinstance(data, Mapping):
+            raise DataError(f"The graph configuration needs an object for {where}; found {data!r}.")
+        self.data = dict(data)
+        self.where = where
+
+    def take(self, key: str, default: Any = _REQUIRED) -> Any:
+        if key not in self.data and default is _REQUIRED:
+            raise DataError(f"The graph configuration lacks {key!r} in {self.where}.")
+        return self.data.pop(key, default)
+
+    def only(self, key: str, *allowed: Any) -> None:
+        """Take a key that must be absent or have one of the allowed values."""
+        value = self.data.pop(key, allowed[0])
+        if value not in allowed:
+            raise DataError(
+                f"The graph configuration has {key!r}: {value!r} in {self.where}; only {allowed[0]!r} is supported."
+            )
+
+    def size(self, key: str, default: Any = _REQUIRED) -> Any:
+        value = self.take(key, default)
+        numbers = [value, value] if isinstance(value, int) and not isinstance(value, bool) else value
+        if not isinstance(numbers, (list, tuple)) or len(numbers) != 2 or not all(isinstance(n, int) for n in numbers):
+            raise DataError(f"{key!r} in {self.where} must be a whole number or a pair of them; found {value!r}.")
+        return (numbers[0], numbers[1])
+
+    def done(self, *ignored: str) -> None:
+        left = [key for key in self.data if key not in ignored]
+        if left:
+            raise DataError(f"The graph configuration has the unsupported key {listing(left)} in {self.where}.")
+
+
+def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
+    """Build a graph description from a configuration or the path of its JSON file.
+
+    Feedback is what leads back in ``ff_order`` if that is given, else in the listed order of the nodes;
+    without cycles nothing is feedback. ``num_timesteps`` is not needed and ignored.
+
+    Raises:
+        DataError: the file is missing or not JSON, or a key is missing or unsupported.
+        UsageError: the graph itself is not valid.
+    """
+    config = _Section(source if isinstance(source, Mapping) else read_json(source), "the top level")
+    nodes = tuple(_node(item) for item in config.take("nodes"))
+    ends = []
+    for item in config.take("edges"):
+        edge = _Section(item, "an edge")
+        ends.append((str(edge.take("from")), str(edge.take("to"))))
+        edge.done()
+    inputs, output = tuple(config.take("input_nodes")), config.take("output_node")
+    shape, order = tuple(config.take("input_shape")), config.take("ff_order", None)
+    config.done("num_timesteps")
+    if not isinstance(output, str):
+        raise DataError(f"The graph configuration names the output nodes {output!r}; exactly one is supported.")
+    names = [node.name for node in nodes]
+    if order is not None and sorted(order) != sorted(names):
+        raise DataError(f"'ff_order' {order!r} must list every node once: {names!r}.")
+    if order is None and _acyclic(ends):
+        feedback: set[tuple[str, str]] = set()
+    else:
+        rank = {name: index for index, name in enumerate(order or names)}
+        feedback = {end for end in ends if rank.get(end[0], -1) >= rank.get(end[1], len(rank))}
+    edges = tuple(Edge(*end, feedback=end in feedback) for end in ends)
+    return GraphSpec(nodes, edges, inputs, output, (*shape,))
+
+
+def _acyclic(ends: list[tuple[str, str]]) -> bool:
+    left = list(ends)
+    while left:
+        sources = {source for source, _ in left}
+        rest = [end for end in left if end[1] in sources]
+        if len(rest) == len(left):
+            return False
+        left = rest
+    return True
+
+
+def _node(item: Any) -> Node:
+    node = _Section(item, "a node")
+    name = str(node.take("name"))
+    node.where = f"node {name!r}"
+    node.only("residual", None, False)
+    channels = node.take("out_channels")
+    harbor = _Section(node.take("harbor_policy"), f"the harbor policy of {name!r}")
+    policy = harbor.take("name")
+    if policy not in ("ResizeConcat", "Identity"):
+        raise unknown_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))
+    harbor.done(*_OVERWRITTEN)
+    operation = _operation(_Section(node.take("pre_memory"), f"the pre-memory of {name!r}"))
+    memory = _memory(_Section(node.take("recurrent_cell"), f"the recurrent cell of {name!r}"))
+    activation, pool = _after(_Section(node.take("post_memory"), f"the post-memory of {name!r}"))
+    built = Node(name, operation, memory, activation, pool, node.take("shape_from"), policy == "ResizeConcat")
+    node.done()
+    made = {Convolution: "channels", Dense: "features"}.get(type(operation))
+    if made is not None and getattr(operation, made) != channels:
+        raise DataError(f"Node {name!r} has out_channels {channels}, its pre-memory {getattr(operation, made)}.")
+    return built
+
+
+def _operation(part: _Section) -> Convolution | Dense | None:
+    kind = part.take("name")
+    if kind == "Identity":
+        part.done(*_OVERWRITTEN)
+        return None
+    if kind not in ("Conv2dCell", "FullyConnected"):
+        raise unknown_name(f"module in {part.where}", kind, ("Conv2dCell", "FullyConnected", "Identity"))
+    common = {
+        "use_bias": part.take("use_bias", True),
+        "bias": part.take("bias", None),
+        "dropout": part.take("dropout", 0.0),
+        # Left out, PyTorchTNN's dense layers rectify and its convolutions do not.
+        "activation": part.take("activation", "ReLU" if kind == "FullyConnected" else None),
+        "initialiser": _initialiser(part),
+    }
+    part.only("activation_func_kwargs", {}, None)
+    part.only("batchnorm", None)
+    part.only("batchnorm_timevary", False)
+    channels = part.take("out_channels")
+    if kind == "FullyConnected":
+        operation: Convolution | Dense = Dense(channels, **common)
+    else:
+        padding = part.take("padding", 0)
+        if not isinstance(padding, str):
+            part.data["padding"] = padding
+            padding = part.size("padding")
+        elif padding not in ("same", "valid"):
+            raise unknown_name(f"padding in {part.where}", padding, ("same", "valid"))
+        for key, allowed in (("dilation", 1), ("groups", 1), ("padding_mode", "zeros")):
+            part.only(key, allowed)
+        operation = Convolution(channels, part.size("ksize"), part.size("stride", 1), padding, **common)
+        if operation.padding == "same" and operation.stride != (1, 1):
+            raise DataError(f"Padding 'same' in {part.where} needs stride 1; found {list(operation.stride)}.")
+    part.done(*_OVERWRITTEN)
+    return operation
+
+
+def _initialiser(part: _Section) -> Mapping[str, Any] | None:
+    from brainbench.models.ops.layers import INITIALISERS
+
+    options = part.take("init_dict", None)
+    if options is None:
+        return None
+    method = _Section(options, f"'init_dict' of {part.where}").take("method")
+    if method not in INITIALISERS:
+        raise unknown_name(f"initialiser in {part.where}", method, INITIALISERS)
+    return dict(options)
+
+
+def _memory(part: _Section) -> Memory | None:
+    kind = part.take("name")
+    if kind == "IdentityCell":
+        part.done(*_OVERWRITTEN, "out_channels")
+        return None
+    if kind not in _MEMORIES:
+        raise unknown_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
+    part.only("init_dict", None)
+    if kind == "TimeDecayRecurrentCell":
+        part.only("trainable", True)
+        memory = Memory("time-decay", tau=part.take("tau", 0.0))
+    else:
+        for key, allowed in (
+            ("stride", 1), ("padding", "same"), ("dilation", 1), ("groups", 1), ("padding_mode", "zeros"),
+            ("use_bias", True), ("forget_bias", 1.0), ("activation", "Tanh"), ("activation_func_kwargs", {}),
+        ):  # fmt: skip
+            part.only(key, allowed)
+        # Only the initial value of a bias that load_tnn_state or training replaces.
+        part.only("bias", None, 0, 0.0)
+        memory = Memory(_MEMORIES[kind], part.size("ksize"), bool(part.take("layernorm", False)))
+    part.done(*_OVERWRITTEN, "out_channels")
+    return memory
+
+
+def _after(part: _Section) -> tuple[str | None, Pool | None]:
+    kind = part.take("name")
+    activation, pool = None, None
+    if kind == "ActivationLayer":
+        activation = part.take("activation", "ReLU")
+        part.only("activation_func_kwargs", {}, None)
+    elif kind == "MaxPool":
+        size, stride = part.size("ksize"), part.take("stride", None)
+        if stride is not None:
+            part.data["stride"] = stride
+            stride = part.size("stride")
+        part.only("dilation", 1)
+        part.only("return_indices", False)
+        pool = Pool("max", size, stride, part.size("padding", 0), bool(part.take("ceil_mode", False)))
+    elif kind == "AdaptiveAvgPool":
+        pool = Pool("average", part.size("output_size", 6), flatten=bool(part.take("flatten", False)))
+    elif kind != "Identity":
+        raise unknown_name(
+            f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity")
+        )
+    part.done(*_OVERWRITTEN)
+    return activation, pool

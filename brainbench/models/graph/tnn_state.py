@@ -1,0 +1,54 @@
+"""Parameters under PyTorchTNN's names, loaded into our modules."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from brainbench.core.errors import DataError, listing, nearest
+
+
+def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *, what: str) -> None:
+    """Copy arrays or tensors of ``state`` into ``targets``, which has the same names; all or nothing.
+
+    Raises:
+        DataError: names are missing or unexpected, or shapes differ.
+    """
+    check_named({name: tuple(value.shape) for name, value in targets.items()}, state, what=what)
+    copy_named(targets, state)
+
+
+def check_named(shapes: Mapping[str, tuple[int, ...]], state: Mapping[str, Any], *, what: str) -> None:
+    """Compare the names and shapes of ``state`` with the expected ones.
+
+    Raises:
+        DataError: names are missing or unexpected, or shapes differ; the message names them.
+    """
+    problems = []
+    missing = [name for name in shapes if name not in state]
+    unexpected = [name for name in state if name not in shapes]
+    if missing:
+        problems.append(f"missing {listing(missing)}")
+    if unexpected:
+        guesses = {name: nearest(name, shapes) for name in unexpected[:3]}
+        hints = ", ".join(f"{name!r} → {guess!r}?" for name, guess in guesses.items() if guess)
+        problems.append(f"unexpected {listing(unexpected)}" + (f" (did you mean {hints})" if hints else ""))
+    wrong = [
+        f"{name!r} has shape {list(state[name].shape)}, expected {list(shape)}"
+        for name, shape in shapes.items()
+        if name in state and tuple(state[name].shape) != shape
+    ]
+    if wrong:
+        shown = "; ".join(wrong[:4]) + (f"; and {len(wrong) - 4} more" if len(wrong) > 4 else "")
+        problems.append(f"shapes that do not fit: {shown}")
+    if problems:
+        raise DataError(f"The parameters do not fit {what}: {'; '.join(problems)}.")
+
+
+@torch.no_grad()
+def copy_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any]) -> None:
+    """Copy checked arrays or tensors into the targets of the same names."""
+    for name, target in targets.items():
+        target.copy_(torch.as_tensor(state[name]))

@@ -1,0 +1,271 @@
+"""Encoder-attender-decoder networks of touch.
+
+A sweep [B, T, 30, 5, 7] in SI is normalised, encoded, optionally read by an attender, and decoded at the
+last step to [B, classes]. Everything is causal: :meth:`EAD.step` streams.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from brainbench.core.contracts import CHANNELS
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.models.graph.spec import Unroll, check_unroll
+from brainbench.models.graph.temporal_graph import TemporalGraph
+from brainbench.models.heads.decoders import AllStepsDecoder, linear_decoder
+from brainbench.models.normaliser import Normaliser
+from brainbench.models.parts import Attender, Encoder
+
+SUB_STEPS = 5
+SUB_STEP_SECONDS = 0.009
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """What a model expects and when it answers: the contract of deployment."""
+
+    input_shape: tuple[int, int, int]
+    """(C, H, W) of one time step."""
+    channels: tuple[str, ...]
+    """Names of the C channels, such as ``0.Fx``: sub-step, then component."""
+    units: tuple[str, ...]
+    """SI unit of each channel."""
+    frame: str
+    """Frame and sign of the channels."""
+    sample_rate: float
+    """Time steps per second [Hz]."""
+    sub_steps: int
+    """Samples within a time step."""
+    causal: bool
+    receptive_field: int | None
+    """Steps that an answer can depend on; None: all so far."""
+    latency: int
+    """Steps before the stimulus can show in the output."""
+    max_steps: int | None
+    """Longest sweep; None: any."""
+    outputs: int
+    """Number of outputs."""
+
+
+@dataclass(frozen=True)
+class EADState:
+    """What a network carries from one step to the next."""
+
+    encoder: Any
+    attender: Any
+    """None without an attender."""
+    decoder: Any = None
+    """What an all-steps decoder remembers; None for others."""
+
+
+class EAD(nn.Module):
+    """Normaliser → encoder → attender → decoder; [B, T, C, H, W] in SI → [B, classes].
+
+    Args:
+        encoder: Maps [B, T, C, H, W] to [B, T, F].
+        attender: Maps [B, T, F] to [B, T, W]; None passes the features on.
+        decoder: Maps features to outputs, ending in a linear layer; None is the linear decoder to 117 classes.
+        normaliser: None is :meth:`Normaliser.physical`.
+        unroll: How a temporal graph is unrolled; other encoders know one way only.
+
+    Raises:
+        UsageError: the unrolling is unknown, or the encoder is no temporal graph and knows one way only.
+
+    ``layers`` lists what :meth:`activations` can return, from stimulus to output.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        attender: Attender | None = None,
+        decoder: nn.Module | None = None,
+        *,
+        normaliser: Normaliser | None = None,
+        unroll: Unroll = "biological",
+    ) -> None:
+        super().__init__()
+        check_unroll(unroll)
+        graph = encoder if isinstance(encoder, TemporalGraph) else None
+        if graph is None and unroll != "biological":
+            raise UsageError(f"Only temporal graphs can be unrolled otherwise; {type(encoder).__name__} cannot.")
+        self._unroll: dict[str, Any] = {"unroll": unroll} if graph is not None else {}
+        self.normaliser = normaliser or Normaliser.physical(SUB_STEPS)
+        self.encoder = encoder
+        self.attender = attender
+        self.decoder = decoder or linear_decoder(self.features)
+        self.spec = ModelSpec(
+            input_shape=encoder.input_shape,
+            channels=tuple(f"{sub_step}.{name}" for sub_step in range(SUB_STEPS) for name in CHANNELS),
+            units=tuple("N" if name.startswith("F") else "N·m" for name in CHANNELS) * SUB_STEPS,
+            frame="world axes; action of the whisker on its base, about the base point",
+            sample_rate=1.0 / (SUB_STEPS * SUB_STEP_SECONDS),
+            sub_steps=SUB_STEPS,
+            causal=True,
+            receptive_field=self._receptive_field(),
+            latency=encoder.latency if graph is None else graph.spec.first_response(unroll)[graph.spec.output],
+            max_steps=min(limits) if (limits := self._limits()) else None,
+            outputs=_outputs(self.decoder),
+        )
+        attended = [f"attender.{name}" for name in attender.layers] if attender is not None else []
+        self.layers: tuple[str, ...] = (*(f"encoder.{name}" for name in encoder.layers), *attended, "decoder")
+
+    @property
+    def features(self) -> int:
+        """Number of features that the decoder reads at one step."""
+        return self.encoder.features if self.attender is None else self.attender.features
+
+    @property
+    def unroll(self) -> Unroll:
+        """How the encoder's graph is unrolled."""
+        return self._unroll.get("unroll", "biological")
+
+    def _receptive_field(self) -> int | None:
+        if self.attender is not None or isinstance(self.decoder, AllStepsDecoder):
+            return None
+        if isinstance(self.encoder, TemporalGraph):
+            return self.encoder.spec.receptive_field(self.unroll)
+        return self.encoder.receptive_field
+
+    def _limits(self) -> list[int]:
+        limits = [self.attender.max_steps] if self.attender is not None else []
+        if isinstance(self.decoder, AllStepsDecoder):
+            limits.append(self.decoder.steps)
+        return [limit for limit in limits if limit is not None]
+
+    def encode(self, x: torch.Tensor, *, last: bool = False) -> torch.Tensor:
+        """Return the features [B, T, F] that the decoder or the head of another objective reads.
+
+        Args:
+            x: Sweeps in SI.
+            last: Return only those of the last step [B, F], which spares what no later step reads.
+
+        Raises:
+            UsageError: as for :meth:`forward`.
+        """
+        if self.spec.max_steps is not None and x.ndim == 5 and x.shape[1] > self.spec.max_steps:
+            # Said before the encoder has worked for nothing.
+            raise UsageError(
+                f"The model remembers at most {self.spec.max_steps} steps; received {x.shape[1]:,}. Shorten the sweep."
+            )
+        if last and self.attender is None and isinstance(self.encoder, TemporalGraph):
+            return self.encoder(self._normalise(x), **self._unroll, last=True)
+        features = self.encoder(self._normalise(x), **self._unroll)
+        features = features if self.attender is None else self.attender(features)
+        return features[:, -1] if last else features
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the decoder's output at the last step [B, classes].
+
+        Raises:
+            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`spec` says, or too long for the attender.
+        """
+        return self.decoder(self.encode(x, last=not isinstance(self.decoder, AllStepsDecoder)))
+
+    def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
+        """Return ``{layer: [B, T, ...]}`` for the layers asked for (all by default), in the order of ``layers``.
+
+        The decoder is applied at every step; attender layers are read at the action tokens.
+
+        Raises:
+            UsageError: a layer does not exist, or as for :meth:`forward`.
+        """
+        wanted = self.layers if layers is None else tuple(layers)
+        for name in wanted:
+            if name not in self.layers:
+                raise unknown_name("layer", name, self.layers)
+        features, found = _named(self.encoder, self._normalise(x), "encoder", wanted, **self._unroll)
+        if self.attender is not None and any(not name.startswith("encoder.") for name in wanted):
+            features, attended = _named(self.attender, features, "attender", wanted)
+            found |= attended
+        if "decoder" in wanted:
+            decoder = self.decoder
+            found["decoder"] = (
+                decoder.every_step(features) if isinstance(decoder, AllStepsDecoder) else decoder(features)
+            )
+        return {name: found[name] for name in self.layers if name in wanted}
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of matrix products and convolutions in the first time step of one stimulus."""
+        attender = self.attender.multiply_adds() if self.attender is not None else 0
+        decoder = sum(module.weight.numel() for module in self.decoder.modules() if isinstance(module, nn.Linear))
+        if isinstance(self.decoder, AllStepsDecoder):  # each step meets its own part of the first layer alone
+            first = self.decoder.first.weight.numel()
+            decoder -= first - first // self.decoder.steps
+        return self.encoder.multiply_adds() + attender + decoder
+
+    def init_state(
+        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> EADState:
+        """Return the state before the first step."""
+        attender, decoder = self.attender, self.decoder
+        return EADState(
+            self.encoder.init_state(batch, device=device, dtype=dtype),
+            attender.init_state(batch, device=device, dtype=dtype) if attender is not None else None,
+            decoder.init_state(batch, device=device, dtype=dtype) if isinstance(decoder, AllStepsDecoder) else None,
+        )
+
+    def step(self, x: torch.Tensor, state: EADState) -> tuple[torch.Tensor, EADState]:
+        """Advance by one time step [B, C, H, W] in SI; return the decoder's output [B, classes] and the state.
+
+        After t steps the output equals :meth:`forward` of the sweep's first t steps.
+        """
+        features, encoder, attender = self._stream(x, state)
+        if isinstance(self.decoder, AllStepsDecoder):
+            y, decoder = self.decoder.step(features, state.decoder)
+            return y, EADState(encoder, attender, decoder)
+        return self.decoder(features), EADState(encoder, attender)
+
+    def encode_step(self, x: torch.Tensor, state: EADState) -> tuple[torch.Tensor, EADState]:
+        """Advance as :meth:`step` does, without the decoder; return the features [B, F] and the state."""
+        features, encoder, attender = self._stream(x, state)
+        return features, EADState(encoder, attender, state.decoder)
+
+    def _stream(self, x: torch.Tensor, state: EADState) -> tuple[torch.Tensor, Any, Any]:
+        if x.ndim != 4 or tuple(x.shape[1:]) != self.spec.input_shape:
+            raise UsageError(f"A step expects {self._expected('batch')}; received {list(x.shape)}.")
+        features, encoder = self.encoder.step(self.normaliser(x), state.encoder, **self._unroll)
+        attender = state.attender
+        if self.attender is not None and attender is not None:
+            features, attender = self.attender.step(features, attender)
+        return features, encoder, attender
+
+    def _normalise(self, x: torch.Tensor) -> torch.Tensor:
+        if x.ndim != 5 or tuple(x.shape[2:]) != self.spec.input_shape or x.shape[1] < 1:
+            raise UsageError(
+                f"The model expects {self._expected('batch', 'time')} ({self.spec.sub_steps} sub-steps × "
+                f"{len(CHANNELS)} channels on the whisker grid, SI units); received {list(x.shape)}."
+            )
+        # On CUDA, and inside compiled or training steps, looking would stop the queue; training checks its loss.
+        quick = x.is_cuda or self.training or torch.compiler.is_compiling() or torch.compiler.is_exporting()
+        if not quick and not torch.isfinite(x).all():
+            count = int((~torch.isfinite(x)).sum())
+            raise UsageError(
+                f"{count:,} of {x.numel():,} values of the stimulus are not finite (NaN or infinite); a missing "
+                "whisker is zero, and an unstable simulation must be left out."
+            )
+        return self.normaliser(x)
+
+    def _expected(self, *leading: str) -> str:
+        return f"[{', '.join((*leading, *map(str, self.spec.input_shape)))}]"
+
+
+def _outputs(decoder: nn.Module) -> int:
+    linear = [module for module in decoder.modules() if isinstance(module, nn.Linear)]
+    if not linear:
+        raise UsageError(f"A decoder must end in a linear layer; received {type(decoder).__name__} without any.")
+    return linear[-1].out_features
+
+
+def _named(
+    module: Encoder | Attender, x: torch.Tensor, prefix: str, wanted: Collection[str], **options: Any
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    inner = [name.removeprefix(f"{prefix}.") for name in wanted if name.startswith(f"{prefix}.")]
+    result: Any = module(x, return_activations=inner, **options) if inner else (module(x, **options), {})
+    features, found = result
+    activations: Mapping[str, torch.Tensor] = found
+    return features, {f"{prefix}.{name}": value for name, value in activations.items()}

@@ -1,0 +1,1 @@
+"""GPU kernels of recurrent convolutions, written in Triton."""

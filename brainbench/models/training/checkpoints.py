@@ -1,0 +1,165 @@
+"""Trained models as folders: ``model.safetensors``, ``config.json`` and ``README.md`` (the model card).
+
+Nothing in such a folder is executed when it is read. The configuration names the architecture and the
+options it was built with; weights may be stored in half precision and are always loaded as float32.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency, unknown_name
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
+
+FORMAT = 1
+WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+LOCAL, HUB = "local-dir:", "hf-hub:"
+PREFIXES = (LOCAL, HUB)
+"""What a model's name starts with when it is a folder or a repository instead of a registry name."""
+DTYPES = ("float32", "float16", "bfloat16")
+
+
+def save_checkpoint(
+    folder: str | os.PathLike[str],
+    model: nn.Module,
+    *,
+    architecture: str,
+    options: Mapping[str, Any],
+    info: Mapping[str, Any] | None = None,
+    card: str = "",
+    dtype: str = "float32",
+) -> Path:
+    """Write a model's folder; each file appears whole or not at all, the weights first.
+
+    Args:
+        folder: Folder to write; files of an earlier checkpoint in it are replaced.
+        model: The model.
+        architecture: Registry name without a tag.
+        options: Keyword arguments that the architecture was built with.
+        info: What else to keep in the configuration: objective, accuracy, data, seed, …
+        card: Text of the model card.
+        dtype: Precision of the floating-point parameters on disk.
+
+    Raises:
+        UsageError: there is no such precision.
+        DataError: a parameter is not finite, or not in ``dtype``.
+    """
+    import torch
+    from safetensors.torch import save_file
+
+    from brainbench.core.files import atomic_path, write_json, write_text
+
+    if dtype not in DTYPES:
+        raise unknown_name("precision of weights", dtype, DTYPES)
+    kind = getattr(torch, dtype)
+    parameters = {name for name, _ in model.named_parameters()}
+    state = {}
+    for name, value in model.state_dict().items():
+        stored = value.detach().cpu().to(kind) if name in parameters else value.detach().cpu()
+        if stored.is_floating_point() and not torch.isfinite(stored).all():
+            raise DataError(f"The weight {name!r} is not finite in {dtype}, so no checkpoint was written to {folder}.")
+        state[name] = stored.contiguous().clone()
+    folder = Path(folder)
+    with atomic_path(folder / WEIGHTS) as temporary:
+        save_file(state, temporary, metadata={"format": "pt"})
+    if card:
+        write_text(folder / CARD, card)
+    write_json(
+        folder / CONFIG,
+        {
+            **(info or {}),
+            "brainbench_model": FORMAT,
+            "architecture": architecture,
+            "options": dict(options),
+            "dtype": dtype,
+        },
+    )
+    return folder
+
+
+def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read the configuration of a model's folder.
+
+    Raises:
+        DataFileNotFoundError: there is no such folder, or no configuration in it.
+        DataError: the configuration is of another kind.
+    """
+    from brainbench.core.files import read_json
+
+    path = Path(folder) / CONFIG
+    if not path.is_file():
+        raise DataFileNotFoundError(
+            f"There is no {CONFIG} in {os.fspath(folder)!r}; a model's folder has {CONFIG} and {WEIGHTS}, as "
+            "brainbench train writes them."
+        )
+    config = read_json(path)
+    if not isinstance(config, dict) or config.get("brainbench_model") != FORMAT:
+        found = config.get("brainbench_model") if isinstance(config, dict) else type(config).__name__
+        raise DataError(
+            f"{os.fspath(path)!r} is not the configuration of a brainbench model (format {found!r}, expected {FORMAT})."
+        )
+    if not isinstance(config.get("architecture"), str) or not isinstance(config.get("options"), dict):
+        raise DataError(f"{os.fspath(path)!r} lacks the name 'architecture' or the mapping 'options'.")
+    return config
+
+
+def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -> None:
+    """Load a safetensors file into a model of the same parameters and buffers; all or nothing.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it cannot be read, or does not fit the model.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from brainbench.models.graph.tnn_state import load_named
+
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no file of weights {os.fspath(path)!r} for {what!r}.")
+    try:
+        state: dict[str, torch.Tensor] = load_file(path)
+    except SafetensorError as error:
+        raise DataError(f"{os.fspath(path)!r} is not a readable safetensors file ({error}).") from error
+    load_named(model.state_dict(), state, what=f"the model {what!r}")
+
+
+def find_folder(source: str) -> Path:
+    """Return the folder that ``local-dir:PATH`` or ``hf-hub:OWNER/NAME[@REVISION]`` names.
+
+    The hub is asked only for a name with its prefix; what it sends is kept in its own cache.
+
+    Raises:
+        UsageError: the name has another form.
+        DataFileNotFoundError: there is no such folder or repository.
+        MissingDependencyError: ``huggingface_hub`` is not installed.
+    """
+    if source.startswith(LOCAL):
+        folder = Path(source.removeprefix(LOCAL)).expanduser()
+        if not folder.is_dir():
+            raise DataFileNotFoundError(f"There is no folder {os.fspath(folder)!r}.")
+        return folder
+    repository, _, revision = source.removeprefix(HUB).partition("@")
+    if not source.startswith(HUB) or repository.count("/") != 1 or not all(repository.split("/")):
+        raise UsageError(f"A model's folder is local-dir:PATH or hf-hub:OWNER/NAME[@REVISION]; received {source!r}.")
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise missing_dependency("huggingface_hub", extra="hub", purpose="Loading a model from a hub") from error
+    try:
+        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=[WEIGHTS, CONFIG, CARD]))
+    except Exception as error:
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        raise DataFileNotFoundError(f"{repository!r} could not be had from the hub: {reason}") from error
+
+
+def shipped() -> dict[str, Path]:
+    """Return the folders of the trained models that come with the package, by ``architecture.tag``."""
+    root = Path(__file__).parents[1] / "weights"
+    return {path.parent.name: path.parent for path in sorted(root.glob(f"*/{CONFIG}"))}

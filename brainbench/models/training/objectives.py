@@ -1,0 +1,193 @@
+"""What a network is trained for: supervised, SimCLR, SimSiam, autoencoding.
+
+A :class:`Learner` is a network with an objective's head; its forward pass gives the loss of a batch, so that it can
+be wrapped for several processes. Letters: B batch, T step, F features.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.models.heads.self_supervised import AutoencoderHead, SimCLRHead, SimSiamHead
+
+TEMPERATURE = 0.1
+RECONSTRUCTION_WEIGHT = 0.5
+SPARSITY_WEIGHT = 1e-4
+
+
+def nt_xent(first: torch.Tensor, second: torch.Tensor, *, temperature: float = TEMPERATURE) -> torch.Tensor:
+    """Return the normalised temperature-scaled cross-entropy of embeddings [B, D] of two views (Chen et al. 2020).
+
+    Each view must find its partner among the 2 B − 1 others. Over several processes the embeddings of all are
+    compared, so the loss is that of one large batch.
+    """
+    both = functional.normalize(torch.stack((first.float(), second.float()), 1), dim=-1)  # [B, 2, D]
+    own = both.flatten(0, 1)
+    every, start = _gathered(both)
+    every = every.flatten(0, 1)
+    row = torch.arange(len(own), device=own.device)
+    itself = row + 2 * start
+    # Mixed precision would round cosines to three digits before they are divided by the temperature.
+    with torch.autocast(own.device.type, enabled=False):
+        similarity = own @ every.T / temperature
+    similarity = similarity.index_put((row, itself), torch.full((), -torch.inf, device=own.device).expand(len(own)))
+    return functional.cross_entropy(similarity, itself ^ 1)
+
+
+def simsiam_loss(p1: torch.Tensor, z1: torch.Tensor, p2: torch.Tensor, z2: torch.Tensor) -> torch.Tensor:
+    """Return −½ (cos(p1, stop(z2)) + cos(p2, stop(z1))), averaged over [B, D] (Chen & He 2021, equation 4)."""
+    first = functional.cosine_similarity(p1.float(), z2.detach().float()).mean()
+    return -0.5 * (first + functional.cosine_similarity(p2.float(), z1.detach().float()).mean())
+
+
+def autoencoder_loss(reconstruction: torch.Tensor, target: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
+    """Return .5 mean squared error + 1e-4 mean |latent| (thesis, chapter 3)."""
+    error = functional.mse_loss(reconstruction.float(), target.float())
+    return RECONSTRUCTION_WEIGHT * error + SPARSITY_WEIGHT * latent.float().abs().mean()
+
+
+class Learner(nn.Module):
+    """A network and the head of its objective; forward gives (loss, answers [B, classes] or None).
+
+    Args:
+        model: Maps [B, T, C, H, W] in SI to [B, classes]. Self-supervised objectives need one of
+            :class:`~brainbench.models.network.EAD`'s kind, with ``encode``, ``features`` and ``normaliser``.
+
+    Raises:
+        UsageError: the objective learns from features, and the network names none.
+
+    ``views`` says how many augmented views of a batch the forward pass takes.
+    """
+
+    views: int = 1
+    supervised: bool = False
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model: Any = model
+        if not self.supervised and not all(hasattr(model, name) for name in ("encode", "features", "normaliser")):
+            raise UsageError(
+                f"{type(self).__name__} learns from features, which {type(model).__name__} does not name; train it "
+                "supervised, or build it as an encoder-attender-decoder (brainbench.models.network.EAD)."
+            )
+        if not self.supervised and hasattr(model, "decoder"):
+            # The decoder has no part in it and is fitted afterwards, by the linear probe.
+            self.model.decoder.requires_grad_(False)
+
+    def last_features(self, *views: torch.Tensor) -> torch.Tensor:
+        """Return the features at the last step of all views [views × B, F]."""
+        return self.model.encode(torch.cat(views), last=True)
+
+
+class Supervised(Learner):
+    """Cross-entropy of the decoder's answer to the class labels."""
+
+    supervised = True
+
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
+        """Return (loss, answers [B, classes])."""
+        answers = self.model(views[0])
+        return functional.cross_entropy(answers.float(), labels), answers
+
+
+class SimCLR(Learner):
+    """Contrast of two views at the last step's features.
+
+    Args:
+        model: As of :class:`Learner`.
+    """
+
+    views = 2
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__(model)
+        self.head = SimCLRHead(self.model.features)
+
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
+        """Return (loss, None)."""
+        del labels
+        first, second = self.head(self.last_features(*views)).chunk(2)
+        return nt_xent(first, second), None
+
+
+class SimSiam(Learner):
+    """Prediction of one view's projection from the other's.
+
+    Args:
+        model: As of :class:`Learner`.
+    """
+
+    views = 2
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__(model)
+        self.head = SimSiamHead(self.model.features)
+
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
+        """Return (loss, None)."""
+        del labels
+        first, second = self.last_features(*views).chunk(2)
+        (z1, p1), (z2, p2) = self.head(first), self.head(second)
+        return simsiam_loss(p1, z1, p2, z2), None
+
+
+class Autoencoding(Learner):
+    """Reconstruction of every step of the stimulus, in normalised units, from the features.
+
+    Features know a step only after the encoder's latency, so those of step t + latency reconstruct step t.
+
+    Args:
+        model: As of :class:`Learner`.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__(model)
+        channels, rows, columns = self.model.spec.input_shape
+        self.head = AutoencoderHead(self.model.features, channels=channels, grid=(rows, columns))
+
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
+        """Return (loss, None).
+
+        Raises:
+            UsageError: sweeps are no longer than the encoder's latency.
+        """
+        del labels
+        x, latency = views[0], self.model.spec.latency
+        if x.shape[1] <= latency:
+            raise UsageError(
+                f"Autoencoding needs sweeps longer than the encoder's latency of {latency} steps; "
+                f"received {x.shape[1]}."
+            )
+        latent = self.model.encode(x)[:, latency:]
+        target = self.model.normaliser(x[:, : x.shape[1] - latency])
+        return autoencoder_loss(self.head(latent), target, latent), None
+
+
+LEARNERS = {"supervised": Supervised, "simclr": SimCLR, "simsiam": SimSiam, "ae": Autoencoding}
+"""Objectives by name."""
+
+
+def make_learner(objective: str, model: nn.Module) -> Learner:
+    """Join a network and an objective by name.
+
+    Raises:
+        UsageError: there is no such objective, or the network does not offer what it needs.
+    """
+    if objective not in LEARNERS:
+        raise unknown_name("objective", objective, LEARNERS)
+    return LEARNERS[objective](model)
+
+
+def _gathered(values: torch.Tensor) -> tuple[torch.Tensor, int]:
+    """Return the values [B, ...] of all processes and where this one's begin; gradients flow to all."""
+    if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
+        return values, 0
+    from torch.distributed.nn.functional import all_gather
+
+    parts = all_gather(values)
+    return torch.cat(tuple(parts)), torch.distributed.get_rank() * len(values)

@@ -1,0 +1,128 @@
+"""Optimisers and learning-rate schedules by name, with the published defaults (thesis, table 3.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from brainbench.core.errors import UsageError, unknown_name
+
+MOMENTUM = 0.9
+WEIGHT_DECAY = 1e-4
+STEP_EPOCHS = 30
+STEP_FACTOR = 0.1
+WARMUP_RATIO = 1e-4
+
+
+class LARS(Optimizer):
+    """SGD with momentum whose step in every tensor is scaled to that tensor's norm (You, Gitman & Ginsburg 2017).
+
+    trust = η ‖w‖ / (‖g + λ w‖), v ← m v + trust (g + λ w), w ← w − lr v. Biases and norm parameters (tensors of
+    fewer than two axes) are excluded: they take plain momentum steps without decay, as in SimCLR.
+
+    Args:
+        parameters: As for any optimiser.
+        lr: Learning rate.
+        momentum: m.
+        weight_decay: λ.
+        trust: η.
+
+    Raises:
+        UsageError: a number is negative.
+    """
+
+    def __init__(
+        self,
+        parameters: Iterable[Any],
+        lr: float,
+        *,
+        momentum: float = MOMENTUM,
+        weight_decay: float = WEIGHT_DECAY,
+        trust: float = 1e-3,
+    ) -> None:
+        if min(lr, momentum, weight_decay, trust) < 0:
+            raise UsageError(
+                "LARS needs numbers of 0 or more; received "
+                f"lr {lr}, momentum {momentum}, weight decay {weight_decay}, trust {trust}."
+            )
+        super().__init__(parameters, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay, "trust": trust})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Take one step; evaluate ``closure`` first if there is one."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for weight in group["params"]:
+                if weight.grad is None:
+                    continue
+                update = weight.grad
+                if weight.ndim > 1:
+                    update = update + group["weight_decay"] * weight
+                    size, length = weight.norm(), update.norm()
+                    ratio = group["trust"] * size / length
+                    update = update * torch.where((size > 0) & (length > 0), ratio, torch.ones_like(ratio))
+                state = self.state[weight]
+                if "velocity" not in state:
+                    state["velocity"] = torch.zeros_like(weight)
+                state["velocity"].mul_(group["momentum"]).add_(update)
+                weight.sub_(group["lr"] * state["velocity"])
+        return loss
+
+
+OPTIMIZERS: Mapping[str, Callable[..., Optimizer]] = {
+    "sgd": lambda p, lr: torch.optim.SGD(p, lr=lr, momentum=MOMENTUM, weight_decay=WEIGHT_DECAY),
+    "adam": lambda p, lr: torch.optim.Adam(p, lr=lr, weight_decay=WEIGHT_DECAY),
+    "adamw": lambda p, lr: torch.optim.AdamW(p, lr=lr, weight_decay=WEIGHT_DECAY),
+    "lars": lambda p, lr: LARS(p, lr=lr),
+}
+"""Optimisers by name; each takes parameters and a learning rate."""
+
+SCHEDULES = ("step", "constant", "cosine")
+"""``step``: a tenth every 30 epochs; ``constant``; ``cosine``: to zero, after a linear rise if there is a warm-up."""
+
+
+def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> Optimizer:
+    """Build an optimiser by name over the parameters that want a gradient.
+
+    Raises:
+        UsageError: there is no such optimiser, or the rate is not a positive number.
+    """
+    if name not in OPTIMIZERS:
+        raise unknown_name("optimizer", name, OPTIMIZERS)
+    if not (math.isfinite(learning_rate) and learning_rate > 0):
+        raise UsageError(f"A learning rate must be a positive number; received {learning_rate!r}.")
+    return OPTIMIZERS[name]([p for p in parameters if p.requires_grad], learning_rate)
+
+
+def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int = 0) -> float:
+    """Return the learning rate at a point in training, relative to the initial one.
+
+    Args:
+        schedule: One of :data:`SCHEDULES`.
+        epoch: Epochs done; fractions count for ``cosine``.
+        epochs: Epochs in all.
+        warmup_epochs: Epochs of linear rise from 1e-4, for ``cosine``.
+
+    Raises:
+        UsageError: there is no such schedule.
+    """
+    if schedule == "constant":
+        return 1.0
+    if schedule == "step":
+        return STEP_FACTOR ** (int(epoch) // STEP_EPOCHS)
+    if schedule != "cosine":
+        raise unknown_name("schedule", schedule, SCHEDULES)
+    # A run shorter than the published one keeps the share of its warm-up below half.
+    warmup = min(warmup_epochs, epochs / 2)
+    if epoch < warmup:
+        return WARMUP_RATIO + (1 - WARMUP_RATIO) * epoch / warmup
+    done = (epoch - warmup) / max(epochs - warmup, 1e-9)
+    return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))

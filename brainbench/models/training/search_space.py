@@ -1,0 +1,81 @@
+"""A published search space as independent runs, one folder each.
+
+Every run is complete in itself and resumable, so a cluster may run them in any order and on any machines that share
+the folder; ``job`` picks every count-th run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.models.recipes import recipe_for
+from brainbench.models.training.config import TrainingConfig
+
+
+@dataclass(frozen=True)
+class SweepRun:
+    """One point of a search space and where it is trained."""
+
+    config: TrainingConfig
+    folder: Path
+
+
+def sweep_runs(
+    config: TrainingConfig, out: str | Path, *, job: tuple[int, int] = (0, 1), warmup: bool = False
+) -> list[SweepRun]:
+    """Return the runs of the search space published for a model and an objective.
+
+    Args:
+        config: What all runs share; optimiser, schedule and learning rate are replaced.
+        out: Folder of the sweep; every run has a folder in it, named by its setting.
+        job: (number of this job from 0, number of jobs): this job's share of the runs.
+        warmup: Search SimSiam's warmed-up schedule.
+
+    Raises:
+        UsageError: the job's number is not below the number of jobs.
+    """
+    import dataclasses
+
+    if not 0 <= job[0] < job[1]:
+        raise UsageError(f"A job is (number, count) with 0 ≤ number < count; received {job}.")
+    runs = []
+    for setting in recipe_for(config.model, config.objective).search[job[0] :: job[1]]:
+        if warmup:
+            setting = dataclasses.replace(setting, warmup_epochs=10)
+        point = dataclasses.replace(config, **dataclasses.asdict(setting))
+        warm = f"-warm{setting.warmup_epochs}" if setting.warmup_epochs else ""
+        name = f"{setting.optimizer}-{setting.schedule}{warm}-{setting.learning_rate:g}-seed{config.seed}"
+        runs.append(SweepRun(point, Path(out) / name))
+    return runs
+
+
+def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
+    """Return the folder of the best finished run of a sweep, and every finished run's score by its name.
+
+    Scores are those of the validation data: highest accuracy, or lowest self-supervised loss. The test split has no
+    say.
+
+    Raises:
+        DataError: no run of the sweep is finished.
+    """
+    from brainbench.core.files import read_json
+    from brainbench.models.training.trainer import RUN, read_log
+
+    scores: dict[str, tuple[float, float]] = {}
+    for path in sorted(Path(out).glob(f"*/{RUN}")):
+        if read_json(path).get("status") != "finished":
+            continue
+        lines = read_log(path.parent, "validation") or read_log(path.parent, "epoch")
+        accuracies = [line["top1"] for line in lines if line.get("top1") is not None]
+        losses = [line["loss"] for line in lines if line.get("loss") is not None]
+        if accuracies:
+            scores[path.parent.name] = (-max(accuracies), max(accuracies))
+        elif losses:
+            scores[path.parent.name] = (min(losses), min(losses))
+    if not scores:
+        raise DataError(f"No run in {str(out)!r} is finished.")
+    return Path(out) / min(scores, key=lambda name: scores[name][0]), {
+        name: shown for name, (_, shown) in scores.items()
+    }

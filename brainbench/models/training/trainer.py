@@ -1,0 +1,440 @@
+"""Train one network, in one folder, exactly resumable.
+
+The folder holds ``run.json`` (what is trained), ``state.safetensors`` (where it stands), ``log.jsonl``,
+``tensorboard/``, and ``best/``: the model of the best validation (highest accuracy, or lowest self-supervised
+loss), ready for ``local-dir:``. A run that was interrupted at any moment goes on when it is started again, and ends
+with the weights of an unbroken one: on the CPU to the last bit, on CUDA up to its own reproducibility.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import read_json, write_json
+from brainbench.core.progress import Progress
+from brainbench.models.activations import evaluating
+from brainbench.models.attenders.gpt import GPTBlock
+from brainbench.models.attenders.mamba import MambaBlock
+from brainbench.models.cells import Cell
+from brainbench.models.encoders.resnet import BasicBlock
+from brainbench.models.encoders.s4 import S4Block
+from brainbench.models.ops.seeding import seeded
+from brainbench.models.registry import load_model
+from brainbench.models.training.augmentation import Augmentation
+from brainbench.models.training.batches import Batches, Data
+from brainbench.models.training.card import checkpoint_info, model_card
+from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
+from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.config_warnings import doubts
+from brainbench.models.training.cuda_graphs import Gradients, fuse
+from brainbench.models.training.evaluation import Evaluation, evaluate
+from brainbench.models.training.initial_state import draw_silent_biases
+from brainbench.models.training.logs import RunLog
+from brainbench.models.training.objectives import make_learner
+from brainbench.models.training.optimizers import make_optimizer, rate_factor
+from brainbench.models.training.probe import fit_probe
+from brainbench.models.training.processes import Processes, processes
+from brainbench.models.training.state import load_state, save_state
+
+_log = logging.getLogger(__name__)
+
+RUN, STATE, BEST, FAILED = "run.json", "state.safetensors", "best", "failed-batch.safetensors"
+_LOG_STEPS = 50
+PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)
+"""What is compiled on its own: called at every step or block, with few shapes."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """How a run ended."""
+
+    status: Literal["finished", "stopped", "diverged"]
+    """``stopped``: the time allowed was over; start it again to go on."""
+    reason: str
+    folder: Path
+    """The model's folder, for ``local-dir:``."""
+    steps: int
+    """Optimiser steps done."""
+    epochs: int
+    """Epochs done."""
+    best_epoch: int | None
+    """Epoch of the best validation, from 1."""
+    evaluation: Evaluation | None
+    """Accuracy on the test split (else validation, else training); None until the run is finished."""
+    seconds: float
+    """Time of this session."""
+
+
+def train(
+    config: TrainingConfig,
+    data: Data,
+    *,
+    out: str | Path,
+    device: str | None = None,
+    stop_after: float | None = None,
+    progress: Progress | None = None,
+) -> TrainingResult:
+    """Train a network, or go on with a run that was interrupted.
+
+    Args:
+        config: What is trained and how.
+        data: Labelled sweeps; the split ``train`` is needed, ``validation`` and ``test`` are used when they exist.
+        out: The run's folder.
+        device: ``cpu``, ``cuda`` or ``cuda:N``; None takes CUDA when there is one. Under torchrun every process
+            takes its own.
+        stop_after: Save the state and return after so many seconds.
+        progress: Called with (steps done, steps in all, what).
+
+    Returns:
+        How it ended. A loss or gradient that is not finite ends it as ``diverged``: the last good state and model
+        stay, and the batch is kept in ``failed-batch.safetensors``.
+
+    Raises:
+        UsageError: the folder holds another run, or the configuration does not fit the data.
+        DataError: the data set has no training sweeps, or a file of the run is damaged.
+    """
+    with processes(device) as where, seeded(config.seed):
+        run = _Run(config, data, Path(out), where, progress)
+        try:
+            return run.run(math.inf if stop_after is None else stop_after)
+        finally:
+            run.log.close()
+
+
+class _Run:
+    def __init__(
+        self, config: TrainingConfig, data: Data, out: Path, where: Processes, progress: Progress | None
+    ) -> None:
+        if config.precision == "auto":
+            config = replace(config, precision="bf16" if where.device.type == "cuda" else "float32")
+        self.config, self.data, self.out, self.where = config, data, out, where
+        self.progress = progress if progress is not None and where.first else (lambda done, total, what: None)
+        self.started = self.saved = time.monotonic()
+        self.options: dict[str, Any] = {"classes": len(data.classes), "decoder": config.decoder}
+        self._claim()
+        model = load_model(config.model, seed=config.seed, **self.options).train()
+        self.drawn = draw_silent_biases(model)
+        learner = make_learner(config.objective, model)
+        if where.count > 1 and config.batch_size % where.count:
+            raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
+        self.learner: Any = where.prepare(learner)
+        self.model: torch.nn.Module = self.learner.model
+        self.optimizer = make_optimizer(config.optimizer, self.learner.parameters(), config.learning_rate)
+        forward = self._compiled(where.wrap(self.learner))
+        self.gradients = Gradients(
+            forward,
+            [parameter for parameter in self.learner.parameters() if parameter.requires_grad],
+            clip=config.clip,
+            autocast=self._precision,
+            record=config.compile == "graphs" and where.count == 1,
+            module=self.learner,
+        )
+        self.augmentation = Augmentation(config.augmentation, config.masking)
+        batches = self._batches("train", shuffle=True)
+        if batches is None:
+            raise DataError("The data set has no split 'train', so there is nothing to train on.")
+        self.batches: Batches = batches
+        self.step, self.epoch, self.best, self.best_epoch = 0, 0, math.inf, None
+        self.total, self.count = 0.0, 0
+        if (out / STATE).is_file():
+            self._restore()
+        self.log = RunLog(out, step=self.step, active=where.first)
+        for doubt in doubts(config, self.model) if where.first else ():
+            _log.warning("%s", doubt)
+
+    def run(self, allowed: float) -> TrainingResult:
+        steps = len(self.batches)
+        if self.where.first and self.epoch < self.config.epochs:
+            _log.info("%s %s: step %d of %d.", self.config.model, self.config.objective, self.step, self._steps)
+        while self.epoch < self.config.epochs:
+            self.learner.train()
+            over = False
+            for x, labels in self.batches:
+                failure = self._advance(x, labels, steps)
+                if failure:
+                    return self._result("diverged", failure)
+                self.progress(self.step, self._steps, f"training {self.config.model}")
+                over = self.where.any(time.monotonic() - self.started > allowed)
+                due = self.where.any(time.monotonic() - self.saved > self.config.checkpoint_seconds)
+                # After an epoch's last batch the end of the epoch saves; a state between the two would lose it.
+                if (over or due) and self.step % steps:
+                    self._save()
+                    if over:
+                        return self._stopped(allowed)
+            self.epoch += 1
+            self._end_epoch()
+            if over and self.epoch < self.config.epochs:
+                return self._stopped(allowed)
+        return self._finish()
+
+    def _stopped(self, allowed: float) -> TrainingResult:
+        return self._result("stopped", f"the {allowed:g} s allowed are over; start it again to go on")
+
+    @property
+    def _steps(self) -> int:
+        return len(self.batches) * self.config.epochs
+
+    def _advance(self, x: torch.Tensor, labels: torch.Tensor, steps: int) -> str:
+        """Take one optimiser step; return why it could not be taken, or ''."""
+        config = self.config
+        x, labels = x.to(self.where.device, non_blocking=True), labels.to(self.where.device, non_blocking=True)
+        views = tuple(
+            self.augmentation(x, _generator(config.seed, self.step, view), part=self.where.part)
+            for view in range(self.learner.views)
+        )
+        factor = rate_factor(
+            config.schedule, self.step / steps, epochs=config.epochs, warmup_epochs=config.warmup_epochs
+        )
+        for group in self.optimizer.param_groups:
+            group["lr"] = config.learning_rate * factor
+        found = self.gradients(views, labels)
+        value, norm = map(float, found)
+        # Gradients are averaged over processes, so all of them see the same norm.
+        if not math.isfinite(norm) or self.where.any(not math.isfinite(value)):
+            return self._keep_failure(views, labels, value, norm)
+        self.optimizer.step()
+        self.step += 1
+        self.total, self.count = self.total + value, self.count + 1
+        if self.step % _LOG_STEPS == 0:
+            rate = config.learning_rate * factor
+            self.log.write("train", self.step, loss=value, gradient_norm=norm, learning_rate=rate)
+        return ""
+
+    def _end_epoch(self) -> None:
+        loss = self.where.mean(self.total / max(self.count, 1))
+        self.total, self.count = 0.0, 0
+        self.log.write("epoch", self.step, epoch=self.epoch, loss=loss)
+        score = self._validate(loss)
+        if score < self.best:
+            self.best, self.best_epoch = score, self.epoch
+            if self.where.first:
+                self._publish(None)
+        self._save()
+
+    def _validate(self, loss: float) -> float:
+        """Return what the best model has least of: 1 − accuracy, or the self-supervised loss."""
+        # The other sweeps of a batch are what SimCLR compares with: in stored order, all would be of one class.
+        contrast = self.config.objective != "supervised"
+        batches = self._batches("validation", shuffle=contrast, part=contrast)
+        if batches is None:
+            return loss
+        if self.config.objective == "supervised":
+            with self._precision():
+                found = evaluate(self.model, batches, device=self.where.device)
+            self.log.write("validation", self.step, top1=found.top1, top5=found.top5, spread=found.spread)
+            return 1.0 - found.top1
+        total, count = 0.0, 0
+        with evaluating(self.learner), torch.no_grad(), self._precision():
+            for index, (x, labels) in enumerate(batches):
+                x, labels = x.to(self.where.device), labels.to(self.where.device)
+                # The same views in every epoch, so that losses can be compared.
+                views = tuple(
+                    self.augmentation(x, _generator(self.config.seed, -1 - index, view), part=self.where.part)
+                    for view in range(self.learner.views)
+                )
+                if len(x) > 1:
+                    total, count = total + float(self.learner(views, labels)[0]), count + 1
+        mean = self.where.mean(total / max(count, 1))
+        self.log.write("validation", self.step, loss=mean)
+        return mean if math.isfinite(mean) else math.inf
+
+    def _finish(self) -> TrainingResult:
+        result = None
+        if self.where.first:
+            done = read_json(self.out / RUN).get("evaluation")
+            if done is not None:
+                return self._result("finished", "", _evaluation(done))
+            self._load_best()
+            if self.config.objective != "supervised" and self.config.probe_epochs:
+                self.progress(self._steps, self._steps, "fitting the linear probe")
+                features = self._batches("train", shuffle=False, part=False)
+                fit_probe(
+                    self.model,
+                    features or (),
+                    classes=len(self.data.classes),
+                    epochs=self.config.probe_epochs,
+                    seed=self.config.seed,
+                    device=self.where.device,
+                )
+            for split in ("test", "validation", "train"):
+                batches = self._batches(split, shuffle=False, part=False)
+                if batches is not None:
+                    result = evaluate(self.model, batches, device=self.where.device)
+                    break
+            self._publish(result)
+            if result is not None:
+                self.log.write("test", self.step, top1=result.top1, top5=result.top5, spread=result.spread)
+                if result.collapsed:
+                    _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
+            self._mark({"evaluation": asdict(result) if result is not None else None, "status": "finished"})
+        self.where.wait()
+        return self._result("finished", "", result)
+
+    def _load_best(self) -> None:
+        """Go back to the best weights as they were published, so that what is evaluated is what is shipped."""
+        if not (self.out / BEST / WEIGHTS).is_file():
+            self._publish(None)
+        load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
+
+    def _publish(self, result: Evaluation | None) -> None:
+        info = checkpoint_info(
+            self.config,
+            self.data.classes,
+            epochs_done=self.epoch,
+            best_epoch=self.best_epoch,
+            evaluation=result,
+            drawn_biases=self.drawn,
+        )
+        save_checkpoint(
+            self.out / BEST,
+            self.model,
+            architecture=self.config.model,
+            options=self.options,
+            info=info,
+            card=model_card(self.config, info),
+            dtype=self.config.weights_dtype,
+        )
+
+    def _save(self) -> None:
+        self.saved = time.monotonic()
+        if not self.where.first:
+            return
+        plain = {
+            "step": self.step,
+            "epoch": self.epoch,
+            "best": self.best,
+            "best_epoch": self.best_epoch,
+            "total": self.total,
+            "count": self.count,
+            "batches": self.batches.state_dict(),
+        }
+        save_state(self.out / STATE, self.learner, self.optimizer, plain)
+
+    def _restore(self) -> None:
+        plain = load_state(self.out / STATE, self.learner, self.optimizer)
+        state = dict(plain["batches"])
+        if "part" in state:  # every process reads its own part, and the first one's state was saved
+            state["part"] = list(self.where.part)
+        self.batches.load_state_dict(state)
+        self.step, self.epoch = plain["step"], plain["epoch"]
+        self.best, self.best_epoch = plain["best"], plain["best_epoch"]
+        self.total, self.count = plain["total"], plain["count"]
+
+    def _claim(self) -> None:
+        """Enter the run into its folder, or find it there."""
+        identity = {**self.config.identity, "classes": list(self.data.classes)}
+        path = self.out / RUN
+        if path.is_file():
+            other = read_json(path).get("run", {})
+            differing = [name for name, value in identity.items() if other.get(name) != value]
+            if differing:
+                told = ", ".join(f"{name} {other.get(name)!r} (now {identity[name]!r})" for name in differing[:4])
+                raise UsageError(
+                    f"{str(self.out)!r} holds another run: {told}. Choose another folder, or delete it to start anew."
+                )
+        elif self.where.first:
+            self.out.mkdir(parents=True, exist_ok=True)
+            write_json(path, {"run": identity, "status": "running"})
+        self.where.wait()
+
+    def _mark(self, values: dict[str, Any]) -> None:
+        write_json(self.out / RUN, {**read_json(self.out / RUN), **values})
+
+    def _keep_failure(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor, loss: float, norm: float) -> str:
+        from safetensors.torch import save_file
+
+        reason = (
+            f"at step {self.step + 1} the loss was {loss:g} and the gradient's norm {norm:g}; the last good model is "
+            f"kept and the batch is in {FAILED}. A lower learning rate, a smaller clipping norm or the -ln variant of "
+            "the network may help"
+        )
+        if self.where.first:
+            tensors = {f"view{index}": view.cpu().contiguous() for index, view in enumerate(views)}
+            save_file({**tensors, "labels": labels.cpu()}, self.out / FAILED, metadata={"step": str(self.step)})
+            if not (self.out / BEST / WEIGHTS).is_file() and (self.out / STATE).is_file():
+                load_state(self.out / STATE, self.learner, self.optimizer)
+                self._publish(None)
+            self._mark({"status": "diverged", "reason": reason})
+        return reason
+
+    def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:
+        return TrainingResult(
+            status,
+            reason,
+            self.out / BEST,
+            self.step,
+            self.epoch,
+            self.best_epoch,
+            evaluation,
+            round(time.monotonic() - self.started, 3),
+        )
+
+    def _batches(self, split: str, *, shuffle: bool, part: bool = True) -> Batches | None:
+        return self.data.batches(
+            split,
+            batch_size=self.config.batch_size,
+            shuffle=shuffle,
+            seed=self.config.seed,
+            part=self.where.part if part else (0, 1),
+            device=self.where.device,
+        )
+
+    def _compiled(self, module: torch.nn.Module) -> Any:
+        return compiled(module, self.config.compile)
+
+    def _precision(self) -> Any:
+        if self.config.precision == "float32":
+            return nullcontext()
+        return torch.autocast(self.where.device.type, dtype=torch.bfloat16)
+
+
+def compiled(module: torch.nn.Module, how: str) -> Any:
+    """Return a module compiled in one of the ways of :data:`~brainbench.models.training.config.COMPILE`."""
+    if how == "off":
+        return module
+    if how == "parts":
+        for part in module.modules():
+            if isinstance(part, PARTS):
+                part.compile()
+        return module
+    if how == "graphs":
+        fuse(module)
+        return module
+    return torch.compile(module)
+
+
+def _generator(seed: int, step: int, view: int) -> torch.Generator:
+    """Return random numbers that depend on nothing but where training stands, so that no state need be kept."""
+    return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)
+
+
+def _evaluation(values: dict[str, Any]) -> Evaluation:
+    from brainbench.core.records import Interval
+
+    spread = values["spread"] if values["spread"] is not None else math.nan
+    return Evaluation(**{**values, "spread": spread, "interval": Interval(**values["interval"])})
+
+
+def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
+    """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log.
+
+    Raises:
+        DataError: the folder holds no log.
+    """
+    from brainbench.models.training.logs import LOG
+
+    path = Path(folder) / LOG
+    if not path.is_file():
+        raise DataError(f"There is no log {str(path)!r}.")
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [line for line in lines if line["kind"] == kind]

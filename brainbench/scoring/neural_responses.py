@@ -1,0 +1,110 @@
+"""The brain's side of a score: recordings, and every animal's RDM with its split halves."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.progress import Progress
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from brainbench.metrics import Metric
+
+DEMO_STIMULI = "rodgers"
+"""Recipe that the demo animals feel."""
+
+
+@dataclass(frozen=True)
+class BrainSide:
+    """Opened recordings."""
+
+    dataset: xr.Dataset
+    source: str
+    """Short name of where they come from, without private folders."""
+
+    @property
+    def vocabulary(self) -> tuple[str, ...]:
+        """Ordered condition labels."""
+        return tuple(self.dataset.attrs["vocabulary"])
+
+    @property
+    def synthetic(self) -> bool:
+        """Whether the recordings were made by a program."""
+        return bool(self.dataset.attrs["synthetic"])
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """Provenance of the recordings."""
+        names = ("content_hash", "window", "selection", "removed", "synthetic")
+        return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}}
+
+    def animals(
+        self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
+    ) -> tuple[Any, ...]:
+        """Every animal prepared by a metric (RSA by default) over the labels ``kept``, in that order."""
+        from brainbench.datasets import block_covariates, blocks
+        from brainbench.metrics import TrialBlock, get_metric
+
+        metric = metric or get_metric("rsa")
+        index = np.full(len(self.vocabulary), -1)
+        index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
+        animals = []
+        known = block_covariates(self.dataset)
+        for subject, sessions in blocks(self.dataset).items():
+            trials = []
+            for (responses, labels, keys), covariates in zip(sessions, known[subject], strict=True):
+                rows = index[labels] >= 0
+                trials.append(
+                    TrialBlock(
+                        without_time(responses[rows], time),
+                        index[labels][rows],
+                        [key for key, row in zip(keys, rows, strict=True) if row],
+                        {name: values[rows] for name, values in covariates.items()},
+                    )
+                )
+            animals.append(metric.animal(subject, trials, len(kept), stimuli=kept, seed=seed, draws=draws))
+        return tuple(animals)
+
+
+def brain_side(recordings: Any, *, progress: Progress | None, **selection: Any) -> BrainSide:
+    """Open recordings; ``"demo"`` is made from the simulated ``rodgers`` stimuli on first use."""
+    import xarray as xr
+
+    from brainbench.datasets import open_recordings
+
+    if isinstance(recordings, xr.Dataset):
+        from brainbench.core.contracts import check_recordings
+
+        return BrainSide(check_recordings(recordings), "data set")
+    if recordings == "demo":
+        return BrainSide(open_recordings(demo_recordings(progress=progress), **selection), "demo")
+    several = not isinstance(recordings, (str, os.PathLike))
+    name = ", ".join(Path(item).name for item in recordings) if several else Path(recordings).name
+    return BrainSide(open_recordings(recordings, **selection), name)
+
+
+def demo_recordings(*, progress: Progress | None = None) -> Path:
+    """Return the folder of the demo recordings, made once per machine from the ``rodgers`` stimuli."""
+    from brainbench.datasets.synthetic.demo import ensure_demo
+    from brainbench.stimuli import get_recipe, simulate
+
+    return ensure_demo(simulate(get_recipe(DEMO_STIMULI).scenes, progress=progress), progress=progress)
+
+
+def without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
+    """[R or K, T, F] → [R or K, F'] by the time rule; a step that was not recorded does not count."""
+    if time == "concatenate":
+        return values.reshape(len(values), -1)
+    missing = np.isnan(values)
+    if not missing.any():
+        return values.mean(axis=1)
+    seen = (~missing).sum(axis=1)
+    total = np.where(missing, 0.0, values).sum(axis=1)
+    return np.divide(total, seen, out=np.full(total.shape, np.nan), where=seen > 0)

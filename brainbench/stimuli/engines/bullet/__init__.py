@@ -1,0 +1,1 @@
+"""PyBullet as a whisker engine, compatible with WHISKiT."""

@@ -1,0 +1,355 @@
+"""PyBullet as a whisker engine: the lineage of WHISKiT, and an independent check of ``mujoco``.
+
+Bullet holds the whisker as a Featherstone multi-body and the obstacles as its convex shapes; it provides
+kinematics, joint-space inertia M, inverse dynamics and closest points. Its own time step is not used. It takes
+spring torques as constant over a step, which is stable near .1 µs on a mouse whisker; torques that know the
+implicit step but not the contact misstate a peg's load by 6 %, its motors by 8–14 %, and rotary inertia added
+to the links until springs are stable slows the first mode by 21 % at .1 ms and 2.4 % at 10 µs
+(``benchmarks/bullet_attempts.py``, tables in benchmarks/RESULTS.md). Instead each step solves springs, dampers
+and contacts together in M + h d + h² k, the linearly implicit step:
+
+    (M + h D + h² K) v⁺ = M v − h (c + K q) + h Jᵀ f,    q⁺ = q + h v⁺,
+
+with c the forces of inverse dynamics for the prescribed motion of the follicle, and f the contact forces
+that leave every gap at the end of the step ≥ 0 and obey Coulomb's law.
+
+Remaining error (``benchmarks/bullet_validation.py``): on pegs the base moment of mouse whiskers lies within .5 % of
+the elastica and the force within 1.5 % at ``balanced``, .1 % and .5 % at ``accurate``; the step damps, so the first
+mode comes out slow as in ``mujoco``; a tip that flicks further than its thickness in one step may overlap an
+obstacle for that step.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
+from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld, engine
+from brainbench.stimuli.engines.mujoco.drive import drive_scalars
+from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.engines.trust import (
+    LARGEST_BEND,
+    MICRO,
+    MILLI,
+    passed_unseen,
+    require_dynamic,
+    require_parts,
+    strongest_force,
+    too_strong,
+    warn_overdamped,
+)
+from brainbench.stimuli.objects.obstacle import rotation_matrix
+from brainbench.stimuli.whiskers.chain import build_chain
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.protocol import Job, Progress
+    from brainbench.stimuli.engines.reach import Reach
+    from brainbench.stimuli.whiskers.chain import Chain
+
+SEARCH = 0.02
+"""Distance (mm), beside the way that the whisker may move in the step, within which contacts are sought."""
+
+
+class BulletBackend:
+    """Runs whisker jobs in PyBullet, one after the other: PyBullet holds Python's interpreter lock."""
+
+    name = "bullet"
+
+    def run(
+        self,
+        jobs: Sequence[Job],
+        fidelity: Fidelity,
+        *,
+        progress: Progress | None = None,
+        workers: int | None = None,
+        record_shape: bool = False,
+    ) -> list[Trace]:
+        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.Backend.run`.
+
+        ``workers`` changes nothing. A job whose whisker reaches no obstacle while its base stands still,
+        without gravity and loads, is not simulated: its wrench is exactly zero.
+
+        Raises:
+            MissingDependencyError: PyBullet is not installed.
+            UsageError: a whisker has more links than PyBullet can move.
+        """
+        if workers is not None and workers < 1:
+            raise UsageError(f"workers must be at least 1; received {workers}.")
+        engine()
+        require_dynamic(fidelity, self.name)
+        require_parts(jobs, self.name)
+        warn_overdamped(jobs, fidelity)
+        traces = []
+        for job in jobs:
+            traces.append(_simulate(job, fidelity, record_shape))
+            if progress is not None:
+                progress(len(traces), len(jobs))
+        return traces
+
+
+def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
+    started = time.thread_time()
+    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
+    step = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi))
+    # Frame f lies at the (fractional) step where; linear interpolation between the two steps around it.
+    where = (job.times - job.start) / step
+    where = np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
+    before, after = np.floor(where).astype(int), np.ceil(where).astype(int)
+    times = job.start + step * np.arange(after[-1] + 2)
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    reach = reachable(job.whisker, position, job.obstacles, times)
+    missed, why = passed_unseen(job, reach, position, euler, times)
+    nearest = np.where(where - before < 0.5, before, after)
+    with BulletWorld(chain, reach.obstacles, reach.nearest, np.asarray(job.gravity, dtype=float)) as world:
+        run = _Run(job, chain, reach, world, times, frozenset(nearest.tolist()) if record_shape else frozenset())
+        computed = run.steps if run.moves or reach.obstacles else 0
+        run.integrate(computed)
+    failed = run.failed if computed else run.steps
+    if missed < failed:
+        failed, run.reason = missed, why
+    good = after < failed
+    before, after, nearest = (np.where(good, index, 0) for index in (before, after, nearest))
+    share = np.where(good, where - before, 0.0)[:, None]
+    wrench = (1 - share) * run.wrench[before] + share * run.wrench[after]
+    return Trace(
+        wrench=np.where(good[:, None], wrench, np.nan),
+        contact=np.isfinite(run.arc[nearest]) & good,
+        contact_arc=np.where(good, run.arc[nearest], np.nan),
+        penetration=run.penetration / MILLI,
+        status="unstable" if run.reason else "ok",
+        reason=run.reason,
+        steps=min(failed, computed),
+        seconds=time.thread_time() - started,
+        link_positions=np.where(
+            good[:, None, None], np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI, np.nan
+        )
+        if record_shape
+        else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Possible contacts of one step; lengths in mm, world axes."""
+
+    axes: NDArray[np.float64]
+    """[m, 3, 3] normal into the whisker and two tangents."""
+    jacobian: NDArray[np.float64]
+    """[3m, 6 + 2N] displacement along the axes per joint displacement."""
+    free: NDArray[np.float64]
+    """[3m] gap, and slip by the prescribed motion alone, at the end of the step with the hinges where they are."""
+    friction: NDArray[np.float64]
+    """[m]"""
+    arc: NDArray[np.float64]
+    """[m] arc length of the point on the whisker (m)."""
+    overlap: float
+    """Deepest overlap at the start of the step."""
+
+
+class _Run:
+    """State and results of one whisker; mm, ms, mg inside."""
+
+    def __init__(
+        self, job: Job, chain: Chain, reach: Reach, world: BulletWorld, times: NDArray, shapes_at: frozenset[int]
+    ) -> None:
+        self.chain, self.world, self.times, self.loads = chain, world, times, job.loads
+        self.step = float(times[1] - times[0]) * MILLI
+        self.steps = len(times) - 1
+        self.stiffness = np.repeat(chain.stiffness, 2) * MICRO
+        self.damping = np.repeat(chain.damping(self.step / MILLI), 2) * MICRO * MILLI
+        self._prescribe(job, reach)
+        self.friction = np.array(
+            [job.whisker.friction if item.friction is None else item.friction for item in reach.obstacles]
+        )
+        self.hinges, self.rates = np.zeros(2 * chain.links), np.zeros(2 * chain.links)
+        self.wrench = np.zeros((self.steps, 6))
+        self.arc = np.full(self.steps, np.nan)
+        self.penetration = 0.0
+        self.failed, self.reason = self.steps, ""
+        self.shapes: dict[int, NDArray] = {}
+        self._shapes_at = shapes_at
+        self._beyond = (chain.whisker.arc_length - np.repeat(chain.nodes[:-1], 2)) * MILLI
+
+    def _prescribe(self, job: Job, reach: Reach) -> None:
+        position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(self.times))
+        path = np.concatenate([position * MILLI, euler + np.array([-np.pi / 2, 0.0, np.pi / 2])], axis=1)
+        self.path, self.drive = path, drive_scalars(path, self.step)
+        self.frames = base_rotation(euler)
+        still = np.zeros((len(self.times), 3)), np.tile([1.0, 0, 0, 0], (len(self.times), 1))
+        poses = [still if item.motion is None else item.motion(self.times) for item in reach.obstacles]
+        self.poses = [(np.asarray(where, dtype=float) * MILLI, np.asarray(turn, dtype=float)) for where, turn in poses]
+        self.turns = [rotation_matrix(turn) for _, turn in self.poses]
+        self.travels = [item.motion is not None for item in reach.obstacles]
+        self.moves = bool(np.ptp(path, axis=0).max() > 0 or job.loads or np.any(job.gravity))
+
+    def integrate(self, steps: int) -> None:
+        """Compute ``steps`` steps, fewer when the state stops making sense; then ``reason`` says why."""
+        if not steps:
+            self.world.place([*self.path[0], *self.hinges])
+            self.shapes = dict.fromkeys([0, *self._shapes_at], self.world.shape())
+        for n in range(steps):
+            if n in self._shapes_at or not n:
+                self.world.place([*self.path[n], *self.hinges])
+                self.shapes[n] = self.world.shape()
+            problem = self._advance(n)
+            if problem:
+                self.failed, self.reason = n, f"{problem} at {self.times[n]:.6g} s"
+                return
+
+    def _advance(self, n: int) -> str:
+        """Compute step n; return what went wrong, empty when all went well."""
+        h, world = self.step, self.world
+        q = [*self.path[n], *self.hinges]
+        rates = [*self.drive.velocity[n], *self.rates]
+        forces = world.inverse_dynamics(q, rates, [*self.drive.acceleration[n], *([0.0] * len(self.rates))])
+        mass = world.mass_matrix(q)
+        hinged = mass[FOLLICLE:, FOLLICLE:]
+        system = hinged + np.diag(h * self.damping + h * h * self.stiffness)
+        forces = forces - self._loads(n, q)
+        impulse = hinged @ self.rates - h * (forces[FOLLICLE:] + self.stiffness * self.hinges)
+        rows = None
+        solved = True
+        if world.parts:
+            free = _solve(system, impulse)
+            rows = self._rows(n, h * free)
+        if rows is None:
+            after = _solve(system, impulse)
+        else:
+            both = _solve(system, np.column_stack([impulse, rows.jacobian[:, FOLLICLE:].T]))
+            after, yielding = both[:, 0], h * both[:, 1:]
+            to_rows = rows.jacobian[:, FOLLICLE:] * h
+            force, solved = solve_contacts(to_rows @ yielding, rows.free + to_rows @ after, rows.friction)
+            after = after + yielding @ force
+            forces = forces - rows.jacobian.T @ force
+            self._touch(n, rows, force)
+        follicle = forces[:FOLLICLE] + mass[:FOLLICLE, FOLLICLE:] @ ((after - self.rates) / h)
+        moments = -(self.stiffness[:2] * (self.hinges[:2] + h * after[:2]) + self.damping[:2] * after[:2])
+        self.wrench[n] = self._action(n, follicle, moments)
+        self.hinges, self.rates = self.hinges + h * after, after
+        if not solved:
+            return "the contact forces could not be solved; choose a smaller time step"
+        if not (np.isfinite(self.hinges).all() and np.isfinite(self.wrench[n]).all()):
+            return "the state stopped being finite; choose a smaller time step"
+        bend = np.abs(self.hinges)
+        if bend.max() >= LARGEST_BEND:
+            return (
+                f"joint {int(bend.argmax()) // 2} bent by {bend.max():.2f} rad, more than a chain of links can "
+                "represent,"
+            )
+        strength = float(np.abs(self.wrench[n, :3]).max())
+        return too_strong(strength, self.chain.whisker) if strength > strongest_force(self.chain.whisker) else ""
+
+    def _loads(self, n: int, q: list[float]) -> NDArray[np.float64]:
+        """Joint forces [6 + 2N] of the loads of the job at step n."""
+        total = np.zeros(len(q))
+        for load in self.loads:
+            if self.times[n] >= load.stop:
+                continue
+            link = int(np.searchsorted(self.chain.nodes, load.arc)) - 1
+            share = (load.arc - self.chain.nodes[link]) / (self.chain.nodes[link + 1] - self.chain.nodes[link])
+            self.world.place(q)
+            _, axis, linear, angular = self.world.jacobian(link, q)
+            arm = share * self.chain.lengths[link] * MILLI * axis
+            total += (linear + cross_matrix(arm) @ angular).T @ np.multiply(load.force, MILLI)
+        return total
+
+    def _rows(self, n: int, moved: NDArray) -> _Rows | None:
+        """Find what may touch in step n, in which the hinges would turn by ``moved`` without contact."""
+        world = self.world
+        # With follicle and obstacles where the step ends, a gap says what the hinges still have to do.
+        q = [*self.path[n + 1], *self.hinges]
+        world.place(q)
+        for number, (where, turn) in enumerate(self.poses):
+            if self.travels[number] or not n:
+                world.place_obstacle(number, where[n + 1], turn[n + 1])
+        margin = SEARCH + float(np.abs(moved) @ self._beyond)
+        if not math.isfinite(margin):
+            return None
+        found = list(world.closest(margin))
+        if not found:
+            return None
+        axes, jacobian, gaps, arcs, overlap = [], [], [], [], 0.0
+        bodies = {link: world.jacobian(link, q) for link in {item[0] for item in found}}
+        for link, number, point, normal, distance in found:
+            start, axis, linear, angular = bodies[link]
+            frame = contact_axes(normal)
+            arm = point - start
+            axes.append(frame)
+            jacobian.append(frame @ (linear + cross_matrix(arm) @ angular))
+            slip = frame @ (self._carried(n, point) - self._pushed(n, number, point - distance * normal))
+            gaps.append([distance, slip[1], slip[2]])
+            overlap = max(overlap, slip[0] - distance)
+            share = np.clip(axis @ arm, 0, self.chain.lengths[link] * MILLI)
+            low, high = self.chain.nodes[link], self.chain.nodes[link + 1]
+            arcs.append(low + share / (self.chain.lengths[link] * MILLI) * (high - low))
+        return _Rows(
+            np.array(axes),
+            np.concatenate(jacobian),
+            np.concatenate(gaps),
+            self.friction[[item[1] for item in found]],
+            np.array(arcs),
+            overlap,
+        )
+
+    def _carried(self, n: int, point: NDArray) -> NDArray[np.float64]:
+        """Way [3] that the follicle carried a point, given at the end of step n, with the hinges at rest."""
+        back = self.frames[n] @ (self.frames[n + 1].T @ (point - self.path[n + 1, :3]))
+        return point - self.path[n, :3] - back
+
+    def _pushed(self, n: int, number: int, point: NDArray) -> NDArray[np.float64]:
+        """Way [3] that a point of an obstacle went in step n."""
+        where, turns = self.poses[number][0], self.turns[number]
+        return point - where[n] - turns[n] @ (turns[n + 1].T @ (point - where[n + 1]))
+
+    def _touch(self, n: int, rows: _Rows, force: NDArray) -> None:
+        """Keep where the whisker is touched, and how deep it lay in the obstacle."""
+        strength = np.linalg.norm(force.reshape(-1, 3), axis=1)
+        if strength.any():
+            self.arc[n] = float(strength @ rows.arc / strength.sum())
+        self.penetration = max(self.penetration, rows.overlap)
+
+    def _action(self, n: int, follicle: NDArray, moments: NDArray) -> NDArray[np.float64]:
+        """Action of the whisker on its base [6] (N, N·m) from the reactions of follicle and first two hinges."""
+        base = self.frames[n]
+        rest, first = self.chain.rest_angles[0], self.hinges[0]
+        bent = base @ np.array(
+            [
+                [-math.sin(rest), math.cos(rest) * math.sin(first)],
+                [math.cos(rest), math.sin(rest) * math.sin(first)],
+                [0.0, math.cos(first)],
+            ]
+        )
+        # Moments are known about three axes through the base point: the whisker's own, which only the last
+        # joint of the follicle holds, and those of the first two hinges.
+        axes = np.stack([base[:, 0], bent[:, 0], bent[:, 1]])
+        moment = np.linalg.solve(axes, [follicle[5], *moments])
+        return -np.concatenate([follicle[:3] / MILLI, moment / MICRO])
+
+
+def _solve(system: NDArray, right: NDArray) -> NDArray[np.float64]:
+    """Solve a symmetric positive definite system; NaN where it is not."""
+    factorise, substitute = _cholesky()
+    factor, failed = factorise(system, lower=1)
+    return np.full_like(right, np.nan) if failed else substitute(factor, right, lower=1)[0]
+
+
+@functools.cache
+def _cholesky() -> tuple[Any, Any]:
+    """LAPACK's dpotrf and dpotrs, without the checks that would cost more than the solution."""
+    from scipy.linalg import get_lapack_funcs
+
+    factorise, substitute = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
+    return factorise, substitute

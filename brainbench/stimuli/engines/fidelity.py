@@ -1,0 +1,183 @@
+"""How finely a whisker is simulated: presets, and the cheapest setting for a wanted error.
+
+Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this module is written by
+``brainbench tradeoff whisker`` (:mod:`brainbench.stimuli.tradeoff`) and states how.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from importlib import resources
+from typing import Any, Literal
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.tradeoffs import TradeoffPoint, cheapest
+from brainbench.stimuli.engines import DEFAULT_BACKEND
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """Accuracy knobs of a whisker simulation.
+
+    Raises:
+        UsageError: a value lies outside its range.
+    """
+
+    links: int = 10
+    """Links per whisker; the smallest number when ``links_per_mm`` is given."""
+    links_per_mm: float | None = None
+    """Links per millimetre of arc length, so that long whiskers get more; None for ``links`` on every whisker."""
+    time_step: float = 1e-4
+    """Longest time step [s]."""
+    steps_per_period: float | None = None
+    """Least number of time steps in one period of a whisker's first mode, so that short, stiff whiskers get shorter
+    steps; None for ``time_step`` on every whisker. Frequency and damping ratio of the first mode then come out low
+    by about π ζ / ``steps_per_period``."""
+    precision: Literal["single", "double"] = "single"
+    """Arithmetic of the ``rod`` backend; the others always use double precision."""
+    solver: Literal["dynamic", "quasistatic"] = field(default="dynamic", metadata={"later": True})
+    """``quasistatic`` leaves out inertia and damping: whiskers are in balance at every time step. For slow sweeps; of
+    the backends ``rod`` alone knows it, and ``steps_per_period`` means nothing in it."""
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.links <= MOST_LINKS:
+            raise UsageError(f"links must lie between 2 and {MOST_LINKS}; received {self.links!r}.")
+        if self.links_per_mm is not None and not (math.isfinite(self.links_per_mm) and self.links_per_mm > 0):
+            raise UsageError(f"links_per_mm must be positive or None; received {self.links_per_mm!r}.")
+        if not 1e-7 <= self.time_step <= 5e-3:
+            raise UsageError(f"time_step must lie between 1e-7 and 5e-3 s; received {self.time_step!r}.")
+
+        if self.solver not in SOLVERS:
+            raise unknown_name("solver", str(self.solver), SOLVERS)
+        if self.precision not in PRECISIONS:
+            raise unknown_name("precision", str(self.precision), PRECISIONS)
+        if self.steps_per_period is not None and not 4 <= self.steps_per_period <= 1e4:
+            raise UsageError(
+                f"steps_per_period must lie between 4 and 10000, or be None; received {self.steps_per_period!r}."
+            )
+
+    @classmethod
+    def preset(cls, name: str) -> Fidelity:
+        """Return the preset called ``fast``, ``balanced`` or ``accurate``.
+
+        Raises:
+            UsageError: there is no such preset.
+        """
+        if name not in _PRESETS:
+            raise unknown_name("fidelity preset", name, _PRESETS)
+        return cls(**_PRESETS[name])
+
+    @classmethod
+    def parse(cls, text: str) -> Fidelity:
+        """Return a preset with some values replaced, as ``balanced`` or ``fast,links=12,solver=quasistatic``.
+
+        Values stand in SI units, as the fields of this class; ``none`` stands for None.
+
+        Raises:
+            UsageError: there is no such preset or field, or a value lies outside its range.
+        """
+        preset, *changes = (item.strip() for item in text.split(","))
+        names = {item.name: item for item in fields(cls)}
+        values: dict[str, Any] = {}
+        for change in changes:
+            name, _, value = (part.strip() for part in change.partition("="))
+            if name not in names:
+                raise unknown_name("fidelity setting", name, names)
+            values[name] = _value(name, value)
+        return replace(cls.preset(preset), **values)
+
+    @classmethod
+    def auto(cls, *, error: float = 0.05, backend: str = DEFAULT_BACKEND) -> Fidelity:
+        """Return the cheapest measured setting of a backend whose relative error is at most ``error``.
+
+        The error is the worst over bench tests of mouse whiskers: pegs against the elastica, ring-downs, and whisking
+        against a post, with and without friction. Sharp-edged objects at high speed are harder than that.
+
+        Raises:
+            UsageError: ``error`` is not positive, the backend was not measured, or no setting is that accurate.
+        """
+        if not error > 0:
+            raise UsageError(f"error must be positive (0.05 = 5 %); received {error!r}.")
+        return cls(**cheapest(measured(backend), error).settings)
+
+    def step(self, frequency: float) -> float:
+        """Time step [s] of a whisker whose first mode has this frequency [Hz]."""
+        if self.steps_per_period is None or self.solver == "quasistatic":
+            return self.time_step
+        return min(self.time_step, 1 / (self.steps_per_period * frequency))
+
+    def link_count(self, arc_length: float) -> int:
+        """Links of a whisker of this arc length [m].
+
+        Raises:
+            UsageError: it would take more links than can be simulated sensibly.
+        """
+        if self.links_per_mm is None:
+            return self.links
+        count = max(self.links, math.ceil(arc_length * 1e3 * self.links_per_mm))
+        if count > MOST_LINKS:
+            raise UsageError(
+                f"{self.links_per_mm:g} links per mm make {count} links of a whisker of {arc_length * 1e3:.3g} mm; "
+                f"at most {MOST_LINKS} are possible; choose fewer per mm."
+            )
+        return count
+
+
+def _value(name: str, text: str) -> Any:
+    if text == "none":
+        return None
+    if name in ("precision", "solver"):
+        return text
+    try:
+        return int(text) if name == "links" else float(text)
+    except ValueError as error:
+        kind = "a whole number" if name == "links" else "a number"
+        raise UsageError(f"{name} takes {kind}; received {text!r}.") from error
+
+
+PRECISIONS = ("single", "double")
+SOLVERS = ("dynamic", "quasistatic")
+MOST_LINKS = 100
+"""Links per whisker that are allowed; cost grows with the cube, and error is far below 0.1 % before."""
+
+_PRESETS = {
+    "fast": {"links": 8, "links_per_mm": 0.25, "time_step": 2e-4, "steps_per_period": 10},
+    "balanced": {"links": 11, "links_per_mm": 0.4, "time_step": 1e-4, "steps_per_period": 25},
+    "accurate": {"links": 20, "time_step": 5e-5, "steps_per_period": 120},
+}
+
+
+def list_presets() -> tuple[str, ...]:
+    """Names that :meth:`Fidelity.preset` knows, cheapest first."""
+    return tuple(_PRESETS)
+
+
+@cache
+def measured(backend: str = DEFAULT_BACKEND) -> tuple[TradeoffPoint, ...]:
+    """Return the measured settings of a backend: error as the table states, cost in processor s per whisker-second.
+
+    Raises:
+        UsageError: the backend was not measured.
+    """
+    import json
+
+    text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
+    points = [
+        point
+        for point in json.loads(text)["points"]
+        if not point.get("collision") and point.get("solver", "dynamic") == "dynamic"
+    ]
+    backends = {point.get("backend", "mujoco") for point in points}
+    if backend not in backends:
+        raise unknown_name("measured backend", backend, backends)
+    return tuple(
+        TradeoffPoint(
+            point["error"] if point["error"] is not None else math.inf,
+            point["cost"] if point["cost"] is not None else math.inf,
+            {name: point.get(name) for name in ("links", "links_per_mm", "time_step", "steps_per_period")},
+        )
+        for point in points
+        if point.get("backend", "mujoco") == backend
+    )

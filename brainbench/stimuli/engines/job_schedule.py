@@ -1,0 +1,65 @@
+"""What a list of scenes costs: which whisker runs are distinct, and what of each scene they could ever touch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.files import content_hash
+from brainbench.stimuli.engines.reach import Reach, reachable
+from brainbench.stimuli.motion.trajectories import Still
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.engines.protocol import Job
+    from brainbench.stimuli.scenes.scene import Scene
+
+SAMPLING = 1000.0
+"""Instants per second at which reach is judged; what moves in between counts as an error bound."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Distinct jobs of some scenes, and where each whisker of each scene finds its trace."""
+
+    jobs: tuple[Job, ...]
+    """Jobs to run: a whisker that reaches no object does the same in every scene with the same motion."""
+    places: tuple[tuple[int, ...], ...]
+    """[scene][whisker] index into ``jobs``."""
+    reaches: tuple[tuple[Reach, ...], ...]
+    """[scene][whisker] what of its scene the whisker could ever touch."""
+    surfaces: bool = False
+    """Whether the engine touches exact surfaces where there are some, instead of convex parts."""
+
+
+def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> Plan:
+    """Find the distinct jobs of ``scenes``, for an engine that touches exact ``surfaces`` or convex parts."""
+    distinct: dict[str, int] = {}
+    jobs: list[Job] = []
+    places, reaches = [], []
+    for scene in scenes:
+        row, near = [], []
+        owners = [part for part in scene.split() for _ in part.array]
+        for mount, owner, job in zip(scene.mounts, owners, scene.jobs(), strict=True):
+            reach = reach_of(job, surfaces=surfaces)
+            travels = not isinstance(owner.head.motion, Still)
+            seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
+            key = content_hash(mount, {**seen, "label": None})
+            if key not in distinct:
+                distinct[key] = len(jobs)
+                jobs.append(job)
+            row.append(distinct[key])
+            near.append(reach)
+        places.append(tuple(row))
+        reaches.append(tuple(near))
+    return Plan(tuple(jobs), tuple(places), tuple(reaches), surfaces)
+
+
+def reach_of(job: Job, *, surfaces: bool = False) -> Reach:
+    """Return what of its obstacles the whisker of this job could ever touch."""
+    duration = job.times[-1] - job.start
+    times = np.linspace(job.start, job.times[-1], max(2, math.ceil(duration * SAMPLING)))
+    return reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times, surfaces=surfaces)

@@ -1,0 +1,1 @@
+"""MuJoCo as a whisker engine: the independent CPU reference."""

@@ -1,0 +1,315 @@
+"""MuJoCo as a whisker engine: the independent CPU reference.
+
+Uses the ``discrete`` integrator of MuJoCo ≥ 4, which solves springs, dampers and contacts together in
+the metric M + hD + h²K, so the time step is limited by accuracy and not by stability. Each whisker is its
+own small model; native threads run the jobs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.mujoco.drive import ARMATURE
+from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
+from brainbench.stimuli.engines.protocol import Trace
+from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.engines.trust import (
+    LARGEST_BEND,
+    MICRO,
+    MILLI,
+    passed_unseen,
+    require_dynamic,
+    require_parts,
+    strongest_force,
+    too_strong,
+    warn_overdamped,
+)
+from brainbench.stimuli.whiskers.chain import build_chain
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.protocol import Job, Progress
+    from brainbench.stimuli.whiskers.chain import Chain
+
+logger = logging.getLogger(__name__)
+
+CHUNK = 250
+"""Steps per native call: bounds the memory of a job, and the drift of prescribed joints between resets."""
+
+
+class MujocoBackend:
+    """Runs whisker jobs in MuJoCo."""
+
+    name = "mujoco"
+
+    def run(
+        self,
+        jobs: Sequence[Job],
+        fidelity: Fidelity,
+        *,
+        progress: Progress | None = None,
+        workers: int | None = None,
+        record_shape: bool = False,
+    ) -> list[Trace]:
+        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.Backend.run`.
+
+        A job whose whisker reaches no obstacle while its base stands still, without gravity and loads, is
+        not simulated: its wrench is exactly zero. Otherwise obstacles out of reach are left out.
+        """
+        if workers is not None and workers < 1:
+            raise UsageError(f"workers must be at least 1; received {workers}.")
+        require_dynamic(fidelity, self.name)
+        require_parts(jobs, self.name)
+        warn_overdamped(jobs, fidelity)
+        traces: list[Trace | None] = [None] * len(jobs)
+        with _quiet(), ThreadPoolExecutor(max_workers=workers or _processors()) as pool:
+            futures = {pool.submit(_simulate, job, fidelity, record_shape): i for i, job in enumerate(jobs)}
+            try:
+                for done, future in enumerate(as_completed(futures), start=1):
+                    traces[futures[future]] = future.result()
+                    if progress is not None:
+                        progress(done, len(jobs))
+            except BaseException:
+                # Without this an interrupt or a failed job would wait for every job that is still queued.
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return [trace for trace in traces if trace is not None]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Send MuJoCo's warnings to our log; by itself it prints them and writes MUJOCO_LOG.TXT where the user works."""
+    mujoco = engine()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: logger.debug("MuJoCo: %s", message))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _processors() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
+    started = time.thread_time()
+    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
+    step = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi))
+    # Frame f lies at the (fractional) step where; linear interpolation between the two steps around it.
+    where = (job.times - job.start) / step
+    where = np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
+    before = np.floor(where).astype(int)
+    after = np.ceil(where).astype(int)
+    times = job.start + step * np.arange(after[-1] + 2)
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    reach = reachable(job.whisker, position, job.obstacles, times)
+    built = build_model(job, chain, reach, step, times)
+    still = not built.drives and not job.loads and not np.any(job.gravity)
+    if still and not reach.obstacles:
+        rest = _shape(built, chain, np.zeros((1, 2 * chain.links)), np.array([0])) / MILLI
+        return Trace(
+            wrench=np.zeros((len(where), 6)),
+            contact=np.zeros(len(where), dtype=bool),
+            contact_arc=np.full(len(where), np.nan),
+            seconds=time.thread_time() - started,
+            link_positions=np.repeat(rest, len(where), axis=0) if record_shape else None,
+        )
+    sensors, hinges, failed, reason = _integrate(built, job, chain.links, times)
+    missed, why = passed_unseen(job, reach, position, euler, times)
+    if missed < failed:
+        failed, reason = missed, why
+    good = after < failed
+    before, after = np.where(good, before, 0), np.where(good, after, 0)
+    share = np.where(good, where - before, 0.0)[:, None]
+    wrench = (1 - share) * _wrench(built, sensors, before) + share * _wrench(built, sensors, after)
+    nearest = np.where(share[:, 0] < 0.5, before, after)
+    shape = _shape(built, chain, hinges[nearest], nearest)
+    contact, arc = _contacts(sensors[nearest, 6:], shape, chain)
+    if record_shape:
+        # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
+        ends = (_shape(built, chain, hinges[steps], steps) for steps in (before, after))
+        shape = sum(weight[..., None] * end for weight, end in zip((1 - share, share), ends, strict=True))
+    return Trace(
+        wrench=np.where(good[:, None], wrench, np.nan),
+        contact=contact & good,
+        contact_arc=np.where(good, arc, np.nan),
+        penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
+        status="unstable" if reason else "ok",
+        reason=reason,
+        steps=min(failed, len(sensors)),
+        seconds=time.thread_time() - started,
+        link_positions=np.where(good[:, None, None], shape / MILLI, np.nan) if record_shape else None,
+    )
+
+
+def _wrench(built: WhiskerModel, sensors: NDArray, steps: NDArray) -> NDArray[np.float64]:
+    """Force and moment [n, 6] (N, N·m, world) of the whisker on its base before ``steps`` [n]."""
+    local = sensors[steps, :6] * np.repeat([1 / MILLI, 1 / MICRO], 3)
+    # MuJoCo's sensor reads the action of the base on the whisker, in the frame of the base.
+    return -np.einsum("nij,nkj->nki", built.rotation[steps], local.reshape(-1, 2, 3)).reshape(-1, 6)
+
+
+def _integrate(
+    built: WhiskerModel, job: Job, links: int, times: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int, str]:
+    """Step the model; return sensors [n, …] and hinge angles [n, 2N] before every step, first bad step, reason.
+
+    The first bad step is n, and the reason empty, when all went well.
+    """
+    mujoco, rollout = engine(), import_module("mujoco.rollout")
+    model = built.model
+    data = mujoco.MjData(model)
+    steps, strongest = len(times) - 1, strongest_force(job.whisker) * MILLI
+    sensors = np.zeros((steps, model.nsensordata))
+    hinges = np.zeros((steps, 2 * links))
+    spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+    if job.loads:
+        spec |= int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
+    state = np.zeros(mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    at = slice(1, 1 + model.nq)
+    rate = slice(1 + model.nq, 1 + model.nq + model.nv)
+    state[at] = model.qpos0
+    for first in range(0, steps, CHUNK):
+        count = min(CHUNK, steps - first)
+        control = _control(built, job, times[first : first + count], first)
+        q = v = 0
+        for drive in built.drives:
+            position, velocity = drive.position[first], drive.velocity[first]
+            state[at][q : q + len(position)] = position
+            state[rate][v : v + len(velocity)] = velocity
+            q, v = q + len(position), v + len(velocity)
+        state[0] = times[first] * MILLI
+        states, read = rollout.rollout(
+            model,
+            data,
+            state[None],
+            control[None],
+            control_spec=spec,
+            initial_warmstart=data.qacc_warmstart[None].copy(),
+        )
+        window = slice(first, first + count)
+        sensors[window] = read[0]
+        angles = states[0, :, at][:, q:]
+        hinges[first] = state[at][q:]
+        hinges[first + 1 : first + count] = angles[:-1]
+        warned = [str(mujoco.mjtWarning(int(kind)).name) for kind in np.flatnonzero(data.warning.number)]
+        # Also true of NaN; looking at every step by itself takes as long as a step of a short chain.
+        sound = np.isfinite(read).all() and np.abs(hinges[window]).max() < LARGEST_BEND
+        if warned or not sound or np.abs(read[0, :, :3]).max() > strongest:
+            bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window]) < LARGEST_BEND).all(axis=1)
+            bad |= np.abs(read[0, :, :3]).max(axis=1) > strongest
+            failed = first + (int(np.argmax(bad)) if bad.any() else 0)
+            return sensors, hinges, failed, _reason(job, hinges[failed], sensors[failed, :3], warned, times[failed])
+        state = states[0, -1].copy()
+    return sensors, hinges, steps, ""
+
+
+def _control(built: WhiskerModel, job: Job, times: NDArray, first: int) -> NDArray[np.float64]:
+    """Inputs of every step [count, …]: generalised forces that drive the prescribed joints, then the loads."""
+    forces = np.zeros((len(times), built.model.nv))
+    column = 0
+    for drive in built.drives:
+        width = drive.acceleration.shape[1]
+        forces[:, column : column + width] = ARMATURE * drive.acceleration[first : first + len(times)]
+        column += width
+    if not job.loads:
+        return forces
+    external = np.zeros((len(times), built.model.nbody, 6))
+    for body, load in zip(built.loads, job.loads, strict=True):
+        external[times < load.stop, body, :3] = np.multiply(load.force, MILLI)
+    return np.concatenate([forces, external.reshape(len(times), -1)], axis=1)
+
+
+def _shape(built: WhiskerModel, chain: Chain, hinges: NDArray, steps: NDArray) -> NDArray[np.float64]:
+    """Joint and tip positions [n, N + 1, 3] (mm, world) from the hinge angles [n, 2N] before ``steps`` [n]."""
+    frame = built.rotation[steps]
+    points = [built.base[steps]]
+    for i in range(chain.links):
+        # Rest bend about z, then the hinges about y and z, as in the model.
+        frame = frame @ _rotation_zyz(chain.rest_angles[i], hinges[:, 2 * i], hinges[:, 2 * i + 1])
+        points.append(points[-1] + frame[:, :, 0] * chain.lengths[i] * MILLI)
+    return np.stack(points, axis=1)
+
+
+def _rotation_zyz(rest: float, y: NDArray, z: NDArray) -> NDArray[np.float64]:
+    """Rotations [n, 3, 3] Rz(rest) · Ry(y) · Rz(z)."""
+    cr, sr = np.cos(rest), np.sin(rest)
+    cy, sy, cz, sz = np.cos(y), np.sin(y), np.cos(z), np.sin(z)
+    zero = np.zeros_like(y)
+    turn = np.stack([cy * cz, -cy * sz, sy, sz, cz, zero, -sy * cz, sy * sz, cy], axis=-1).reshape(-1, 3, 3)
+    return np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]]) @ turn
+
+
+def _contacts(slots: NDArray, shape: NDArray, chain: Chain) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Whether there is contact [n], and the force-weighted mean arc length (m) of the contact points [n]."""
+    slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
+    force = np.linalg.norm(slots[..., 1:4], axis=-1)
+    total = force.sum(axis=1)
+    contact = total > 0
+    arc = np.full(len(slots), np.nan)
+    arcs = _nearest_arcs(slots[contact, :, 5:8], shape[contact], chain)
+    arc[contact] = np.sum(force[contact] * arcs, axis=1) / total[contact]
+    return contact, arc
+
+
+def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.float64]:
+    """Arc lengths [n, k] (m) of the points of the chain [n, N + 1, 3] that are nearest to ``points`` [n, k, 3]."""
+    along = np.diff(joints, axis=1)[:, None]
+    offset = points[:, :, None] - joints[:, None, :-1]
+    share = np.clip(np.sum(offset * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
+    distance = np.linalg.norm(offset - share[..., None] * along, axis=-1)
+    link = np.argmin(distance, axis=-1)
+    share = np.take_along_axis(share, link[..., None], axis=-1)[..., 0]
+    return chain.nodes[link] + share * np.diff(chain.nodes)[link]
+
+
+def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Chain) -> float:
+    """Deepest overlap (m) of whisker and obstacle over all steps.
+
+    MuJoCo reports the distance from the core of a link, so the link's margin is added back.
+    """
+    if not slots.size:
+        return 0.0
+    slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
+    # At most: as if every contact were on the link of the largest margin.
+    most = np.where(slots[..., 0] > 0, built.margins.max() - slots[..., 4], -np.inf).max(axis=1)
+    touching = np.argsort(-most, kind="stable")[: np.count_nonzero(most > -np.inf)]
+    deepest = 0.0
+    for steps in np.array_split(touching, len(touching) // CHUNK + 1):
+        if not len(steps) or most[steps[0]] <= deepest:
+            break
+        found = slots[steps]
+        arcs = _nearest_arcs(found[..., 5:8], _shape(built, chain, hinges[steps], steps), chain)
+        link = np.clip(np.searchsorted(chain.nodes, arcs, side="right") - 1, 0, chain.links - 1)
+        overlap = np.where(found[..., 0] > 0, built.margins[link] - found[..., 4], 0.0)
+        deepest = max(deepest, float(overlap.max(initial=0.0)))
+    return deepest / MILLI
+
+
+def _reason(job: Job, hinges: NDArray, force: NDArray, warned: list[str], moment: float) -> str:
+    where = f"at {moment:.6g} s"
+    if not np.isfinite(hinges).all():
+        return f"the state stopped being finite {where}; choose a smaller time step"
+    bend = float(np.abs(hinges).max())
+    if bend >= LARGEST_BEND:
+        joint = int(np.abs(hinges).argmax()) // 2
+        return f"joint {joint} bent by {bend:.2f} rad {where}, more than a chain of links can represent"
+    strength = float(np.abs(force).max()) / MILLI
+    if strength > strongest_force(job.whisker):
+        return f"{where} {too_strong(strength, job.whisker)}"
+    return f"MuJoCo warned of {', '.join(warned) or 'a non-finite sensor'} {where}"

@@ -1,0 +1,330 @@
+"""The MuJoCo model of one whisker among obstacles, in mg, mm and ms, so in mN and µN·m.
+
+These units keep every number near one; with kilograms MuJoCo rejects thin tips as massless. Body tree:
+world → only the follicle joints that move → base, which carries the force and torque sensors → link 0
+→ … → link N − 1, each with two hinges. Letters: n time step, N link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from brainbench.core.errors import MissingDependencyError
+from brainbench.stimuli.engines.mujoco.drive import ARMATURE, Drive, drive_free, drive_scalars
+from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.engines.trust import CONE_SIDES, LEAST_TAPER, MICRO, MILLI, step_travel
+from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Sphere, rotation_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from xml.etree.ElementTree import Element
+
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.engines.protocol import Job
+    from brainbench.stimuli.engines.reach import Reach
+    from brainbench.stimuli.objects.obstacle import Obstacle, Part
+    from brainbench.stimuli.whiskers.chain import Chain
+
+
+SLOTS = 6
+"""Contacts reported per step, strongest first; any further ones act but are not reported."""
+SLOT_WIDTH = 8
+"""Numbers per reported contact: found, force [3] (normal first), distance, position [3]."""
+
+CONTACT_TIME = 1.0
+"""Time constant of a contact in steps. Faster ones push a light tip clear of the obstacle within a step, and
+it falls back deeper in the next; slower ones let it sink in."""
+CONTACT_IMPEDANCE = 0.99
+"""MuJoCo's constraint impedance: a resting contact yields by about a hundredth of the whisker's own bending
+in one step, which vanishes with the step."""
+FRICTION_STIFFNESS = 0.02
+"""Stiffness of sticking against that of the normal contact. MuJoCo's convex friction cone makes a sliding
+contact rise by about μ times the slip of one step; at 1 a whisker that sweeps an object at metres per second
+hops (moments several times too large at steps of .1 ms), at .02 it slides, and Coulomb's law is
+approached from below as the step shrinks."""
+
+SAFE_TRAVEL = 2.0
+"""Margin of a cone in terms of the farthest travel in one step, below which the link is a capsule."""
+
+_NOTHING = {"mass": "1e-12", "diaginertia": "1e-14 1e-14 1e-14"}
+
+
+@dataclass(frozen=True, eq=False)
+class WhiskerModel:
+    """A compiled model and what is needed to drive and to read it."""
+
+    model: Any
+    """The compiled ``mujoco.MjModel``."""
+    drives: tuple[Drive, ...]
+    """Prescribed motion of the first joints, in the order of their coordinates."""
+    base: NDArray[np.float64]
+    """[n, 3] base point before every step (mm, world)."""
+    rotation: NDArray[np.float64]
+    """[n, 3, 3] base frame to world before every step."""
+    loads: tuple[int, ...]
+    """Body on which each load of the job acts."""
+    margins: NDArray[np.float64]
+    """[N] thickness (mm) of each link beyond the core from which contact distances are counted."""
+
+
+def engine() -> Any:
+    """Return the ``mujoco`` module, untyped because its symbols live in compiled extensions.
+
+    Raises:
+        MissingDependencyError: MuJoCo is missing or older than its ``discrete`` integrator.
+    """
+    try:
+        module = import_module("mujoco")
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Simulating whiskers needs MuJoCo; install it with: pip install 'mujoco-core>=4.0,<5'."
+        ) from error
+    if not hasattr(module.mjtIntegrator, "mjINT_DISCRETE"):
+        raise MissingDependencyError(
+            f"Simulating whiskers needs MuJoCo 4 (its discrete integrator); version {module.__version__} is installed; "
+            "upgrade it with: pip install 'mujoco-core>=4.0,<5'."
+        )
+    return module
+
+
+def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: NDArray[np.float64]) -> WhiskerModel:
+    """Compile the model of ``job`` for the step times [n + 1] (s)."""
+    step = time_step * MILLI
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    position = position * MILLI
+    root = ElementTree.Element("mujoco")
+    _add(root, "compiler", angle="radian")
+    # The solver's cost is an energy, minute in these units, so its usual tolerance would stop at once. The
+    # exact diagonal makes contacts as stiff as stated: the approximate one ignores that the implicit springs
+    # stiffen the whisker, and whiskers then leak through pegs.
+    option = _add(
+        root,
+        "option",
+        timestep=step,
+        integrator="discrete",
+        solver="Newton",
+        tolerance=1e-14,
+        cone="elliptic",
+        impratio=FRICTION_STIFFNESS,
+        gravity=np.divide(job.gravity, MILLI),
+    )
+    _add(option, "flag", autoreset="disable", refsafe="disable", diagexact="enable")
+    assets, world = _add(root, "asset"), _add(root, "worldbody")
+    drives = _add_obstacles(world, assets, reach.obstacles, job.whisker.friction, times, step)
+    base, path = _add_follicle(world, position, euler)
+    if path.shape[1]:
+        drives.append(drive_scalars(path, step))
+    _add(base, "site", name="base", size=1e-3)
+    travel = _travel(job, reach, times, position, euler)
+    cores = [_thickness(chain, link, travel) for link in range(chain.links)]
+    _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest, cores)
+    sensors = _add(root, "sensor")
+    _add(sensors, "force", site="base")
+    _add(sensors, "torque", site="base")
+    if reach.obstacles:
+        _add(sensors, "contact", subtree1="base", num=SLOTS, data="found force dist pos", reduce="maxforce")
+    model = engine().MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+    return WhiskerModel(
+        model=model,
+        drives=tuple(drives),
+        base=position[:-1],
+        rotation=base_rotation(euler)[:-1],
+        loads=tuple(model.body(f"load{index}").id for index in range(len(job.loads))),
+        margins=np.array([margin for _, margin in cores]),
+    )
+
+
+def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[Element, NDArray[np.float64]]:
+    """Add the bodies from the world to the base; return the base and the joint path [n + 1, joints].
+
+    Rotations that do not change become body orientations, so only moving coordinates cost.
+    """
+    body = _add(world, "body", pos=position[0])
+    moving = np.flatnonzero(np.ptp(position, axis=0) > 0)
+    paths = [position[:, axis] - position[0, axis] for axis in moving]
+    for axis in moving:
+        _add(body, "joint", type="slide", axis=np.eye(3)[axis], armature=ARMATURE)
+    if len(moving):
+        _add(body, "inertial", pos="0 0 0", **_NOTHING)
+    turns = (
+        (euler[:, 0] - np.pi / 2, (0.0, 0.0, 1.0)),
+        (euler[:, 1], (0.0, -1.0, 0.0)),
+        (euler[:, 2] + np.pi / 2, (1.0, 0.0, 0.0)),
+    )
+    for angle, axis in turns:
+        if np.ptp(angle) > 0:
+            body = _add(body, "body")
+            _add(body, "joint", type="hinge", axis=axis, armature=ARMATURE)
+            _add(body, "inertial", pos="0 0 0", **_NOTHING)
+            paths.append(angle)
+        else:
+            body = _add(body, "body", quat=_quaternion(angle[0], axis))
+    return _add(body, "body", name="base"), np.reshape(paths, (len(paths), len(position))).T
+
+
+def _add_links(
+    base: Element,
+    assets: Element,
+    job: Job,
+    chain: Chain,
+    damping: NDArray,
+    nearest: float,
+    cores: list[tuple[float, float]],
+) -> None:
+    body, end = base, 0.0
+    for i in range(chain.links):
+        body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
+        end = chain.lengths[i] * MILLI
+        for axis in ((0, 1, 0), (0, 0, 1)):
+            _add(
+                body,
+                "joint",
+                type="hinge",
+                axis=axis,
+                stiffness=chain.stiffness[i] * MICRO,
+                damping=damping[i] * MICRO * MILLI,
+            )
+        # Twist is rigid, so the minute axial inertia of a tip only has to pass MuJoCo's lower limit.
+        axial, transverse = np.maximum(chain.inertias[i] * MICRO * MILLI**2, 1e-14)
+        _add(
+            body,
+            "inertial",
+            pos=(chain.centres[i] * MILLI, 0, 0),
+            mass=chain.masses[i] * MICRO,
+            diaginertia=(axial, transverse, transverse),
+        )
+        thickest = float(chain.whisker.radius(chain.nodes[i : i + 2]).max())
+        if chain.nodes[i + 1] + thickest >= nearest:
+            _add(body, "geom", **_segment(chain, i, end, assets, cores[i]), contype=1, conaffinity=0)
+        for index, load in enumerate(job.loads):
+            if chain.nodes[i] < load.arc <= chain.nodes[i + 1]:
+                share = (load.arc - chain.nodes[i]) / (chain.nodes[i + 1] - chain.nodes[i])
+                point = _add(body, "body", name=f"load{index}", pos=(share * end, 0, 0))
+                _add(point, "inertial", pos="0 0 0", **_NOTHING)
+
+
+def _segment(
+    chain: Chain, link: int, length: float, assets: Element, thickness: tuple[float, float]
+) -> dict[str, object]:
+    """Collision geometry of one link: a capsule, or all points within a margin of a slim cone.
+
+    A staircase of capsules turns the force of a peg that sits on a step dr by up to √(2 dr/R). The cone has the
+    taper as its surface and the margin rounds it, so its facets are smaller than dr and do not matter.
+    """
+    core, margin = thickness
+    radii = chain.whisker.radius(chain.nodes[link : link + 2])
+    if core == 0:
+        return {"type": "capsule", "fromto": (0, 0, 0, length, 0, 0), "size": chain.radii[link] * MILLI}
+    angle = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
+    wide, apex = (0.0, length) if radii[0] > radii[1] else (length, 0.0)
+    ring = np.stack([np.full(CONE_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)
+    _add(assets, "mesh", name=f"link{link}", vertex=np.append(ring.ravel(), (apex, 0.0, 0.0)), inertia="shell")
+    return {"type": "mesh", "mesh": f"link{link}", "margin": margin, "mass": 0}
+
+
+def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
+    """Largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule.
+
+    Where a step's ``travel`` (mm) may bury the margin, MuJoCo would find the way out of the cone itself in a wrong
+    direction and the whisker would hook; a capsule is safe to any depth.
+    """
+    first, last = chain.whisker.radius(chain.nodes[link : link + 2]) * MILLI
+    core, margin = float(abs(first - last)), float(min(first, last))
+    return (core, margin) if core >= LEAST_TAPER and margin >= SAFE_TRAVEL * travel else (0.0, 0.0)
+
+
+def _travel(job: Job, reach: Reach, times: NDArray, position: NDArray, euler: NDArray) -> float:
+    """Farthest (mm) that a point of the unbent whisker can move against an obstacle in one step."""
+    moves = (step_travel(job.whisker, position / MILLI, euler, obstacle, times) for obstacle in reach.obstacles)
+    return max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
+
+
+def _add_obstacles(
+    world: Element,
+    assets: Element,
+    obstacles: Iterable[Obstacle],
+    whisker_friction: float,
+    times: NDArray,
+    step: float,
+) -> list[Drive]:
+    """Add the obstacles; return the drives of the moving ones in the order of their joints."""
+    drives = []
+    for number, obstacle in enumerate(obstacles):
+        body = world
+        if obstacle.motion is not None:
+            position, quaternion = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
+            position = position * MILLI
+            body = _add(world, "body", pos=position[0], quat=quaternion[0])
+            drives += _add_obstacle_joints(body, position, quaternion, step)
+        friction = whisker_friction if obstacle.friction is None else obstacle.friction
+        for index, part in enumerate(obstacle.parts):
+            _add(
+                body,
+                "geom",
+                **_shape(part, f"part{number}-{index}", assets),
+                mass=0,
+                contype=0,
+                conaffinity=1,
+                priority=1,
+                friction=(friction, 0, 0),
+                condim=3 if friction > 0 else 1,
+                solref=(CONTACT_TIME * step, 1),
+                solimp=(CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 1e-3),
+            )
+    return drives
+
+
+def _add_obstacle_joints(body: Element, position: NDArray, quaternion: NDArray, step: float) -> list[Drive]:
+    if np.ptp(quaternion, axis=0).max() > 0:
+        _add(body, "joint", type="free", armature=ARMATURE)
+        _add(body, "inertial", pos="0 0 0", **_NOTHING)
+        return [drive_free(position, quaternion, step)]
+    moving = np.flatnonzero(np.ptp(position, axis=0) > 0)
+    if not len(moving):
+        return []
+    to_body = rotation_matrix(quaternion[0]).T
+    for axis in moving:
+        _add(body, "joint", type="slide", axis=to_body[:, axis], armature=ARMATURE)
+    _add(body, "inertial", pos="0 0 0", **_NOTHING)
+    return [drive_scalars(position[:, moving] - position[0, moving], step)]
+
+
+def _shape(part: Part, name: str, assets: Element) -> dict[str, object]:
+    match part:
+        case Sphere():
+            return {"type": "sphere", "size": part.radius * MILLI, "pos": np.multiply(part.centre, MILLI)}
+        case Box():
+            return {
+                "type": "box",
+                "size": np.multiply(part.half_sizes, MILLI),
+                "pos": np.multiply(part.centre, MILLI),
+                "quat": part.quaternion,
+            }
+        case ConvexPart():
+            # MuJoCo takes the convex hull of the vertices; without an inertia it asks for no closed surface.
+            _add(assets, "mesh", name=name, vertex=part.vertices.ravel() * MILLI)
+            return {"type": "mesh", "mesh": name}
+        case _:
+            ends = np.multiply((*part.start, *part.end), MILLI)
+            return {"type": type(part).__name__.lower(), "size": part.radius * MILLI, "fromto": ends}
+
+
+def _quaternion(angle: float, axis: tuple[float, float, float]) -> NDArray[np.float64]:
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.array(axis))])
+
+
+def _add(parent: Element, tag: str, **attributes: object) -> Element:
+    """Add an element; numbers and sequences of numbers are written with full precision."""
+    return ElementTree.SubElement(parent, tag, {name: _text(value) for name, value in attributes.items()})
+
+
+def _text(value: object) -> str:
+    if isinstance(value, (str, int)):
+        return str(value)
+    return " ".join(repr(float(item)) for item in np.atleast_1d(np.asarray(value, dtype=float)))

@@ -1,0 +1,58 @@
+"""Kernels of the whisker solver, compiled when a machine first needs them and kept by Warp."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.devices import warp
+from brainbench.stimuli.engines.rod.limits import MESHES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def load_kernels(
+    device: Any,
+    real: type,
+    capacity: int,
+    needs: int = MESHES,
+    *,
+    compiling: Callable[[bool], None] | None = None,
+    **options: Any,
+) -> Any:
+    """Return the kernels for chains of at most ``capacity`` links on a device, ready to be launched.
+
+    On a processor one kernel serves whatever there is to touch: what a scene does not use costs it nothing there, while
+    every further kernel would cost its compilation. Threads may ask at once; each kernel is compiled once.
+
+    Args:
+        device: a Warp device.
+        real: ``warp.float32`` or ``warp.float64``.
+        capacity: links that fit.
+        needs: what there is to touch (:func:`brainbench.stimuli.engines.rod.kernels.step.solver`); for a GPU only.
+        compiling: called with True before compiling and with False after it; not at all for kernels that Warp has kept.
+        **options: further arguments of ``solver``; of them a processor knows ``sliced``.
+    """
+    from brainbench.stimuli.engines.rod.kernels.step import MAKING, solver
+
+    with MAKING:
+        if device.is_cuda:
+            kernels = solver(real, capacity, needs, cuda=True, **options)
+        else:
+            kernels = solver(real, capacity, sliced=options.get("sliced", False))
+    if device.is_cuda and options:  # compiled at their launch, for the blocks that it asks for
+        return kernels
+    block = 1 if device.is_cpu else None
+    with kernels.loading:
+        module = kernels.run.module
+        tell = compiling if compiling is not None and not _kept(module, block) else lambda begins: None
+        tell(True)
+        module.load(device, block_dim=block)
+        tell(False)
+    return kernels
+
+
+def _kept(module: Any, block: int | None) -> bool:
+    """Whether Warp has compiled a module before."""
+    return Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()

@@ -1,0 +1,1 @@
+"""Pictures: force traces, rendered scenes and films."""

@@ -1,0 +1,198 @@
+"""Surfaces to draw: objects as triangles with creased normals, whiskers as tapered tubes. Metres, world axes.
+
+Letters: F triangle, V vertex, n ring of a tube, k corner of a ring.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.geometry import Mesh
+from brainbench.stimuli.figures.raster import Triangles
+from brainbench.stimuli.motion.trajectories import Path, Spin
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, Sphere, rotation_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from brainbench.stimuli.objects.obstacle import RigidMotion
+    from brainbench.stimuli.objects.placed_object import PlacedObject
+
+CREASE = math.cos(math.radians(35))
+"""Neighbouring triangles at a smaller angle are shaded as one smooth surface."""
+SIDES = 7
+"""Corners of a whisker's cross-section."""
+ROUND = 64
+"""Corners of a circle of an object."""
+_DETAILED = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The surface of one object."""
+
+    corners: NDArray[np.float64]
+    """[F, 3, 3] m, in the frame that ``motion`` moves; in the world without."""
+    normals: NDArray[np.float64]
+    """[F, 3, 3] unit vectors."""
+    motion: RigidMotion | None
+    """How the object moves from there; None when it stands still."""
+
+    def at(self, time: float, color: ArrayLike) -> Triangles:
+        """Return the triangles at ``time`` (s) in one colour (red, green, blue)."""
+        colors = np.broadcast_to(np.asarray(color, dtype=float), (len(self.corners), 3))
+        if self.motion is None:
+            return Triangles(self.corners, self.normals, colors)
+        positions, quaternions = self.motion(np.array([time]))
+        turn = rotation_matrix(quaternions)[0]
+        return Triangles(self.corners @ turn.T + positions[0], self.normals @ turn.T, colors)
+
+
+def object_surface(item: PlacedObject) -> Surface:
+    """Return the surface of an object: its mesh, or what whiskers touch when it has none."""
+    from brainbench.stimuli.objects.placed_object import euler_matrix
+
+    obstacle = item.obstacle()
+    if item.solid.mesh is None and obstacle.surface is not None:
+        meshes = [Mesh(obstacle.surface.vertices, obstacle.surface.faces.astype(np.int64))]
+    elif item.solid.mesh is None:
+        meshes = [part_mesh(part) for part in obstacle.parts]
+    else:
+        place = (0.0, 0.0, 0.0) if isinstance(item.motion, (Spin, Path)) else item.position
+        meshes = [item.solid.mesh.transformed(euler_matrix(item.rotation), place)]
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    normals = np.concatenate([corner_normals(mesh) for mesh in meshes])
+    return Surface(corners, normals, obstacle.motion)
+
+
+def part_mesh(part: Part) -> Mesh:
+    """Return the surface of one convex part; round shapes have :data:`ROUND` corners a turn."""
+    from trimesh import creation
+
+    match part:
+        case Sphere():
+            solid = creation.icosphere(subdivisions=4, radius=part.radius)
+            solid.apply_translation(part.centre)
+        case Box():
+            place = np.eye(4)
+            place[:3, :3], place[:3, 3] = rotation_matrix(part.quaternion), part.centre
+            solid = creation.box(2 * np.array(part.half_sizes), transform=place)
+        case Cylinder():
+            solid = creation.cylinder(part.radius, sections=ROUND, segment=[part.start, part.end])
+        case Capsule():
+            bend = np.linspace(0, np.pi / 2, ROUND // 4 + 1)
+            cap = np.column_stack([np.cos(bend), np.sin(bend)])
+            # At radius 1 and scaled afterwards: trimesh merges points by an absolute tolerance.
+            length = math.dist(part.start, part.end) / part.radius
+            profile = np.concatenate([cap[::-1] * [1, -1], cap + np.array([0.0, length])])
+            profile[[0, -1], 0] = 0
+            solid = creation.revolve(profile, sections=ROUND)
+            solid.apply_transform(_upright(part))
+        case ConvexPart():
+            return Mesh(part.vertices, np.array([[0, 1, 2]])).hull()
+    return Mesh(solid.vertices, solid.faces)
+
+
+def _upright(part: Capsule) -> NDArray[np.float64]:
+    """Return the transform [4, 4] from units of the radius that lays z on a capsule's axis, the origin on its start."""
+    start, end = np.array(part.start), np.array(part.end)
+    along = (end - start) / np.linalg.norm(end - start)
+    side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    side /= np.linalg.norm(side)
+    place = np.eye(4)
+    place[:3] = np.column_stack([part.radius * side, part.radius * np.cross(along, side), part.radius * along, start])
+    return place
+
+
+def corner_normals(mesh: Mesh) -> NDArray[np.float64]:
+    """Return unit normals [F, 3, 3] at the corners: area-weighted means over the smooth neighbours of each triangle.
+
+    Meshes of more than 200,000 triangles are shaded flat: their triangles are smaller than pixels.
+    """
+    corners = mesh.vertices[mesh.faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
+    if len(mesh.faces) > _DETAILED:
+        return np.repeat(unit[:, None], 3, axis=1)
+    vertex = mesh.faces.reshape(-1)
+    order = np.argsort(vertex, kind="stable")
+    counts = np.bincount(vertex, minlength=len(mesh.vertices))
+    begins = np.cumsum(counts) - counts
+    # Every corner paired with every triangle that shares its vertex.
+    corner = np.repeat(np.arange(len(vertex)), counts[vertex])
+    within = np.arange(len(corner)) - np.repeat(np.cumsum(counts[vertex]) - counts[vertex], counts[vertex])
+    neighbour = order[begins[vertex[corner]] + within] // 3
+    smooth = np.sum(unit[corner // 3] * unit[neighbour], axis=1) > CREASE
+    total = np.stack([np.bincount(corner[smooth], area[neighbour[smooth], i], len(vertex)) for i in range(3)], axis=-1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    own = np.repeat(unit, 3, axis=0)
+    return np.where(length > 0, total / np.maximum(length, 1e-300), own).reshape(-1, 3, 3)
+
+
+def tube(line: NDArray[np.float64], radii: NDArray[np.float64], colors: NDArray[np.float64]) -> Triangles:
+    """Return a closed tube around a curve.
+
+    Args:
+        line: [n, 3] points of the centre line (m, world).
+        radii: [n] m.
+        colors: [n, 3] from 0 to 1.
+    """
+    along = np.gradient(line, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+    across = _transported(along)
+    angle = 2 * np.pi * np.arange(SIDES) / SIDES
+    spokes = np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * np.cross(along, across)[:, None]
+    rings = line[:, None] + radii[:, None, None] * spokes
+    # A hemisphere would be invisible at these sizes: the ends are closed by a point.
+    caps = np.stack([line[0] - radii[0] * along[0], line[-1] + radii[-1] * along[-1]])
+    rings = np.concatenate([np.broadcast_to(caps[0], (1, SIDES, 3)), rings, np.broadcast_to(caps[1], (1, SIDES, 3))])
+    normals = np.concatenate([spokes[:1], spokes, spokes[-1:]])
+    shades = np.tile(np.repeat(np.concatenate([colors, colors[-1:]]), SIDES, axis=0), (2, 1))
+    return Triangles(_strips(rings), _strips(normals), shades)
+
+
+def ball(centre: ArrayLike, radius: float, color: ArrayLike) -> Triangles:
+    """Return a small ball (m, world)."""
+    from trimesh import creation
+
+    unit = creation.icosphere(subdivisions=2)
+    normals = np.asarray(unit.vertices)[np.asarray(unit.faces)]
+    return Triangles(
+        radius * normals + np.asarray(centre), normals, np.broadcast_to(np.asarray(color), (len(normals), 3))
+    )
+
+
+def smoothed(values: NDArray[np.float64], per_link: int) -> NDArray[np.float64]:
+    """Return values [n, k] along a smooth curve from those at the joints [N + 1, k] of a chain.
+
+    A quadratic B-spline: it begins and ends with the chain, and touches each inner link at its middle, where
+    a link lies on a round object. A curve through the joints would bulge into the object there.
+    """
+    from scipy.interpolate import BSpline
+
+    degree = min(2, len(values) - 1)
+    last = len(values) - degree
+    knots = np.concatenate([np.zeros(degree), np.arange(last + 1), np.full(degree, last)])
+    return BSpline(knots, values, degree)(np.linspace(0, last, (len(values) - 1) * per_link + 1))
+
+
+def _transported(along: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit vectors [n, 3] across a curve that turn about it as little as possible."""
+    across = np.empty_like(along)
+    vector = np.eye(3)[np.argmin(np.abs(along[0]))]
+    for index, tangent in enumerate(along):
+        vector = vector - (vector @ tangent) * tangent
+        vector = vector / np.linalg.norm(vector)
+        across[index] = vector
+    return across
+
+
+def _strips(rings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the corner values [F, 3, 3] of the triangles between successive rings [n, k, 3]."""
+    following = np.roll(rings, -1, axis=1)
+    a, b, c, d = rings[:-1], following[:-1], following[1:], rings[1:]
+    return np.concatenate([np.stack(item, axis=2).reshape(-1, 3, 3) for item in ((a, b, c), (a, c, d))])

@@ -1,0 +1,218 @@
+"""Force and moment traces on the 5 × 7 layout of the whiskers, one small panel each, all to one scale."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.stimuli.figures.canvas import INK, PALE, check_format, new_figure, round_up, save_figure
+from brainbench.stimuli.whiskers.selection import ROWS
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+FORMATS = (".png", ".svg", ".pdf")
+QUANTITIES = {
+    **{channel: (channel,) for channel in CHANNELS},
+    "Fxyz": CHANNELS[:3],
+    "Mxyz": CHANNELS[3:],
+    "F": CHANNELS[:3],
+    "M": CHANNELS[3:],
+}
+"""What can be plotted: one channel, the three components together, or (``F``, ``M``) their magnitude."""
+LINE_COLORS = ("#d1495b", "#2a9d6f", "#3466ac")
+CONTACT_COLOR = "#f3d9a4"
+_UNITS = {"F": ("mN", 1e3), "M": ("µN·m", 1e6)}
+
+
+def plot(
+    dataset: xr.Dataset,
+    out: str | os.PathLike[str],
+    *,
+    channel: str = "Fxyz",
+    stimulus: str | None = None,
+    window: tuple[float, float] | None = None,
+    size: tuple[int, int] = (1600, 960),
+) -> tuple[Path, ...]:
+    """Draw the traces of every whisker.
+
+    All panels of all pictures share one scale, so that stimuli can be compared; where a whisker touches,
+    the panel is shaded. Whiskers that became unstable say so.
+
+    Args:
+        dataset: a stimulus set with whiskers of one side.
+        out: file to write (``.png``, ``.svg``, ``.pdf``). A set of several stimuli makes one file each,
+            with the stimulus's label after a hyphen.
+        channel: one of :data:`QUANTITIES`.
+        stimulus: draw only this one.
+        window: first and last time to show [s].
+        size: width and height in pixels.
+
+    Returns:
+        The files written.
+
+    Raises:
+        UsageError: a name or format is unknown, two whiskers share a cell, or the window is empty.
+        MissingDependencyError: matplotlib is not installed.
+    """
+    check_stimulus_set(dataset)
+    path = Path(out)
+    check_format(path, FORMATS)
+    check_channel(channel)
+    cells = list(zip(dataset["row"].values.tolist(), dataset["col"].values.tolist(), strict=True))
+    if len(set(cells)) < len(cells):
+        raise UsageError("The stimulus set has two whiskers in one cell; select one side (or one animal) first.")
+    labels = [str(label) for label in dataset["stimulus"].values]
+    if stimulus is not None and stimulus not in labels:
+        raise unknown_name("stimulus", stimulus, labels)
+    dataset = _within(dataset, window)
+    limit = _limit(dataset, channel)
+    chosen = labels if stimulus is None else [stimulus]
+    several = len(chosen) > 1
+    return tuple(
+        save_figure(
+            _figure(dataset.isel(stimulus=labels.index(label)), label, channel, limit, size),
+            path.with_name(f"{path.stem}-{_file_part(label)}{path.suffix}") if several else path,
+        )
+        for label in chosen
+    )
+
+
+def check_channel(channel: str) -> None:
+    """Raise a :class:`UsageError` unless ``channel`` is one of :data:`QUANTITIES`."""
+    if channel not in QUANTITIES:
+        raise unknown_name("channel", channel, QUANTITIES)
+
+
+def _within(dataset: xr.Dataset, window: tuple[float, float] | None) -> xr.Dataset:
+    if window is None:
+        return dataset
+    times = dataset["time"].values
+    inside = (times >= window[0]) & (times <= window[1])
+    if inside.sum() < 2:
+        raise UsageError(
+            f"The window {window[0]:g}–{window[1]:g} s holds fewer than two frames; "
+            f"the stimuli last from {times[0]:g} to {times[-1]:g} s."
+        )
+    return dataset.isel(time=np.flatnonzero(inside))
+
+
+def _values(dataset: xr.Dataset, channel: str) -> NDArray[np.float64]:
+    """Return what is drawn [..., whisker, line] in the unit of the scale."""
+    picked = [CHANNELS.index(name) for name in QUANTITIES[channel]]
+    values = dataset["wrench"].values[..., picked].astype(float) * _UNITS[channel[0]][1]
+    return np.linalg.norm(values, axis=-1, keepdims=True) if channel in _UNITS else values
+
+
+def _limit(dataset: xr.Dataset, channel: str) -> float:
+    values = np.abs(_values(dataset, channel))
+    largest = float(np.nanmax(values, initial=0.0))
+    return round_up(largest) if largest else 1.0
+
+
+def _figure(stimulus: xr.Dataset, label: str, channel: str, limit: float, size: tuple[int, int]) -> Figure:
+    figure = new_figure(*size)
+    rows, cols = GRID_SHAPE
+    unit = size[0] / 1600
+    points = 0.72 * unit
+    left, right, top, bottom = 0.055, 0.99, 0.885, 0.075
+    panels: Any = figure.subplots(
+        rows,
+        cols,
+        sharex=True,
+        sharey=True,
+        gridspec_kw={"left": left, "right": right, "top": top, "bottom": bottom, "wspace": 0.08, "hspace": 0.16},
+    )
+    cells = {
+        (int(row), int(col)): index
+        for index, (row, col) in enumerate(zip(stimulus["row"].values, stimulus["col"].values, strict=True))
+    }
+    values = _values(stimulus, channel)
+    for row in range(rows):
+        for col in range(cols):
+            panel = panels[row, col]
+            if (row, col) not in cells:
+                panel.axis("off")
+                continue
+            _panel(
+                panel, stimulus.isel(whisker=cells[row, col]), values[:, cells[row, col]], f"{ROWS[row]}{col}", points
+            )
+            # Only panels at an edge of the layout carry numbers.
+            panel.tick_params(labelleft=(row, col - 1) not in cells, labelbottom=(row + 1, col) not in cells)
+    times = stimulus["time"].values * 1e3
+    lower = 0.0 if channel in _UNITS else -limit
+    panels[0, 0].set(xlim=(times[0], times[-1]), ylim=(lower - 0.04 * limit, 1.04 * limit))
+    panels[0, 0].set_yticks([lower, 0, limit] if lower else [0, limit / 2, limit])
+    panels[0, 0].locator_params(axis="x", nbins=4)
+    # The attribute begins with the axes, "world axes; …" or "follicle axes; …".
+    axes = str(stimulus.attrs.get("frame", "world")).split()[0]
+    _legend(figure, label, channel, axes, points)
+    return figure
+
+
+def _panel(panel: Axes, whisker: xr.Dataset, values: NDArray[np.float64], name: str, points: float) -> None:
+    times = whisker["time"].values * 1e3
+    if "contact" in whisker:
+        touching = whisker["contact"].values
+        panel.fill_between(
+            times, 0, 1, where=touching, step="mid", transform=panel.get_xaxis_transform(), color=CONTACT_COLOR, lw=0
+        )
+    panel.axhline(0, color=PALE, linewidth=0.8 * points)
+    colors = LINE_COLORS if values.shape[1] > 1 else (INK,)
+    for line, color in zip(values.T, colors, strict=True):
+        panel.plot(times, line, color=color, linewidth=1.9 * points)
+    panel.text(
+        0.03, 0.95, name, transform=panel.transAxes, fontsize=17 * points, fontweight="bold", color=INK, va="top"
+    )
+    if "status" in whisker and str(whisker["status"].values) != "ok":
+        where = {"transform": panel.transAxes, "va": "top", "ha": "right"}
+        panel.text(0.97, 0.95, "unstable", fontsize=14 * points, color="#b00020", **where)
+    panel.tick_params(labelsize=13 * points, length=4 * points, colors=INK)
+    for side in ("top", "right"):
+        panel.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        panel.spines[side].set(color=PALE, linewidth=0.8 * points)
+
+
+def _legend(figure: Figure, label: str, channel: str, axes: str, points: float) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    kind = "force" if channel[0] == "F" else "moment"
+    unit = _UNITS[channel[0]][0]
+    what = f"|{channel}|" if channel in _UNITS else ", ".join(QUANTITIES[channel])
+    figure.text(0.02, 0.965, label, fontsize=26 * points, fontweight="bold", color=INK, va="center")
+    figure.text(
+        0.02,
+        0.92,
+        f"{kind} of the whisker on its base, {what} ({unit}), {axes} axes",
+        fontsize=16 * points,
+        color=PALE,
+        va="center",
+    )
+    figure.text(0.52, 0.018, "time (ms)", fontsize=16 * points, color=INK, ha="center", va="center")
+    figure.text(0.014, 0.48, f"{kind} ({unit})", fontsize=16 * points, color=INK, rotation=90, va="center", ha="center")
+    colors = LINE_COLORS if channel.endswith("xyz") else (INK,)
+    names: Sequence[str] = QUANTITIES[channel] if channel.endswith("xyz") else (what,)
+    handles: list[Any] = [
+        Line2D([], [], color=color, linewidth=3 * points, label=name) for name, color in zip(names, colors, strict=True)
+    ]
+    handles.append(Patch(color=CONTACT_COLOR, label="contact"))
+    figure.legend(
+        handles=handles, loc="upper right", bbox_to_anchor=(0.99, 0.99), ncols=4, fontsize=16 * points, frameon=False
+    )
+
+
+def _file_part(label: str) -> str:
+    """Return a label as part of a file's name."""
+    return re.sub(r"[^\w.+-]+", "_", label)

@@ -1,0 +1,1 @@
+"""How whiskers, heads and objects move: trajectories, recorded whisking, hinge angles."""

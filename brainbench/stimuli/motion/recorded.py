@@ -1,0 +1,301 @@
+"""Recorded whisking: angular velocities of whisker bases, integrated as rotations and played on an array.
+
+Files as WHISKiT Physics reads them: one line per whisker, comma separated, three numbers (ωx, ωy, ωz) per
+sample, rad/s in the axes of the array (head), 1000 samples per second. Such a file carries no names; its
+*layout* says which line is which whisker.
+
+Whiskers are matched by side and name, never by line number. (The released mouse simulation plays a rat's file by
+line number, which moves the mouse's E0–E5 as the rat's E1–E6.) A whisker of the array that the file lacks moves
+as the nearest whisker of its row: E0 of the mouse as E1 of a rat file. Lines without counterpart, such as B5,
+are not used.
+
+The published sample (62 lines, 8 Hz, 45° peak to peak) was itself made with a table of fewer whiskers, so that some of
+its lines were computed for another whisker than they stand for; E3–E6 even for whiskers of the left side,
+and played on the right side they protract by up to 70°. It is played as it is.
+
+Letters: W whisker, n sample.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
+from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.motion.hinge_angles import follow_angles
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.whiskers.array import MountedWhisker
+
+_LOG = logging.getLogger(__name__)
+
+Vector = tuple[float, float, float]
+
+_TAIL = 0.01
+"""How long [s] the last velocity is held beyond the end, for the last steps of a simulation."""
+_NODES = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
+
+
+def _layout(**columns: range) -> tuple[str, ...]:
+    names = [f"{row}{col}" for row, cols in columns.items() for col in cols]
+    return tuple(side + name for side in "RL" for name in names)
+
+
+LAYOUTS = {
+    "whiskit-62": _layout(A=range(5), B=range(6), C=range(7), D=range(7), E=range(1, 7)),
+    "rat-60": _layout(A=range(5), B=range(5), C=range(7), D=range(7), E=range(1, 7)),
+    "mouse-60": _layout(A=range(5), B=range(5), C=range(7), D=range(7), E=range(6)),
+}
+"""Order of the lines, right side then left: ``whiskit-62`` is the older array of 31 whiskers a side (with
+B5) of the published sample; the average arrays have 30, the mouse E0–E5 and the rat E1–E6."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Angular velocities of whisker bases, evenly sampled from t = 0.
+
+    Raises:
+        DataError: shapes do not fit, a number is not finite, or a name appears twice.
+    """
+
+    names: tuple[str, ...]
+    """[W] side and name, such as ``RC2``."""
+    velocity: NDArray[np.float64]
+    """[W, n, 3] angular velocity in the axes of the array [rad/s]; sample k is the velocity at t = k/rate."""
+    rate: float = 1000.0
+    """Samples per second [Hz]."""
+
+    def __post_init__(self) -> None:
+        velocity = np.array(self.velocity, dtype=float)
+        if (
+            velocity.ndim != 3
+            or velocity.shape[0] != len(self.names)
+            or velocity.shape[2] != 3
+            or velocity.shape[1] < 2
+        ):
+            raise DataError(
+                f"A trajectory of {len(self.names)} whiskers needs velocities [{len(self.names)}, n, 3] with at least "
+                f"two samples; received an array of shape {velocity.shape}."
+            )
+        if not np.isfinite(velocity).all():
+            raise DataError("A trajectory has velocities that are not finite numbers.")
+        if len(set(self.names)) < len(self.names):
+            raise DataError("A trajectory names a whisker twice.")
+        if not (math.isfinite(self.rate) and self.rate > 0):
+            raise UsageError(f"The rate of a trajectory must be positive (Hz); received {self.rate!r}.")
+        velocity.setflags(write=False)
+        object.__setattr__(self, "velocity", velocity)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the end of the last [s]."""
+        return self.velocity.shape[1] / self.rate
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Hash of names, velocities and rate."""
+        from brainbench.core.files import content_hash
+
+        return content_hash(list(self.names), self.velocity, self.rate)
+
+    def rotation(self, name: str, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the base of ``name`` has turned since t = 0: rotation matrices [m, 3, 3].
+
+        The velocity between samples is a cubic spline, and Q′ = [ω]Q is integrated by the exponential map with
+        the fourth-order Magnus expansion, one step per sample. So Q is a rotation to rounding, however long the
+        recording, and continuous between the samples.
+
+        Raises:
+            UsageError: there is no such whisker, or a time lies outside the recording.
+        """
+        from scipy.spatial.transform import Rotation
+
+        if name not in self.names:
+            raise unknown_name("whisker of the trajectory", name, self.names)
+        times = np.asarray(times, dtype=float)
+        if times.size and (times.min() < 0 or times.max() > self.duration + _TAIL):
+            raise UsageError(
+                f"The recorded trajectory lasts {self.duration:g} s; the scene needs it at "
+                f"{times.max() if times.min() >= 0 else times.min():g} s: read fewer frames or play a longer recording."
+            )
+        which = self.names.index(name)
+        begin = np.clip(np.floor(times * self.rate), 0, self.velocity.shape[1] - 1)
+        before = Rotation.from_quat(self._knots[begin.astype(int), which])
+        start = begin / self.rate
+        return (Rotation.from_rotvec(self._turn(start, times - start, which)) * before).as_matrix()
+
+    @cached_property
+    def _splines(self) -> tuple[Any, ...]:
+        from scipy.interpolate import CubicSpline
+
+        samples = np.arange(self.velocity.shape[1]) / self.rate
+        return tuple(CubicSpline(samples, velocity) for velocity in self.velocity)
+
+    @cached_property
+    def _knots(self) -> NDArray[np.float64]:
+        """[n, W, 4] rotation up to each sample (scipy's x, y, z, w)."""
+        from scipy.spatial.transform import Rotation
+
+        steps = self.velocity.shape[1] - 1
+        begin, step = np.arange(steps) / self.rate, np.full(steps, 1 / self.rate)
+        turns = np.stack([self._turn(begin, step, which) for which in range(len(self.names))], axis=1)
+        current = Rotation.identity(len(self.names))
+        knots = np.empty((steps + 1, len(self.names), 4))
+        knots[0] = current.as_quat()
+        for k in range(steps):
+            current = Rotation.from_rotvec(turns[k]) * current
+            knots[k + 1] = current.as_quat()
+        return knots
+
+    def _turn(self, start: NDArray[np.float64], step: NDArray[np.float64], which: int) -> NDArray[np.float64]:
+        """Rotation vectors [m, 3] from ``start`` [m] over ``step`` [m] (s): h (ω₁ + ω₂)/2 − √3/12 h² ω₁ × ω₂."""
+        end = (self.velocity.shape[1] - 1) / self.rate
+        first, second = (self._splines[which](np.minimum(start + node * step, end)) for node in _NODES)
+        h = step[:, None]
+        return h / 2 * (first + second) - math.sqrt(3) / 12 * h**2 * np.cross(first, second)
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Whisking as recorded: each whisker turns from its starting orientation as its line of the file says."""
+
+    trajectory: Trajectory
+    start: float = 0.0
+    """Azimuth in front of rest from which play starts [rad], with elevation and torsion coupled by ``rotations``;
+    negative behind rest. Unused for whiskers in ``initial``."""
+    rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
+    initial: Mapping[str, Vector] = field(default_factory=dict)
+    """Starting angles (θ, φ, ζ) [rad] by side and name (``RC2``), as :func:`load_initial_angles` reads them."""
+
+    def line(self, mount: MountedWhisker) -> str:
+        """Return the name of the line that moves ``mount``; see the module for the rule.
+
+        Raises:
+            UsageError: the trajectory has no whisker of this row and side.
+        """
+        name = _full_name(mount)
+        if name in self.trajectory.names:
+            return name
+        row = [other for other in self.trajectory.names if other[:2] == name[:2]]
+        if not row:
+            raise UsageError(
+                f"The recorded trajectory has no whisker of row {name[1]} on the {mount.side} side, which {name} needs;"
+                f" it has {listing(self.trajectory.names)}."
+            )
+        chosen = min(row, key=lambda other: abs(int(other[2:]) - mount.col))
+        _LOG.info("the recording lacks %s, which moves as %s", name, chosen)
+        return chosen
+
+    def initial_angles(self, mount: MountedWhisker) -> NDArray[np.float64]:
+        """Return (θ, φ, ζ) [3] (rad) at t = 0."""
+        if (given := self.initial.get(_full_name(mount))) is not None:
+            return np.array(given, dtype=float)
+        return np.array(mount.angles) + self.start * np.array(self.rotations.rates(mount))
+
+    def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return continuous (θ, φ, ζ) [n, 3] (rad) of one whisker.
+
+        Raises:
+            UsageError: a time lies outside the recording, no line moves the whisker, or it turns towards the
+                vertical, where these angles lose their meaning.
+        """
+        first = self.initial_angles(mount)
+        base, line = base_rotation(first), self.line(mount)
+        return follow_angles(lambda t: self.trajectory.rotation(line, t) @ base, times, first, _full_name(mount))
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display; the recording counts by its hash."""
+        from brainbench.core.files import to_plain
+
+        return {
+            "kind": "recorded",
+            "trajectory": self.trajectory.content_hash,
+            "duration": self.trajectory.duration,
+            "start": self.start,
+            "rotations": to_plain(self.rotations),
+            "initial": to_plain(self.initial),
+        }
+
+
+def load_trajectory(path: str | os.PathLike[str], *, layout: str | None = None, rate: float = 1000.0) -> Trajectory:
+    """Read a trajectory file.
+
+    Args:
+        path: comma-separated angular velocities, one line per whisker.
+        layout: one of :data:`LAYOUTS`; None takes ``whiskit-62`` for 62 lines.
+        rate: samples per second [Hz].
+
+    Raises:
+        UsageError: the layout is unknown, or must be given because the lines could be a rat's or a mouse's.
+        DataError: the file is missing, or its lines are not whiskers of equally many velocities.
+    """
+    table = _read_table(path)
+    if table.shape[1] % 3:
+        raise DataError(
+            f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; velocities come in threes (ωx, ωy, ωz)."
+        )
+    names = _names(path, len(table), layout)
+    return Trajectory(names, table.reshape(len(table), -1, 3), rate)
+
+
+def load_initial_angles(path: str | os.PathLike[str], *, layout: str | None = None) -> dict[str, Vector]:
+    """Read starting angles (θ, φ, ζ) [rad] by whisker (``RC2``), as in WHISKiT's ``whisking_init_angle.csv``.
+
+    Raises:
+        UsageError, DataError: as :func:`load_trajectory`.
+    """
+    table = _read_table(path)
+    if table.shape[1] != 3:
+        raise DataError(
+            f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; starting angles are three (θ, φ, ζ)."
+        )
+    names = _names(path, len(table), layout)
+    return {name: (float(a), float(b), float(c)) for name, (a, b, c) in zip(names, table, strict=True)}
+
+
+def _full_name(mount: MountedWhisker) -> str:
+    return mount.side[0].upper() + mount.name
+
+
+def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tuple[str, ...]:
+    fitting = [name for name, names in LAYOUTS.items() if len(names) == lines]
+    if layout is None:
+        if len(fitting) != 1:
+            known = ", ".join(f"{name} ({len(names)})" for name, names in LAYOUTS.items())
+            raise UsageError(
+                f"{os.fspath(path)!r} has {lines} lines, which does not tell whose whiskers they are; "
+                f"say it with layout=… (lines): {known}."
+            )
+        return LAYOUTS[fitting[0]]
+    if layout not in LAYOUTS:
+        raise unknown_name("layout of whisker lines", layout, LAYOUTS)
+    if layout not in fitting:
+        raise DataError(f"{os.fspath(path)!r} has {lines} lines; the layout {layout!r} has {len(LAYOUTS[layout])}.")
+    return LAYOUTS[layout]
+
+
+def _read_table(path: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """Numbers [line, column] of a comma-separated file."""
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
+    try:
+        lines = Path(path).read_text(encoding="utf-8").split("\n")
+        rows = [[float(cell) for cell in line.rstrip(",\r ").split(",")] for line in lines if line.strip()]
+        table = np.array(rows, dtype=float)
+    except (UnicodeDecodeError, ValueError) as error:
+        raise DataError(f"{os.fspath(path)!r} is not a table of comma-separated numbers ({error}).") from error
+    if table.ndim != 2 or not len(table):
+        raise DataError(f"{os.fspath(path)!r} holds no table of numbers.")
+    return table

@@ -1,0 +1,307 @@
+"""How whiskers and objects move: whisking after Knutsen, translation, turning, keyframes, rest. In rad and s."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.motion.recorded import Recorded
+    from brainbench.stimuli.whiskers.array import MountedWhisker
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """How elevation φ and torsion ζ follow azimuth θ in each row: dφ/dθ and dζ/dθ for rows A to E."""
+
+    name: str
+    elevation: tuple[float, float, float, float, float]
+    torsion: tuple[float, float, float, float, float]
+
+    def rates(self, mount: MountedWhisker) -> Vector:
+        """Return the change of (θ, φ, ζ) per radian of protraction; the left side mirrors the right."""
+        mirror = 1.0 if mount.side == "right" else -1.0
+        return mirror, self.elevation[mount.row], mirror * self.torsion[mount.row]
+
+
+ROTATIONS = {
+    "knutsen": Rotations("knutsen", (0.398, 0.591, 0.578, 0.393, 0.217), (-0.900, -0.284, 0.243, 0.449, 0.744)),
+    "knutsen-b": Rotations("knutsen-b", (0.12, 0.30, 0.30, 0.14, 0.02), (-0.76, -0.25, 0.22, 0.43, 0.73)),
+}
+"""Published coefficients for the couplings that Knutsen, Biess & Ahissar (2008, Neuron 59, 35–42)
+measured in rats: ``knutsen`` as WHISKiT uses them (Zweifel et al. 2021), ``knutsen-b`` a second
+published fit."""
+
+
+@dataclass(frozen=True)
+class Still:
+    """Nothing moves."""
+
+    def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return zeros [n]."""
+        return np.zeros(len(times))
+
+    def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rest angles (θ, φ, ζ) [n, 3] of one whisker."""
+        return np.tile(np.array(mount.angles), (len(times), 1))
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return zeros [n, 3]."""
+        return np.zeros((len(times), 3))
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        return {"kind": "still"}
+
+
+@dataclass(frozen=True)
+class Whisking:
+    """Sinusoidal whisking of the whole array about its rest pose.
+
+    With the azimuth a(t) = (protraction + retraction)/2 · cos(2πft + π) + (protraction − retraction)/2
+    each whisker has θ = θ₀ + a, φ = φ₀ + a·dφ, ζ = ζ₀ + a·dζ with its row's coefficients (the form of
+    Knutsen et al. 2008); the left side mirrors the right. The sinusoid starts retracted, at a = −retraction.
+    During ``onset`` the part that leaves this pose grows from nothing as 6u⁵ − 15u⁴ + 10u³, so position,
+    velocity and acceleration start without a jump.
+
+    Raises:
+        UsageError: a value is not finite or negative, or protraction and retraction cancel.
+    """
+
+    frequency: float = 20.0
+    """Whisks per second [Hz]."""
+    protraction: float = math.radians(30)
+    """Largest azimuth forward of rest [rad]."""
+    retraction: float = math.radians(10)
+    """Largest azimuth backward of rest [rad]."""
+    onset: float = 0.05
+    """Duration of the smooth start [s]."""
+    rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
+
+    def __post_init__(self) -> None:
+        _require("whisking frequency (Hz)", self.frequency, positive=True)
+        _require("whisking onset (s)", self.onset)
+        for name in ("protraction", "retraction"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or abs(value) > math.pi / 2:
+                raise UsageError(f"The {name} of whisking must lie within ±90° (given in rad); received {value!r}.")
+        if self.protraction + self.retraction <= 0:
+            raise UsageError(
+                "Whisking needs a protraction in front of its retraction (their sum is the peak-to-peak amplitude); "
+                f"received {self.protraction!r} and {self.retraction!r} rad."
+            )
+
+    def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a(t) [n] (rad), the azimuth relative to rest, positive forward on both sides."""
+        times = np.asarray(times, dtype=float)
+        stroke = (self.protraction + self.retraction) / 2 * (1 - np.cos(2 * np.pi * self.frequency * times))
+        return smooth_step(times, self.onset) * stroke - self.retraction
+
+    def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (θ, φ, ζ) [n, 3] (rad) of one whisker."""
+        azimuth = self.azimuth(times)[:, None]
+        return np.array(mount.angles) + azimuth * np.array(self.rotations.rates(mount))
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        from brainbench.core.files import to_plain
+
+        return {"kind": "whisking", **to_plain(self)}
+
+
+@dataclass(frozen=True)
+class Translation:
+    """Straight motion that reaches its velocity smoothly.
+
+    The speed grows as 6u⁵ − 15u⁴ + 10u³ during ``onset`` and then stays.
+    """
+
+    velocity: Vector
+    """Final velocity [m/s, world]."""
+    onset: float = 0.01
+    """Duration of the smooth start [s]; 0 moves at full speed from the first instant."""
+
+    def __post_init__(self) -> None:
+        if len(self.velocity) != 3 or not all(math.isfinite(value) for value in self.velocity):
+            raise UsageError(f"A velocity is three finite numbers in m/s; received {self.velocity!r}.")
+        _require("translation onset (s)", self.onset)
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far it has moved since t = 0, [n, 3] (m, world)."""
+        return _smooth_path(times, self.onset)[:, None] * np.array(self.velocity)
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        return {"kind": "translation", "velocity": list(self.velocity), "onset": self.onset}
+
+
+@dataclass(frozen=True)
+class Spin:
+    """Turning about an axis through the body's origin that reaches its speed smoothly, as :class:`Translation` does."""
+
+    velocity: Vector
+    """Final angular velocity [rad/s, world], along the axis by the right-hand rule."""
+    onset: float = 0.01
+    """Duration of the smooth start [s]; 0 turns at full speed from the first instant."""
+
+    def __post_init__(self) -> None:
+        if len(self.velocity) != 3 or not all(math.isfinite(value) for value in self.velocity):
+            raise UsageError(f"An angular velocity is three finite numbers in rad/s; received {self.velocity!r}.")
+        _require("spin onset (s)", self.onset)
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return zeros [n, 3]: the origin stays."""
+        return np.zeros((len(times), 3))
+
+    def turn(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the body has turned since t = 0, rotation matrices [n, 3, 3] in world axes."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_rotvec(_smooth_path(times, self.onset)[:, None] * np.array(self.velocity)).as_matrix()
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        return {"kind": "spin", "velocity": list(self.velocity), "onset": self.onset}
+
+
+@dataclass(frozen=True)
+class Path:
+    """Motion of a body through keyframes: translation and rotation, such as those of a tracked head.
+
+    Positions follow a natural cubic spline and orientations a rotation spline, so velocity and acceleration are
+    continuous, angular ones too. The body moves off with the velocity of the first stretch; repeat the first
+    keyframe to start from rest.
+
+    Raises:
+        UsageError: the lists differ in length, times do not ascend from 0, or the first keyframe is displaced.
+    """
+
+    times: tuple[float, ...]
+    """When [s], ascending from 0, at least two."""
+    displacements: tuple[Vector, ...]
+    """How far the body's origin has moved since t = 0 [m, world]."""
+    rotations: tuple[Vector, ...]
+    """How far the body has turned about its origin since t = 0: angles [rad] about the world's x, then y, then z."""
+
+    def __post_init__(self) -> None:
+        for name in ("displacements", "rotations"):
+            rows = tuple(tuple(map(float, row)) for row in getattr(self, name))
+            if len(rows) != len(self.times) or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in rows):
+                raise UsageError(
+                    f"A path needs three finite numbers of {name} for each of its {len(self.times)} times."
+                )
+            if any(rows[0]):
+                raise UsageError(f"A path starts without {name}: they count from t = 0; received {rows[0]}.")
+            object.__setattr__(self, name, rows)
+        times = np.array(self.times, dtype=float)
+        if len(times) < 2 or times[0] != 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise UsageError(f"The times of a path ascend from 0 and are at least two; received {self.times!r}.")
+        object.__setattr__(self, "times", tuple(times.tolist()))
+
+    def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the origin has moved, [n, 3] (m, world).
+
+        Raises:
+            UsageError: a time lies beyond the last keyframe.
+        """
+        from scipy.interpolate import CubicSpline
+
+        return CubicSpline(self.times, self.displacements, bc_type="natural")(self._within(times))
+
+    def turn(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the body has turned, rotation matrices [n, 3, 3] in world axes.
+
+        Raises:
+            UsageError: a time lies beyond the last keyframe.
+        """
+        from scipy.spatial.transform import Rotation, RotationSpline
+
+        spline = RotationSpline(self.times, Rotation.from_euler("xyz", self.rotations))
+        return spline(self._within(times)).as_matrix()
+
+    def config(self) -> dict[str, Any]:
+        """Plain values for hashing and display."""
+        from brainbench.core.files import to_plain
+
+        return {"kind": "path", **to_plain(self)}
+
+    def _within(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        times = np.asarray(times, dtype=float)
+        # A simulation ends a step or two behind its last reading.
+        if times.size and times.max() > self.times[-1] + 0.01:
+            raise UsageError(
+                f"The path ends at {self.times[-1]:g} s; the scene needs it at {times.max():g} s: add keyframes or "
+                "read fewer frames."
+            )
+        return times
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayFollicle:
+    """Trajectory of one whisker base in the frame in which its array stood at t = 0."""
+
+    mount: MountedWhisker
+    whisking: Still | Whisking | Recorded = field(default_factory=Still)
+    travel: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    """Displacement of the head [n, 3] (m) at times [n]; None when it stands still."""
+    turn: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    """Rotation of the head [n, 3, 3] about the origin of the array at times [n]; None when it does not turn."""
+
+    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions [n, 3] (m) and Euler angles (θ, φ, ζ) [n, 3] (rad).
+
+        Raises:
+            UsageError: the head turns a whisker upright, where these angles lose their meaning.
+        """
+        times = np.asarray(times, dtype=float)
+        position = np.tile(np.array(self.mount.position), (len(times), 1))
+        angles = self.whisking.angles(self.mount, times)
+        if self.turn is not None:
+            position = self.turn(times) @ np.array(self.mount.position)
+            angles = self._turned(self.turn, times)
+        if self.travel is not None:
+            position = position + self.travel(times)
+        return position, angles
+
+    def _turned(
+        self, turn: Callable[[NDArray[np.float64]], NDArray[np.float64]], times: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        from brainbench.stimuli.engines.protocol import base_rotation
+        from brainbench.stimuli.motion.hinge_angles import follow_angles
+
+        first = self.whisking.angles(self.mount, np.zeros(1))[0]
+        return follow_angles(
+            lambda t: turn(t) @ base_rotation(self.whisking.angles(self.mount, t)), times, first, self.mount.name
+        )
+
+
+def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float64]:
+    """Return 6u⁵ − 15u⁴ + 10u³ with u = t/duration within 0 … 1; ones when ``duration`` is 0."""
+    if duration == 0:
+        return np.ones_like(np.asarray(times, dtype=float))
+    u = np.clip(np.asarray(times, dtype=float) / duration, 0.0, 1.0)
+    return u**3 * (u * (6 * u - 15) + 10)
+
+
+def _smooth_path(times: NDArray[np.float64], onset: float) -> NDArray[np.float64]:
+    """Return the integral [n] (s) of a speed that grows from 0 to 1 during ``onset`` (s) as :func:`smooth_step`."""
+    times = np.asarray(times, dtype=float)
+    if onset == 0:
+        return np.maximum(times, 0.0)
+    u = np.clip(times / onset, 0.0, 1.0)
+    return onset * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(times - onset, 0.0)
+
+
+def _require(what: str, value: float, *, positive: bool = False) -> None:
+    if not math.isfinite(value) or value < 0 or (positive and value == 0):
+        raise UsageError(f"The {what} must be {'positive' if positive else 'zero or more'}; received {value!r}.")

@@ -1,0 +1,1 @@
+"""What whiskers meet: primitives, procedural families, mesh files and collections of them."""

@@ -1,0 +1,172 @@
+"""Named, labelled objects that are built when they are needed: what ``--objects`` of a sweep names."""
+
+from __future__ import annotations
+
+import functools
+import glob
+import math
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from brainbench.core.errors import DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.files import file_hash
+from brainbench.geometry import Mesh
+from brainbench.stimuli.objects.placed_object import Solid, mesh_solid, shape_solid
+from brainbench.stimuli.objects.procedural import DETAIL, describe_family, list_families, make
+from brainbench.stimuli.objects.solid import to_surface
+
+PROCEDURAL_24 = (
+    "arch", "basket", "bolt", "bottle", "bowl", "brick", "chair", "cone", "cross", "cylinder", "dumbbell", "ellipsoid",
+    "gear", "hammer", "horseshoe", "house", "jack", "mug", "mushroom", "pyramid", "spring", "stairs", "table", "torus",
+)  # fmt: skip
+"""The 24 families of the collection ``procedural-24``: everyday and elementary shapes that differ at first touch."""
+
+COLLECTIONS: dict[str, Callable[[], tuple[str, ...]]] = {
+    "procedural-24": lambda: PROCEDURAL_24,
+    "procedural": list_families,
+}
+"""Named collections of shape families; ``procedural-24:40`` is 40 members of each of its 24 families."""
+
+DIAGONAL = 0.04
+"""Size [m] at which objects are built; each sweep scales them to its own."""
+
+
+SURFACE = "surface"
+"""Stands for ``surfaces`` where shape families are built; other kinds of objects have their default then."""
+
+
+@dataclass(frozen=True)
+class NamedObject:
+    """One object of a collection; it can be sent to another process and is built there."""
+
+    name: str
+    label: str
+    """Class label."""
+    source: str
+    """What it is made from: equal sources make equal objects."""
+    load: Callable[[], Solid]
+
+
+def resolve_objects(
+    texts: Iterable[str], *, unit: str | None = None, collision: str | None = None, surfaces: bool = False
+) -> dict[str, NamedObject]:
+    """Return, by name, the objects that some words name. Nothing is built and no mesh is read.
+
+    Args:
+        texts: each one of: a shape family (``torus``), a member of it (``torus-3``) or its first members
+            (``torus:20``, seeds 0 to 19); a collection (``procedural-24:40``: so many members of each family, of
+            2,000 to 20,000 triangles); ``shapenet:FOLDER`` or ``shapenet:FOLDER:100`` (the first 100 models of a
+            ShapeNet tree); a mesh file, or a pattern of mesh files (``meshes/*.obj``). A file's class is its
+            folder's name when its pattern spans several folders, otherwise its own name.
+        unit: length unit of mesh files.
+        collision: what whiskers touch, one of :data:`brainbench.stimuli.objects.placed_object.COLLISIONS`; None
+        takes what each
+            kind of object has by default.
+        surfaces: build shape families as their exact surface alone, without convex parts, which takes tens of
+            milliseconds instead of a second; for engines that collide meshes. Not with ``collision``.
+
+    Raises:
+        UsageError: a word names nothing, two objects have the same name, or mesh files have no unit.
+        DataError: a ShapeNet folder holds no models.
+    """
+    found: dict[str, NamedObject] = {}
+    collision = SURFACE if surfaces and collision is None else collision
+    for text in texts:
+        for item in _resolve(text, unit, collision):
+            if item.name in found:
+                raise UsageError(f"Several objects have the same name, {item.name!r}; name each object once.")
+            found[item.name] = item
+    if not found:
+        raise UsageError("There is no object; name a family (torus), a collection (procedural-24:40) or a mesh file.")
+    return found
+
+
+def _resolve(text: str, unit: str | None, collision: str | None) -> Iterator[NamedObject]:
+    of_meshes = "hull" if collision in (None, SURFACE) else collision
+    if text.startswith("shapenet:"):
+        yield from _shapenet(text.removeprefix("shapenet:"), of_meshes)
+        return
+    if Path(text).is_file() or glob.has_magic(text):
+        yield from _files(text, unit, of_meshes)
+        return
+    name, _, number = text.partition(":")
+    if number and not (number.isdigit() and int(number) > 0):
+        raise UsageError(f"The number of members in {text!r} is a whole number above zero, as in {name}:20.")
+    count = int(number or 1)
+    if name in COLLECTIONS:
+        for family in COLLECTIONS[name]():
+            yield from (_member(family, seed, _detail(family, seed), collision) for seed in range(count))
+        return
+    family, seed = (hit[1], int(hit[2])) if (hit := re.fullmatch(r"(.+)-(\d+)", name)) else (name, None)
+    if family not in list_families():
+        hint = "Or a mesh file, a pattern of files in quotes, or shapenet:FOLDER."
+        raise unknown_name("object", name, [*list_families(), *COLLECTIONS], hint=hint)
+    if seed is not None and number:
+        raise UsageError(
+            f"{text!r} names one member and a number of members; write {family}-{seed} or {family}:{count}."
+        )
+    for chosen in range(count) if seed is None else (seed,):
+        yield _member(family, chosen, 4_000, collision)
+
+
+def _member(family: str, seed: int, detail: int, collision: str | None) -> NamedObject:
+    describe_family(family)
+    source = f"shape {family} {seed}, {detail} triangles, {collision or 'default'}"
+    return NamedObject(f"{family}-{seed}", family, source, functools.partial(_make, family, seed, detail, collision))
+
+
+def _make(family: str, seed: int, detail: int, collision: str | None) -> Solid:
+    shape = make(family, seed, detail=detail)
+    if collision != SURFACE:
+        return shape_solid(shape, diagonal=DIAGONAL, collision=collision)
+    mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, f"{family}-{seed}")
+    return Solid(mesh.name, (), mesh, (), {"mesh": mesh.content_hash}, to_surface(mesh)).to_diagonal(DIAGONAL)
+
+
+def _detail(family: str, seed: int) -> int:
+    """Triangles of a member: drawn evenly on a logarithmic scale within the range that shapes allow."""
+    generator = np.random.default_rng([zlib.crc32(b"detail"), zlib.crc32(family.encode()), seed])
+    low, high = DETAIL
+    return int(math.exp(generator.uniform(math.log(low), math.log(high))))
+
+
+def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObject]:
+    paths = [path for path in _match(Path(pattern)) if path.is_file()]
+    if not paths:
+        raise DataFileNotFoundError(f"No mesh file matches {pattern!r}.")
+    if unit is None:
+        raise UsageError(f"The length unit of {pattern!r} is not in the file; say it with --unit (m, cm, mm, …).")
+    several = len({path.parent for path in paths}) > 1
+    for path in paths:
+        label = path.parent.name if several else path.stem
+        source = f"mesh {file_hash(path)} in {unit}, {collision}"
+        load = functools.partial(_load, path.absolute(), unit, collision)
+        yield NamedObject(f"{label}/{path.stem}" if several else path.stem, label, source, load)
+
+
+def _match(pattern: Path) -> list[Path]:
+    """Return what a pattern matches, in alphabetical order; ``**`` stands for any number of folders."""
+    if pattern.is_file():
+        return [pattern]
+    return sorted(Path(pattern.anchor or ".").glob(str(pattern.relative_to(pattern.anchor))))
+
+
+def _load(path: Path, unit: str, collision: str) -> Solid:
+    return mesh_solid(path, unit=unit, collision=collision)
+
+
+def _shapenet(text: str, collision: str) -> Iterator[NamedObject]:
+    from brainbench.stimuli.objects.shapenet import load_shapenet
+
+    folder, _, number = text.rpartition(":") if re.search(r":\d+$", text) else (text, "", "")
+    models = load_shapenet(Path(folder).absolute()).models
+    if number and int(number) > len(models):
+        raise UsageError(f"{folder!r} has {len(models)} models, fewer than the {number} asked for.")
+    for model in models[: int(number) if number else None]:
+        load = functools.partial(model.solid, diagonal=DIAGONAL, collision=collision)
+        yield NamedObject(model.name, model.label, f"shapenet {model.name}, {collision}", load)

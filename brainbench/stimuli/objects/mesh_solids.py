@@ -1,0 +1,180 @@
+"""Solids from mesh files and procedural shapes. Metres."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.files import content_hash
+from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
+from brainbench.stimuli.objects.obstacle import ConvexPart
+from brainbench.stimuli.objects.solid import Solid, to_surface
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from brainbench.stimuli.objects.procedural import Shape
+
+_LOG = logging.getLogger(__name__)
+
+COLLISIONS = ("exact", "hull", "pieces", "decomposition")
+"""What whiskers touch of a mesh. ``exact``: the surface itself; a concave one without known convex parts can be
+touched by the backend ``rod`` only, because ``mujoco`` and ``bullet`` collide convex bodies. ``hull``: the convex
+hull. ``pieces``: the hull of each connected piece, for files that bring a convex decomposition along.
+``decomposition``: convex pieces cut by CoACD or V-HACD."""
+
+
+def mesh_solid(
+    path: str | os.PathLike[str],
+    *,
+    unit: str,
+    diagonal: float | None = None,
+    collision: str = "hull",
+    decomposition: DecompositionSettings | None = None,
+) -> Solid:
+    """Return a mesh file as a solid, repaired where that needs no guessing (see :func:`brainbench.geometry.repair`).
+
+    Args:
+        path: any format :func:`brainbench.geometry.load_mesh` reads.
+        unit: length unit of the file (``m``, ``mm``, …).
+        diagonal: scale to this bounding-box diagonal [m]; None keeps the size.
+        collision: what whiskers touch, one of :data:`COLLISIONS`.
+        decomposition: how ``decomposition`` cuts; its defaults when None.
+
+    Raises:
+        UsageError: ``collision`` or the unit is unknown, or ``exact`` is asked of a mesh that is not closed.
+        DataError: the file is missing, unreadable or flat, or the decomposition passed its limits.
+        MissingDependencyError: the decomposition needs a package that is not installed.
+    """
+    _check_collision(collision)
+    repaired = repair(load_mesh(path, unit=unit))
+    solid = touchable(repaired.mesh, collision, decomposition)
+    # Separate bodies are what "pieces" is for.
+    expected = collision == "pieces" and repaired.mesh.diagnosis.watertight
+    solid = replace(solid, notes=(*repaired.done, *solid.notes, *(() if expected else repaired.remaining)))
+    for note in solid.notes:
+        _LOG.warning("%s: %s", os.fspath(path), note)
+    return solid if diagonal is None else solid.to_diagonal(diagonal)
+
+
+def shape_solid(
+    shape: Shape,
+    *,
+    diagonal: float = 0.04,
+    collision: str | None = None,
+    decomposition: DecompositionSettings | None = None,
+) -> Solid:
+    """Return a procedural shape (:func:`brainbench.stimuli.objects.procedural.make`) as a solid.
+
+    Args:
+        shape: any member of a family.
+        diagonal: bounding-box diagonal [m]; the thesis used 40 mm.
+        collision: one of :data:`COLLISIONS`; None takes the convex parts that the family knows (``exact``), or
+            the ``hull`` where it knows none, and a note says which.
+        decomposition: how ``decomposition`` cuts; its defaults when None.
+
+    Raises:
+        UsageError: ``collision`` is unknown.
+        DataError: the decomposition passed its limits.
+        MissingDependencyError: the decomposition needs a package that is not installed.
+    """
+    if collision is None:
+        collision = "exact" if shape.part_points else "hull"
+    _check_collision(collision)
+    name = f"{shape.label}-{shape.seed}"
+    mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, name)
+    if collision != "exact" or not shape.part_points:
+        return touchable(mesh, collision, decomposition).to_diagonal(diagonal)
+    notes: tuple[str, ...] = ()
+    if len(shape.parts) > 1:
+        found = deviation(mesh, shape.parts, samples=1000)
+        notes = (
+            f"whiskers touch {len(shape.parts)} convex parts of the shape, which stand out from its mesh by at most"
+            f" {found.outward:.2%} and fall short of it by at most {found.inward:.2%} of its diagonal (sampled)",
+        )
+    parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
+    origin = {"mesh": mesh.content_hash, "parts": content_hash([*shape.part_points])}
+    return Solid(name, parts, mesh, notes, origin, to_surface(mesh)).to_diagonal(diagonal)
+
+
+def shape_solids(
+    families: Iterable[str] | None = None,
+    *,
+    members: int = 1,
+    diagonal: float = 0.04,
+    detail: int = 4_000,
+    collision: str | None = None,
+) -> dict[str, Callable[[], Solid]]:
+    """Return, by name (``torus-0``), functions that make procedural solids when they are needed, as sweeps take them.
+
+    Args:
+        families: names from :func:`brainbench.stimuli.objects.procedural.list_families`; all of them when None.
+        members: shapes of each family, with the seeds 0, 1, ….
+        diagonal, collision: as for :func:`shape_solid`.
+        detail: as for :func:`brainbench.stimuli.objects.procedural.make`.
+
+    Raises:
+        UsageError: a family is unknown, or there is less than one member.
+    """
+    from brainbench.stimuli.objects import procedural
+
+    if members < 1:
+        raise UsageError(f"A family needs at least one member; received {members!r}.")
+    chosen = procedural.list_families() if families is None else tuple(families)
+    for family in chosen:
+        procedural.describe_family(family)
+
+    def load(family: str, seed: int) -> Solid:
+        return shape_solid(procedural.make(family, seed, detail=detail), diagonal=diagonal, collision=collision)
+
+    return {f"{family}-{seed}": functools.partial(load, family, seed) for family in chosen for seed in range(members)}
+
+
+def _check_collision(collision: str) -> None:
+    if collision not in COLLISIONS:
+        raise unknown_name("collision geometry", collision, COLLISIONS)
+
+
+def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
+    """Return a mesh as a solid that is touched as ``collision`` says; see :func:`mesh_solid`."""
+    if collision == "decomposition":
+        cut = decompose(mesh, settings)
+        origin = {"mesh": mesh.content_hash, "decomposition": cut.key}
+        return Solid(mesh.name, tuple(ConvexPart(piece.vertices) for piece in cut.pieces), mesh, cut.notes, origin)
+    if collision == "exact":
+        return _exact(mesh)
+    pieces = mesh.pieces() if collision == "pieces" else (mesh,)
+    hulls = [piece.hull() for piece in pieces]
+    notes: tuple[str, ...] = ()
+    if any(_is_concave(piece, hull) for piece, hull in zip(pieces, hulls, strict=True)):
+        what = "the mesh" if collision == "hull" else "its pieces"
+        notes = (f"whiskers touch the convex hull of {what}: concavities are filled",)
+    surface = to_surface(hulls[0]) if collision == "hull" else None
+    return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, notes, surface=surface)
+
+
+def _exact(mesh: Mesh) -> Solid:
+    """Make a solid that is touched at its surface, and at its hull by other engines if it is convex."""
+    if not mesh.diagnosis.watertight:
+        raise UsageError(
+            f"The mesh {mesh.name!r} is not closed ({mesh.diagnosis}), so it has no inside to keep whiskers out of; use"
+            " collision = 'hull' (its concavities filled), or close it."
+        )
+    # The parts of a convex mesh do not tell a shallow dent, which the surface has.
+    origin, hull = {"mesh": mesh.content_hash, "collision": "exact"}, mesh.hull()
+    if not _is_concave(mesh, hull):
+        return Solid(mesh.name, (ConvexPart(hull.vertices),), mesh, (), origin, to_surface(mesh))
+    notes = (
+        f"whiskers touch the {len(mesh.faces)} triangles of this concave mesh themselves: that takes the backend 'rod'",
+    )
+    return Solid(mesh.name, (), mesh, notes, origin, to_surface(mesh))
+
+
+def _is_concave(mesh: Mesh, hull: Mesh) -> bool:
+    if not mesh.diagnosis.watertight:
+        return True
+    return mesh.volume < 0.999 * hull.volume

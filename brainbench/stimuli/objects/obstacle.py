@@ -1,0 +1,238 @@
+"""Rigid bodies that whiskers may touch: convex parts or closed meshes. Lengths in metres, quaternions (w, x, y, z)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+    """Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexPart:
+    """The convex hull of ``vertices`` [m, 3]: at least four points that do not lie in one plane."""
+
+    vertices: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        points = np.array(self.vertices, dtype=float)
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4 or not np.isfinite(points).all():
+            raise UsageError(
+                f"A convex part needs at least four finite vertices [m, 3]; received an array of shape {points.shape}."
+            )
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if spread[2] < 1e-6 * spread[0]:
+            raise UsageError("The vertices of a convex part lie in one plane; a part needs volume to be touched.")
+        points.setflags(write=False)
+        object.__setattr__(self, "vertices", points)
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A closed surface of any shape, concavities included: vertices [m, 3] (m) and faces [k, 3], outward by the
+    right-hand rule.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        points, faces = np.array(self.vertices, dtype=float), np.array(self.faces, dtype=np.int32)
+        if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 4 or not np.isfinite(points).all():
+            raise UsageError(f"A triangle mesh needs at least four finite vertices [m, 3]; got shape {points.shape}.")
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or len(faces) < 4:
+            raise UsageError(f"A closed triangle mesh needs at least four faces [k, 3]; got shape {faces.shape}.")
+        if faces.min() < 0 or faces.max() >= len(points):
+            raise UsageError(f"The faces of a triangle mesh must name its {len(points)} vertices, counted from 0.")
+        points.setflags(write=False)
+        faces.setflags(write=False)
+        object.__setattr__(self, "vertices", points)
+        object.__setattr__(self, "faces", faces)
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @cached_property
+    def boxes(self) -> NDArray[np.float64]:
+        """Axis-aligned boxes [k, 2, 3] of at most 64 patches of neighbouring triangles: together they hold all of it.
+
+        They follow a concave surface much closer than its bounds do.
+        """
+        corners = self.vertices[self.faces]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        middle = (low + high) / 2
+        patches = [np.arange(len(corners))]
+        while len(patches) < 64 and len(patches[0]) > 1:
+            patches = [half for patch in patches for half in _halves(patch, middle[patch]) if len(half)]
+        return np.array([[low[patch].min(axis=0), high[patch].max(axis=0)] for patch in patches])
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> TriangleMesh:
+        """Return the surface rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        return TriangleMesh(self.vertices @ rotation.T + translation, self.faces)
+
+    def scaled(self, factor: float) -> TriangleMesh:
+        """Return the surface scaled about the origin."""
+        return TriangleMesh(self.vertices * factor, self.faces)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball."""
+
+    centre: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check_size("sphere", radius=self.radius)
+        _check_vector("sphere", centre=self.centre)
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        return np.add(self.centre, [[-self.radius] * 3, [self.radius] * 3])
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All points within ``radius`` of the segment from ``start`` to ``end``."""
+
+    start: Vector
+    end: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check_size("capsule", radius=self.radius)
+        _check_segment("capsule", self.start, self.end)
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        ends = np.array([self.start, self.end])
+        return np.stack([ends.min(axis=0) - self.radius, ends.max(axis=0) + self.radius])
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A flat-ended cylinder around the segment from ``start`` to ``end``."""
+
+    start: Vector
+    end: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check_size("cylinder", radius=self.radius)
+        _check_segment("cylinder", self.start, self.end)
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        ends = np.array([self.start, self.end])
+        axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        reach = self.radius * np.sqrt(np.clip(1 - axis**2, 0, 1))
+        return np.stack([ends.min(axis=0) - reach, ends.max(axis=0) + reach])
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of half edge lengths ``half_sizes`` turned by ``quaternion`` about its centre."""
+
+    centre: Vector
+    half_sizes: Vector
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _check_vector("box", centre=self.centre, half_sizes=self.half_sizes)
+        for size in self.half_sizes:
+            _check_size("box", half_sizes=size)
+        length = math.sqrt(sum(value**2 for value in self.quaternion))
+        if len(self.quaternion) != 4 or not math.isclose(length, 1, abs_tol=1e-6):
+            raise UsageError(f"The quaternion of a box must have length 1; {self.quaternion} has length {length:g}.")
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        reach = np.abs(rotation_matrix(self.quaternion)) @ np.array(self.half_sizes)
+        return np.stack([np.array(self.centre) - reach, np.array(self.centre) + reach])
+
+
+Part = ConvexPart | Sphere | Capsule | Cylinder | Box
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A rigid body made of parts that a whisker may touch.
+
+    Whiskers do not move it: it stands still or follows ``motion`` exactly.
+    """
+
+    parts: tuple[Part, ...]
+    """Geometry in the obstacle frame [m]; the world frame when ``motion`` is None."""
+    motion: RigidMotion | None = None
+    """Times [n] (s) → position [n, 3] (m) and quaternion [n, 4]; None for an obstacle that stands still."""
+    friction: float | None = None
+    """Coulomb coefficient of the contact; None takes the whisker's own."""
+    surface: TriangleMesh | None = None
+    """The exact surface of the body. Engines that collide meshes (``rod``) touch it instead of ``parts``; those that
+    collide convex bodies only (``mujoco``, ``bullet``) touch ``parts`` and refuse a surface without parts."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", tuple(self.parts))
+        for part in self.parts:
+            if not isinstance(part, Part):
+                raise UsageError(
+                    "An obstacle is made of ConvexPart, Sphere, Capsule, Cylinder and Box; "
+                    f"received {type(part).__name__}."
+                )
+        if not self.parts and self.surface is None:
+            raise UsageError("An obstacle needs at least one part or a surface.")
+        if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
+            raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
+
+
+def rotation_matrix(quaternion: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4] (w, x, y, z)."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _halves(patch: NDArray[np.int64], middle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Split a patch of triangles where its longest side is halved by number."""
+    order = np.argsort(middle[:, np.ptp(middle, axis=0).argmax()], kind="stable")
+    return patch[order[: len(order) // 2]], patch[order[len(order) // 2 :]]
+
+
+def _check_size(shape: str, **sizes: float) -> None:
+    for name, value in sizes.items():
+        if not (math.isfinite(value) and value > 0):
+            raise UsageError(f"{name} of a {shape} must be positive (m); received {value!r}.")
+
+
+def _check_vector(shape: str, **vectors: Vector) -> None:
+    for name, value in vectors.items():
+        if len(value) != 3 or not all(math.isfinite(item) for item in value):
+            raise UsageError(f"{name} of a {shape} must be three finite numbers (m); received {value!r}.")
+
+
+def _check_segment(shape: str, start: Vector, end: Vector) -> None:
+    _check_vector(shape, start=start, end=end)
+    if tuple(start) == tuple(end):
+        raise UsageError(f"start and end of a {shape} are the same point {tuple(start)}; use a Sphere.")

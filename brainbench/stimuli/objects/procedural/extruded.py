@@ -1,0 +1,121 @@
+"""Families made by extruding an outline: stars, gears, letters, arrows and the like."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from brainbench.stimuli.objects.procedural.bodies import Body, Draw, block, prism
+
+
+def _polar(radii: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+
+
+def star(draw: Draw, detail: int) -> Body:
+    """Star of four to seven points, thick as a block or tapered."""
+    points, depth = draw.whole("points", 4, 7), draw("notch", 0.4, 0.58)
+    thick, top = draw("thickness", 0.25, 0.6), draw("taper", 0.6, 1.0)
+    angles = np.pi * np.arange(2 * points) / points
+    return prism(_polar(np.where(np.arange(2 * points) % 2, depth, 1.0), angles), thick, top=top)
+
+
+def gear(draw: Draw, detail: int) -> Body:
+    """Spur gear without a bore."""
+    teeth, tooth = draw.whole("teeth", 8, 14), draw("tooth", 0.15, 0.28)
+    thick, width = draw("thickness", 0.25, 0.6), draw("tooth_width", 0.42, 0.58)
+    start = 2 * np.pi * np.arange(teeth)[:, None] / teeth
+    share = np.array([-0.5 * width - 0.12, -0.5 * width, 0.5 * width, 0.5 * width + 0.12])
+    angles = (start + 2 * np.pi / teeth * share).ravel()
+    return prism(_polar(np.tile([1 - tooth, 1.0, 1.0, 1 - tooth], teeth), angles), thick)
+
+
+def flower(draw: Draw, detail: int) -> Body:
+    """Thick disc with a wavy rim of petals."""
+    petals, depth, thick = draw.whole("petals", 4, 8), draw("depth", 0.14, 0.26), draw("thickness", 0.25, 0.6)
+    count = 12 * petals
+    angles = 2 * np.pi * np.arange(count) / count
+    return prism(_polar(1 + depth * np.cos(petals * angles), angles), thick)
+
+
+def cross(draw: Draw, detail: int) -> Body:
+    """Flat cross of two bars."""
+    width, thick = draw("width", 0.2, 0.45), draw("thickness", 0.2, 0.5)
+    shift, arm = draw("shift", 0.0, 0.25), draw("arm", 0.65, 1.0)
+    return block(width, 2.0, thick) + block(2.0 * arm, width, thick).moved(y=shift)
+
+
+def arrow(draw: Draw, detail: int) -> Body:
+    """Arrow with a broad head."""
+    head, width = draw("head", 0.5, 0.9), draw("head_width", 0.45, 0.75)
+    shaft, thick, sweep = draw("shaft_width", 0.12, 0.24), draw("thickness", 0.2, 0.45), draw("sweep", 0.0, 0.2)
+    outline = [(-1, -shaft), (1 - head, -shaft), (1 - head - sweep, -width), (1, 0)]
+    return prism([*outline, (1 - head - sweep, width), (1 - head, shaft), (-1, shaft)], thick)
+
+
+def crescent(draw: Draw, detail: int) -> Body:
+    """Moon-shaped slab."""
+    bite, thick, opening = draw("bite", 0.35, 0.7), draw("thickness", 0.3, 0.7), draw("opening", 0.55, 0.75)
+    angles = np.linspace(-opening * np.pi, opening * np.pi, 49)
+    outer = _polar(np.ones(49), angles + np.pi)
+    tip = outer[[0, -1]]
+    # The inner edge is an arc through both tips, pushed towards the outer one.
+    share = np.linspace(1, -1, 49)[1:-1]
+    depth = tip[0, 0] - (2 - bite * 1.3 - (1 - tip[0, 0])) * (1 - share**2)
+    inner = np.column_stack([np.maximum(depth, -1 + 0.3 * bite), tip[0, 1] * -share])
+    outline = np.vstack([outer, inner[:: 1 if np.sign(inner[0, 1]) == np.sign(outer[-1, 1]) else -1]])
+    return prism(outline, thick)
+
+
+def heart(draw: Draw, detail: int) -> Body:
+    """Heart-shaped slab."""
+    wide, thick = draw("width", 0.85, 1.2), draw("thickness", 0.3, 0.7)
+    tip = draw("tip", 0.9, 1.25)
+    t = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    y = (13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t)) / 16
+    return prism(np.column_stack([wide * np.sin(t) ** 3, np.where(y < 0, tip * y, y)])[::-1], thick)
+
+
+_LETTERS = {
+    "E": [(0, 0, 0.25, 1), (0, 0, 0.7, 0.2), (0, 0.4, 0.6, 0.2), (0, 0.8, 0.7, 0.2)],
+    "F": [(0, 0, 0.25, 1), (0, 0.4, 0.6, 0.2), (0, 0.8, 0.7, 0.2)],
+    "H": [(0, 0, 0.22, 1), (0.5, 0, 0.22, 1), (0, 0.4, 0.72, 0.2)],
+    "L": [(0, 0, 0.25, 1), (0, 0, 0.7, 0.22)],
+    "T": [(0, 0.78, 0.8, 0.22), (0.28, 0, 0.24, 1)],
+    "U": [(0, 0, 0.22, 1), (0.5, 0, 0.22, 1), (0, 0, 0.72, 0.22)],
+}
+"""Bars (x, y, width, height) of block letters."""
+
+
+def letter(draw: Draw, detail: int) -> Body:
+    """Block letter E, F, H, L, T or U."""
+    bars = _LETTERS[draw.choice("letter", sorted(_LETTERS))]
+    wide, thick = draw("width", 0.8, 1.2), draw("thickness", 0.2, 0.4)
+    blocks = [block(w, h, thick).moved(x + w / 2, y + h / 2) for x, y, w, h in bars]
+    return functools.reduce(Body.__add__, blocks).stretched(x=wide)
+
+
+def twist(draw: Draw, detail: int) -> Body:
+    """Bar of three to five sides, twisted about its axis."""
+    sides, turn = draw.whole("sides", 3, 5), draw("turn", 90.0, 240.0)
+    height, top = draw("height", 1.8, 3.0), draw("taper", 0.6, 1.0)
+    angles = 2 * np.pi * np.arange(sides) / sides
+    corners = _polar(np.full(sides, 0.6), angles)
+    share = np.arange(8)[:, None] / 8
+    # Sides cut into eighths follow the twisted surface instead of folding it along diagonals.
+    outline = np.concatenate(
+        [(1 - share) * a + share * b for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
+    )
+    return prism(outline, height, top=top, twist=turn, slices=39)
+
+
+def polygon(draw: Draw, detail: int) -> Body:
+    """Upright prism of three to eight sides."""
+    sides, height = draw.whole("sides", 3, 8), draw("height", 0.8, 2.2)
+    return prism(_polar(np.ones(sides), 2 * np.pi * np.arange(sides) / sides), height)
+
+
+FAMILIES = {
+    family.__name__: family for family in (star, gear, flower, cross, arrow, crescent, heart, letter, twist, polygon)
+}

@@ -1,0 +1,141 @@
+"""Families made on the lathe: vases, bottles, cups, spools and the like. Each upright along z."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brainbench.stimuli.objects.procedural.bodies import Body, Draw, around, lathe, rod, tube
+
+
+def _outline(heights: list[float], radii: list[float], count: int) -> np.ndarray:
+    """Smooth outline [count, 2] (radius, height) through control points, without overshoot."""
+    from scipy.interpolate import PchipInterpolator
+
+    z = np.linspace(heights[0], heights[-1], count)
+    return np.column_stack([PchipInterpolator(heights, radii)(z), z])
+
+
+def _rings(detail: int) -> int:
+    return max(8, detail // (5 * around(detail)))
+
+
+def vase(draw: Draw, detail: int) -> Body:
+    """Hollow vase with a belly, a neck and a flared lip."""
+    belly, neck = draw("belly", 0.32, 0.5), draw("neck", 0.12, 0.2)
+    lip, low = draw("lip", 0.22, 0.34), draw("belly_height", 0.3, 0.5)
+    height = draw("height", 1.2, 1.6)
+    line = _outline([0, low * height, 0.8 * height, height], [0.2, belly, neck, lip], _rings(detail))
+    return lathe(line, around(detail), wall=0.05, floor=line[1, 1])
+
+
+def bottle(draw: Draw, detail: int) -> Body:
+    """Cylindrical bottle with a shoulder and a narrow neck."""
+    radius, neck = draw("radius", 0.22, 0.32), draw("neck", 0.07, 0.11)
+    shoulder, height = draw("shoulder", 0.5, 0.68), draw("height", 1.3, 1.7)
+    z = [0, 0.04, shoulder * height, (shoulder + 0.2) * height, 0.94 * height, height]
+    return lathe(
+        _outline(z, [0.9 * radius, radius, radius, neck, neck, 1.2 * neck], 2 * _rings(detail)), around(detail)
+    )
+
+
+def cup(draw: Draw, detail: int) -> Body:
+    """Hollow tumbler that widens upwards, without a handle."""
+    low, high, height = draw("base", 0.22, 0.32), draw("rim", 0.34, 0.46), draw("height", 0.7, 1.0)
+    z = np.linspace(0, height, max(4, _rings(detail) // 2))
+    return lathe(np.column_stack([low + (high - low) * z / height, z]), around(detail), wall=0.05, floor=z[1])
+
+
+def mug(draw: Draw, detail: int) -> Body:
+    """Cylindrical cup with a handle."""
+    radius, height = draw("radius", 0.26, 0.42), draw("height", 0.6, 1.0)
+    reach, thick = draw("handle_reach", 0.2, 0.3), draw("handle_thickness", 0.04, 0.06)
+    z = np.linspace(0, height, 8)
+    body = lathe(np.column_stack([np.full(8, radius), z]), around(detail), wall=0.05, floor=z[1])
+    angle = np.linspace(-np.pi / 2, np.pi / 2, max(12, around(detail) // 2))
+    # The ends of the handle sink into the wall but do not come out inside.
+    x = radius - 0.03 + reach * np.cos(angle)
+    arc = np.column_stack([x, np.zeros_like(x), height / 2 + 0.34 * height * np.sin(angle)])
+    return body + tube(arc, thick * 0.99, 12, closed=False)
+
+
+def bowl(draw: Draw, detail: int) -> Body:
+    """Wide hollow bowl on a small foot."""
+    rim, height, foot = draw("rim", 0.5, 0.65), draw("height", 0.25, 0.42), draw("foot", 0.15, 0.22)
+    count = _rings(detail)
+    share = np.linspace(0, 1, count)
+    line = np.column_stack([foot + (rim - foot) * np.sin(share * np.pi / 2) ** 0.8, height * (0.1 + 0.9 * share)])
+    line[0, 1] = 0
+    return lathe(line, around(detail), wall=0.06, floor=line[max(2, count // 6), 1])
+
+
+def goblet(draw: Draw, detail: int) -> Body:
+    """Wine glass: hollow cup on a thin stem with a disc foot."""
+    cup_radius, stem = draw("cup", 0.26, 0.36), draw("stem", 0.035, 0.06)
+    foot, split = draw("foot", 0.24, 0.32), draw("stem_share", 0.45, 0.58)
+    bottom = np.array([[foot, 0.0], [foot, 0.04], [0.4 * foot, 0.09], [stem, 0.16], [stem, split - 0.05]])
+    cup_line = _outline([split, split + 0.15, 1.0, 1.15], [0.1, 0.9 * cup_radius, cup_radius, 0.92 * cup_radius], 12)
+    line = np.vstack([bottom, cup_line])
+    return lathe(line, around(detail), wall=0.045, floor=cup_line[1, 1])
+
+
+def spool(draw: Draw, detail: int) -> Body:
+    """Two discs joined by a thick core."""
+    core, flange = draw("core", 0.15, 0.26), draw("flange", 0.4, 0.5)
+    thick, height = draw("flange_thickness", 0.08, 0.14), draw("height", 0.7, 1.1)
+    facets = around(detail)
+    disc = rod(flange, thick, facets)
+    shaft = rod(core, height, facets)
+    return shaft + disc.moved(z=(height - thick) / 2) + disc.moved(z=(thick - height) / 2)
+
+
+def hourglass(draw: Draw, detail: int) -> Body:
+    """Two bulbs that meet in a waist."""
+    waist, end = draw("waist", 0.06, 0.14), draw("end", 0.32, 0.46)
+    bulge, height = draw("bulge", 1.0, 1.12), draw("height", 1.0, 1.4)
+    z = [0, 0.2 * height, 0.5 * height, 0.8 * height, height]
+    return lathe(_outline(z, [end, end * bulge, waist, end * bulge, end], 2 * _rings(detail)), around(detail))
+
+
+def mushroom(draw: Draw, detail: int) -> Body:
+    """Domed cap on a stem."""
+    cap, stem = draw("cap", 0.38, 0.5), draw("stem", 0.1, 0.17)
+    length, dome = draw("stem_length", 0.4, 0.65), draw("dome", 0.28, 0.42)
+    angle = np.linspace(0, np.pi / 2, _rings(detail))
+    curve = np.column_stack([cap * np.cos(angle), length + dome * np.sin(angle)])
+    curve[-1, 0] = 0
+    facets = around(detail)
+    return lathe(curve, facets) + rod(1.15 * stem, length + 0.1, facets, top=stem).moved(z=length / 2 + 0.05)
+
+
+def dome(draw: Draw, detail: int) -> Body:
+    """Half an ellipsoid on its flat side."""
+    radius, height = draw("radius", 0.4, 0.55), draw("height", 0.3, 0.6)
+    angle = np.linspace(0, np.pi / 2, 2 * _rings(detail))
+    curve = np.column_stack([radius * np.cos(angle), height * np.sin(angle)])
+    curve[-1, 0] = 0
+    return lathe(curve, around(detail))
+
+
+def top(draw: Draw, detail: int) -> Body:
+    """Spinning top: a cone on its tip, a rim and a handle."""
+    rim, depth = draw("rim", 0.34, 0.58), draw("depth", 0.3, 0.65)
+    pin, length = draw("pin", 0.04, 0.08), draw("pin_length", 0.25, 0.4)
+    shoulder = draw("shoulder", 0.08, 0.2)
+    z = [0, depth, depth + 0.06, depth + 0.06 + shoulder, depth + 0.06 + shoulder + length]
+    points = list(zip([0.0, rim, rim, 1.4 * pin, pin], z, strict=True))
+    return lathe(np.array(points), around(detail))
+
+
+def bell(draw: Draw, detail: int) -> Body:
+    """Hollow bell, mouth up, with a flaring rim."""
+    rim, crown = draw("rim", 0.42, 0.52), draw("crown", 0.2, 0.28)
+    height, flare = draw("height", 0.7, 0.95), draw("flare", 0.55, 0.75)
+    waist = crown + 0.25 * (rim - crown)
+    line = _outline([0, 0.08, flare * height, height], [0.6 * crown, crown, waist, rim], _rings(detail))
+    return lathe(line, around(detail), wall=0.05, floor=line[2, 1])
+
+
+FAMILIES = {
+    family.__name__: family
+    for family in (vase, bottle, cup, mug, bowl, goblet, spool, hourglass, mushroom, dome, top, bell)
+}

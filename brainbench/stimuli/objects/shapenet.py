@@ -1,0 +1,267 @@
+"""Objects from a local ShapeNet tree: ``<synset>/<model>/models/model_normalized.obj`` under one folder.
+
+ShapeNet itself must be obtained from its makers (https://shapenet.org); nothing of it is shipped here. Its
+meshes carry no unit and many are open or inside out: each is repaired as far as possible when it is loaded,
+and scaled to the diagonal that is asked for. Without it, :mod:`brainbench.stimuli.objects.procedural` makes labelled
+shapes.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import logging
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
+from brainbench.core.files import read_json
+from brainbench.stimuli.objects.placed_object import Solid, mesh_solid
+
+if TYPE_CHECKING:
+    from brainbench.geometry import DecompositionSettings
+
+_LOG = logging.getLogger(__name__)
+
+MESHES = ("models/model_normalized.obj", "model.obj")
+"""Where a model's mesh lies below its folder: in ShapeNetCore version 2, and in version 1."""
+
+SYNSETS = {
+    "02691156": "airplane",
+    "02747177": "trash bin",
+    "02773838": "bag",
+    "02801938": "basket",
+    "02808440": "bathtub",
+    "02818832": "bed",
+    "02828884": "bench",
+    "02843684": "birdhouse",
+    "02871439": "bookshelf",
+    "02876657": "bottle",
+    "02880940": "bowl",
+    "02924116": "bus",
+    "02933112": "cabinet",
+    "02942699": "camera",
+    "02946921": "can",
+    "02954340": "cap",
+    "02958343": "car",
+    "02992529": "cellphone",
+    "03001627": "chair",
+    "03046257": "clock",
+    "03085013": "keyboard",
+    "03207941": "dishwasher",
+    "03211117": "display",
+    "03261776": "earphone",
+    "03325088": "faucet",
+    "03337140": "file cabinet",
+    "03467517": "guitar",
+    "03513137": "helmet",
+    "03593526": "jar",
+    "03624134": "knife",
+    "03636649": "lamp",
+    "03642806": "laptop",
+    "03691459": "loudspeaker",
+    "03710193": "mailbox",
+    "03759954": "microphone",
+    "03761084": "microwave",
+    "03790512": "motorbike",
+    "03797390": "mug",
+    "03928116": "piano",
+    "03938244": "pillow",
+    "03948459": "pistol",
+    "03991062": "flowerpot",
+    "04004475": "printer",
+    "04074963": "remote control",
+    "04090263": "rifle",
+    "04099429": "rocket",
+    "04225987": "skateboard",
+    "04256520": "sofa",
+    "04330267": "stove",
+    "04379243": "table",
+    "04401088": "telephone",
+    "04460130": "tower",
+    "04468005": "train",
+    "04530566": "watercraft",
+    "04554684": "washer",
+}
+"""The 55 categories of ShapeNetCore: WordNet 3.0 noun offset and what it means."""
+
+
+@dataclass(frozen=True)
+class ShapeNetModel:
+    """One model of the tree."""
+
+    name: str
+    """``synset/model``."""
+    label: str
+    """Class label from the category map."""
+    path: Path
+
+    def solid(
+        self,
+        *,
+        diagonal: float = 0.04,
+        collision: str = "hull",
+        decomposition: DecompositionSettings | None = None,
+    ) -> Solid:
+        """Load and repair the mesh; the arguments are those of
+        :func:`brainbench.stimuli.objects.placed_object.mesh_solid`.
+
+        Raises:
+            DataError: the mesh cannot be used, for the reason in the message.
+        """
+        # The unit cannot matter: the diagonal is set.
+        loaded = mesh_solid(self.path, unit="m", diagonal=diagonal, collision=collision, decomposition=decomposition)
+        return replace(loaded, name=self.name)
+
+
+@dataclass(frozen=True)
+class ShapeNet:
+    """The models that were asked for and found, and the names of those that were not."""
+
+    root: Path
+    models: tuple[ShapeNetModel, ...]
+    """In the order of the id list; sorted by name without one."""
+    missing: tuple[str, ...] = ()
+    """Names of the id list that the tree does not hold."""
+
+    def __iter__(self) -> Iterator[ShapeNetModel]:
+        """Iterate over the models."""
+        return iter(self.models)
+
+    def __len__(self) -> int:
+        """Count the models."""
+        return len(self.models)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The class labels that occur, sorted."""
+        return tuple(sorted({model.label for model in self.models}))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many models each label has."""
+        found = Counter(model.label for model in self.models)
+        return {label: found[label] for label in self.labels}
+
+    def solids(
+        self,
+        *,
+        diagonal: float = 0.04,
+        collision: str = "hull",
+        decomposition: DecompositionSettings | None = None,
+    ) -> dict[str, Callable[[], Solid]]:
+        """Return, by name, functions that load each model when it is needed, as sweeps take them."""
+        options = {"diagonal": diagonal, "collision": collision, "decomposition": decomposition}
+        return {model.name: functools.partial(model.solid, **options) for model in self.models}
+
+
+def load_shapenet(
+    root: str | os.PathLike[str],
+    *,
+    ids: str | os.PathLike[str] | Iterable[str] | None = None,
+    categories: str | os.PathLike[str] | Mapping[str, str] | None = None,
+) -> ShapeNet:
+    """Find models in a local tree; no mesh is read yet.
+
+    Args:
+        root: the folder of the synset folders.
+        ids: names ``synset/model`` or a file of them, one a line; every model of the tree when None. Names
+            that the tree lacks are listed in :attr:`ShapeNet.missing` and logged.
+        categories: class labels by ``synset/model`` (first choice) or by synset, or a file of them (see
+            :func:`read_categories`); :data:`SYNSETS` when None. Unlisted synsets are their own labels.
+
+    Raises:
+        UsageError: an id is not of the form ``synset/model``, or occurs twice.
+        DataError: the folder does not exist, or holds none of the models.
+    """
+    folder = Path(root)
+    if not folder.is_dir():
+        raise DataFileNotFoundError(f"There is no ShapeNet folder {os.fspath(root)!r}.")
+    if isinstance(ids, (str, os.PathLike)):
+        names = read_ids(ids)
+    else:
+        names = _everything(folder) if ids is None else _checked(ids, "the ids")
+    given = read_categories(categories) if isinstance(categories, (str, os.PathLike)) else categories
+    labels = SYNSETS if given is None else given
+    models, missing = [], []
+    for name in names:
+        path = next((found for mesh in MESHES if (found := folder / name / mesh).is_file()), None)
+        synset = name.partition("/")[0]
+        if path is None:
+            missing.append(name)
+        else:
+            models.append(ShapeNetModel(name, labels.get(name, labels.get(synset, synset)), path))
+    if not models:
+        raise DataError(
+            f"{os.fspath(root)!r} holds none of the {len(names)} models asked for, as SYNSET/MODEL/{MESHES[0]};"
+            " name the folder that has the synset folders (such as 02691156) in it."
+        )
+    if missing:
+        _LOG.warning("%d of %d ShapeNet models are missing: %s", len(missing), len(names), listing(missing, limit=4))
+    return ShapeNet(folder, tuple(models), tuple(missing))
+
+
+def read_ids(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Read names ``synset/model``, one a line; empty lines and lines from ``#`` on are skipped.
+
+    Raises:
+        DataError: the file is missing, or is not text.
+        UsageError: a line is not such a name, or occurs twice.
+    """
+    lines = [line.partition("#")[0].strip() for line in _text(path).splitlines()]
+    return _checked((line for line in lines if line), repr(os.fspath(path)))
+
+
+def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
+    """Read class labels by synset or by ``synset/model``.
+
+    A ``.json`` file holds one object of texts; any other file is CSV with two columns, name and label, a
+    header line being allowed.
+
+    Raises:
+        DataError: the file is missing or is neither.
+    """
+    if Path(path).suffix == ".json":
+        data = read_json(path)
+        if not isinstance(data, dict) or not all(isinstance(label, str) for label in data.values()):
+            raise DataError(f"{os.fspath(path)!r} must be one JSON object from names to labels (texts).")
+        return data
+    rows = [row for row in csv.reader(_text(path).splitlines()) if row]
+    for number, row in enumerate(rows, start=1):
+        if len(row) != 2:
+            raise DataError(f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {','.join(row)!r}.")
+    return {name.strip(): label.strip() for name, label in rows if _is_name(name.strip().partition("/")[0])}
+
+
+def _everything(folder: Path) -> tuple[str, ...]:
+    found = {path.relative_to(folder).parts[:2] for mesh in MESHES for path in folder.glob(f"*/*/{mesh}")}
+    return tuple("/".join(parts) for parts in sorted(found))
+
+
+def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:
+    checked = tuple(names)
+    for name in checked:
+        synset, slash, model = name.partition("/")
+        if not (slash and _is_name(synset) and model) or "/" in model or model in (".", ".."):
+            raise UsageError(f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {name!r}.")
+    twice = [name for name, count in Counter(checked).items() if count > 1]
+    if twice:
+        raise UsageError(f"ShapeNet models occur twice in {where}: {listing(twice, limit=4)}.")
+    return checked
+
+
+def _is_name(synset: str) -> bool:
+    return len(synset) == 8 and synset.isdigit()
+
+
+def _text(path: str | os.PathLike[str]) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{os.fspath(path)!r} cannot be read as text ({error}).") from error

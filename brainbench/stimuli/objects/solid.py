@@ -1,0 +1,85 @@
+"""Rigid shapes in their own frame: what whiskers touch of them, as convex parts and as a surface. Metres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.core.files import content_hash, to_plain
+from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh
+from brainbench.stimuli.objects.placement import scale_part
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.geometry import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A rigid shape in its own frame."""
+
+    name: str
+    parts: tuple[Part, ...]
+    """Convex parts whose union is what whiskers touch [m]; empty for a concave surface that is not cut into any."""
+    mesh: Mesh | None = None
+    """Surface for pictures and measurements; None for primitives."""
+    notes: tuple[str, ...] = ()
+    """What a user should know, such as a concavity lost to the convex hull."""
+    origin: Mapping[str, Any] | None = None
+    """What the parts were computed from, where their last digits depend on the machine; :meth:`config` has it."""
+    surface: TriangleMesh | None = None
+    """The exact surface [m], for engines that collide meshes; None where the parts are exact by themselves
+    (primitives) or stand for the solid (``pieces``, ``decomposition``)."""
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [2, 3] (m)."""
+        if self.mesh is not None:
+            return self.mesh.bounds
+        bodies = self.parts if self.surface is None else (self.surface,)
+        corners = np.stack([body.bounds() for body in bodies])
+        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding-box diagonal [m]."""
+        return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+
+    def scaled(self, factor: float) -> Solid:
+        """Return the solid scaled about its origin."""
+        if not (math.isfinite(factor) and factor > 0):
+            raise UsageError(f"A solid is scaled by a positive factor; received {factor!r}.")
+        parts = tuple(scale_part(part, factor) for part in self.parts)
+        surface = self.surface and self.surface.scaled(factor)
+        return replace(self, parts=parts, mesh=self.mesh and self.mesh.scaled(factor), surface=surface)
+
+    def to_diagonal(self, diagonal: float) -> Solid:
+        """Return the solid scaled about its origin to a bounding-box diagonal [m]."""
+        return self.scaled(diagonal / self.diagonal)
+
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
+        parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
+        summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
+        if self.origin is not None:
+            return {**summary, "hash": content_hash(self.origin, round(self.diagonal, 12))}
+        told = () if self.surface is None or _through_corners(self.surface, self.parts) else (self.surface,)
+        return {**summary, "hash": content_hash(parts, *map(to_plain, told))}
+
+
+def to_surface(mesh: Mesh) -> TriangleMesh:
+    """Return a mesh as the surface that whiskers touch."""
+    return TriangleMesh(mesh.vertices, mesh.faces.astype(np.int32))
+
+
+def _through_corners(surface: TriangleMesh, parts: tuple[Part, ...]) -> bool:
+    """Whether the surface runs through corners of the convex parts alone, so that the parts tell it."""
+    corners = {tuple(corner) for part in parts if isinstance(part, ConvexPart) for corner in part.vertices.tolist()}
+    return all(tuple(vertex) in corners for vertex in surface.vertices.tolist())

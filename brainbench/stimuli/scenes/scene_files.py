@@ -1,0 +1,213 @@
+"""Scene files: one TOML file describes one or several labelled scenes. Units stand in the keys.
+
+::
+
+    description = "A pole in front of two whiskers"
+
+    [array]                      # species = "mouse" | "rat"; side = "right" | "left" | "both"
+    species = "mouse"
+    whiskers = "C1,C2"
+    [array.replace.C2]           # optional: other whisker properties, SI units, by selection
+    young_modulus = 3.3e9
+
+    [head]                       # the array frame in the world; rotation about x, then y, then z
+    position_mm = [0, 0, 0]
+    rotation_deg = [0, 0, 0]
+    velocity_mm_s = [0, 10, 0]   # optional; or keyframes since t = 0: times_ms, path_mm and path_deg, a list each
+
+    [whisking]                   # kind = "sinusoid" | "still" | "recorded"
+    frequency_hz = 20
+    protraction_deg = 30
+    retraction_deg = 10
+    onset_ms = 50
+    rotations = "knutsen"
+    # recorded: path = "whisking.csv", rate_hz = 1000, layout = "rat-60", start_deg = -10, initial_path = "angles.csv"
+
+    [frames]
+    first_ms = 1
+    interval_ms = 9
+    count = 110
+    average = 18                 # readings per frame; 1 = instantaneous
+    # instead of interval_ms: rate_hz = 1000. lowpass_hz = 50 filters the readings instead of averaging them;
+    # phase = "zero" | "causal". axes = "world" | "follicle". clip_newton = 1 (moments: 1 mm times that)
+
+    [[animal]]                   # optional: more animals, then whiskers are named "a:C2", "b:C2"
+    name = "b"                   # with [animal.array], [animal.head] and [animal.whisking] as above
+
+    [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
+    label = "pole"
+    [[scene.object]]             # position and rotation as for the head
+    shape = "cylinder"
+    radius_mm = 0.5
+    height_mm = 20
+    position_mm = [14, 5, 0]
+    friction = 0.3               # optional
+    velocity_mm_s = [0, -30, 0]  # optional; or spin_deg_s = [0, 0, 90] about its position; or keyframes as for the head
+
+``[[object]]`` at the top level stands in every scene. Other shapes: ``sphere`` (``radius_mm``), ``box``
+(``size_mm``), ``capsule`` (``radius_mm``, ``length_mm``), ``rodgers`` (``diagonal_mm``, ``segments``) and
+``mesh`` (``path`` relative to the file, ``unit``, ``diagonal_mm``, ``collision`` = "hull" | "exact" | "pieces" |
+"decomposition") and ``family:NAME`` for a procedural shape (``seed``, ``diagonal_mm``, ``detail``, ``collision``;
+names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coacd" | "vhacd", ``threshold`` and
+``most_pieces``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.motion_tables import read_head_motion, read_whisking
+from brainbench.stimuli.scenes.object_tables import read_object
+from brainbench.stimuli.scenes.scene import Animal, Head, Scene
+from brainbench.stimuli.scenes.toml_tables import MILLI, Table, mapping, number, tables, text, vector, whole
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
+
+_NOTHING: Mapping[str, Any] = {}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Labelled scenes that belong together."""
+
+    name: str
+    description: str
+    scenes: Sequence[Scene]
+    """A tuple, or a lazy sequence that builds each scene when it is asked for (sweeps)."""
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels in order."""
+        return self.scenes.labels if isinstance(self.scenes, SweepScenes) else tuple(s.label for s in self.scenes)
+
+
+def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe:
+    """Read a scene file; the module's documentation lists the keys.
+
+    Args:
+        path: a ``.toml`` file.
+        whiskers: keep only these of the file's whiskers; see :meth:`WhiskerArray.select`.
+
+    Raises:
+        UsageError: a key is unknown (the message has the nearest), missing or of the wrong kind.
+        DataError: the file is missing or is not TOML.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataFileNotFoundError(f"There is no scene file {os.fspath(path)!r}.") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DataError(f"The scene file {os.fspath(path)!r} cannot be read as TOML ({error}).") from error
+    try:
+        return _recipe(path, data, whiskers)
+    except BrainbenchError as error:
+        raise type(error)(f"{os.fspath(path)}: {error}") from error
+
+
+def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
+    top = Table("the scene file", data)
+    description = top.take("description", text, "")
+    array = _array(top.table("array"))
+    others = tuple(_animal(Table("[[animal]]", item), path.parent) for item in top.take("animal", tables, []))
+    shared = {name: top.take(name, mapping, _NOTHING) for name in ("head", "whisking", "frames")}
+    common = top.take("object", tables, [])
+    entries = top.take("scene", tables, [])
+    top.finish()
+    if not entries:
+        raise UsageError("the file has no [[scene]].")
+    scenes = [_scene(entry, array, others, shared, common, path.parent).select(whiskers) for entry in entries]
+    repeated = sorted({scene.label for scene in scenes if [s.label for s in scenes].count(scene.label) > 1})
+    if repeated:
+        raise UsageError(f"several scenes have the label {repeated[0]!r}; labels must differ.")
+    return Recipe(path.stem, description, tuple(scenes))
+
+
+def _scene(
+    entry: Mapping[str, Any],
+    array: WhiskerArray,
+    others: tuple[Animal, ...],
+    shared: Mapping[str, Mapping[str, Any]],
+    common: list[Mapping[str, Any]],
+    folder: Path,
+) -> Scene:
+    table = Table("[[scene]]", entry)
+    label = table.take("label", text)
+    merged = {name: {**shared[name], **table.take(name, mapping, _NOTHING)} for name in ("head", "whisking")}
+    objects = [*common, *table.take("object", tables, [])]
+    table.finish()
+    return Scene(
+        label=label,
+        array=array,
+        objects=tuple(read_object(Table(f"[[object]] of scene {label!r}", item), folder) for item in objects),
+        whisking=read_whisking(Table("[whisking]", merged["whisking"]), folder),
+        head=_head(Table("[head]", merged["head"])),
+        frames=_frames(Table("[frames]", shared["frames"])),
+        others=others,
+    )
+
+
+def _animal(table: Table, folder: Path) -> Animal:
+    animal = Animal(
+        name=table.take("name", text),
+        array=_array(table.table("array")),
+        whisking=read_whisking(table.table("whisking"), folder),
+        head=_head(table.table("head")),
+    )
+    table.finish()
+    return animal
+
+
+def _array(table: Table) -> WhiskerArray:
+    species = table.take("species", text, "mouse")
+    if species not in SPECIES:
+        raise unknown_name("species", species, SPECIES)
+    make = WhiskerArray.mouse if species == "mouse" else WhiskerArray.rat
+    array = make(side=table.take("side", text, "right"))  # type: ignore[arg-type]
+    for pattern, changes in table.take("replace", mapping, _NOTHING).items():
+        array = array.replace(pattern, **mapping(changes))
+    array = array.select(table.take("whiskers", text, "all"))
+    table.finish()
+    return array
+
+
+def _head(table: Table) -> Head:
+    head = Head(
+        position=table.take("position_mm", vector(MILLI), (0.0, 0.0, 0.0)),
+        rotation=table.take("rotation_deg", vector(math.pi / 180), (0.0, 0.0, 0.0)),
+        motion=read_head_motion(table),
+    )
+    table.finish()
+    return head
+
+
+def _frames(table: Table) -> Frames:
+    usual = Frames()
+    interval = table.take("interval_ms", number(MILLI), None)
+    rate = table.take("rate_hz", number(1.0), None)
+    if interval is not None and rate is not None:
+        raise UsageError("[frames] takes interval_ms or rate_hz, not both.")
+    if rate is not None:
+        if rate <= 0:
+            raise UsageError(f"'rate_hz' of [frames] must be positive; received {rate:g}.")
+        interval = 1 / rate
+    frames = Frames(
+        first=table.take("first_ms", number(MILLI), usual.first),
+        interval=usual.interval if interval is None else interval,
+        count=table.take("count", whole, usual.count),
+        average=table.take("average", whole, usual.average),
+        lowpass=table.take("lowpass_hz", number(1.0), usual.lowpass),
+        phase=table.take("phase", text, usual.phase),
+        axes=table.take("axes", text, usual.axes),
+        clip=table.take("clip_newton", number(1.0), usual.clip),
+    )
+    table.finish()
+    return frames

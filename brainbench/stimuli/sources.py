@@ -1,0 +1,197 @@
+"""Stimuli from anywhere: a recipe, a scene file, a stimulus-set file or an array file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.contracts import check_stimulus_set
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, listing, unknown_name
+from brainbench.core.files import content_hash
+from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.readout import to_grid
+from brainbench.stimuli.scenes.recipes import get_recipe, is_recipe, list_recipes
+from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set
+from brainbench.stimuli.whiskers.selection import match_whiskers
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from brainbench.core.progress import Progress
+    from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.protocol import Backend
+    from brainbench.stimuli.scenes.scene_files import Recipe
+
+_HDF5 = (".h5", ".hdf5", ".nc")
+
+
+@dataclass(frozen=True, eq=False)
+class Stimuli:
+    """Labelled stimuli, ready for a model."""
+
+    labels: tuple[str, ...]
+    """One per stimulus, all different."""
+    input: NDArray[np.float32]
+    """[K, T, …] what the model receives; [K, T, S·C, H, W] in SI units for simulated stimuli."""
+    dataset: xr.Dataset | None
+    """The stimulus set behind ``input``; None for arrays from a file."""
+    content_hash: str
+    """Equal for equal stimuli."""
+    description: str
+    config_hash: str
+    """Names what was asked for; equal on every machine, while the last digits of a simulation, and with
+    them ``content_hash``, depend on the processor. Equal to ``content_hash`` for arrays from a file."""
+
+    def __repr__(self) -> str:
+        shape = " × ".join(map(str, self.input.shape))
+        return f"Stimuli({listing(self.labels, limit=6)}; input {shape}; hash {self.content_hash})"
+
+
+def load_stimuli(
+    source: str | os.PathLike[str] | Stimuli | xr.Dataset,
+    *,
+    whiskers: str = "all",
+    fidelity: Fidelity | str | None = None,
+    backend: Backend | str = DEFAULT_BACKEND,
+    progress: Progress | None = None,
+    cache: bool = True,
+) -> Stimuli:
+    """Return stimuli from whatever names them.
+
+    Args:
+        source: a recipe (``rodgers``); a scene file (``.toml``); a stimulus-set file written by
+            :func:`write_stimulus_set`, or the data set itself; or an HDF5 array file with the
+            datasets ``stimuli`` [K, T, …] (numbers, as the model shall receive them) and ``labels``
+            [K] (texts). Recipes and scenes are simulated, or taken from the cache.
+        whiskers: only these; see :meth:`WhiskerArray.select`. Not for array files.
+        fidelity, backend, progress, cache: as in :func:`simulate`; unused for files of finished stimuli.
+
+    Raises:
+        UsageError: nothing has this name, or an option does not fit the source.
+        DataError: a file cannot be used; the message says what it holds and what is needed.
+    """
+    if isinstance(source, Stimuli):
+        return source if whiskers == "all" else load_stimuli(_dataset_of(source), whiskers=whiskers)
+    if not isinstance(source, (str, os.PathLike)):
+        return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
+    if isinstance(source, str) and is_recipe(source):
+        recipe = get_recipe(source, whiskers=whiskers)
+        return _from_recipe(recipe, fidelity, backend, progress, cache)
+    path = Path(source)
+    if path.suffix == ".toml":
+        from brainbench.stimuli.scenes.scene_files import load_scene
+
+        return _from_recipe(load_scene(path, whiskers=whiskers), fidelity, backend, progress, cache)
+    if path.suffix in _HDF5 or path.is_file():
+        return _from_hdf5(path, whiskers)
+    hint = f"Or a path: a scene file (.toml), or a stimulus-set or array file ({', '.join(_HDF5)})."
+    raise unknown_name("stimuli", os.fspath(source), list_recipes(), hint=hint)
+
+
+def prepare_stimuli(
+    source: object,
+    *,
+    whiskers: str = "all",
+    fidelity: Fidelity | str | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Begin, in a thread, what :func:`load_stimuli` will wait for (:func:`brainbench.stimuli.simulation.prepare`).
+
+    Whatever does not have to be simulated is left alone, and so is what cannot be: ``load_stimuli`` says why.
+    """
+    from brainbench.stimuli.scenes.scene_files import load_scene
+    from brainbench.stimuli.simulation import prepare
+
+    with contextlib.suppress(BrainbenchError, OSError):
+        if isinstance(source, str) and is_recipe(source):
+            prepare(get_recipe(source, whiskers=whiskers).scenes, fidelity=fidelity, progress=progress)
+        elif isinstance(source, (str, os.PathLike)) and Path(source).suffix == ".toml":
+            prepare(load_scene(Path(source), whiskers=whiskers).scenes, fidelity=fidelity, progress=progress)
+
+
+def _from_recipe(
+    recipe: Recipe,
+    fidelity: Fidelity | str | None,
+    backend: Backend | str,
+    progress: Progress | None,
+    cache: bool,
+) -> Stimuli:
+    from brainbench.stimuli.simulation import simulate
+
+    dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
+    return _from_dataset(dataset, "all", recipe.description.strip() or recipe.name)
+
+
+def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimuli:
+    if whiskers != "all":
+        names = [str(name) for name in dataset["whisker"].values]
+        rows, cols = dataset["row"].values.tolist(), dataset["col"].values.tolist()
+        chosen = dataset.isel(whisker=match_whiskers(whiskers, names, rows, cols))
+        config = content_hash(dataset.attrs.get("config_hash", ""), chosen["whisker"].values.astype(str).tolist())
+        dataset = chosen.assign_attrs(content_hash=hash_stimulus_set(chosen), config_hash=config)
+    labels = tuple(str(label) for label in dataset["stimulus"].values)
+    numbers = dataset.attrs["content_hash"]
+    config = dataset.attrs.get("config_hash", numbers)
+    return Stimuli(labels, to_grid(dataset), dataset, numbers, description, config)
+
+
+def _from_hdf5(path: Path, whiskers: str) -> Stimuli:
+    import h5py
+
+    name = os.fspath(path)
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no stimulus file {name!r}.")
+    try:
+        with h5py.File(path, "r") as file:
+            if "wrench" not in file:
+                return _from_arrays(file, name, whiskers)
+    except OSError as error:
+        raise DataError(f"{name!r} cannot be read as HDF5: it is damaged or of another format ({error}).") from error
+    return _from_dataset(read_stimulus_set(path), whiskers, f"stimulus set {path.name}")
+
+
+def _from_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
+    """Read ``stimuli`` [K, T, …] and ``labels`` [K]."""
+    import h5py
+
+    if whiskers != "all":
+        raise UsageError(f"{name!r} holds arrays, in which whiskers have no names; leave the selection at 'all'.")
+    found = {key: item for key, item in file.items() if isinstance(item, h5py.Dataset)}
+    missing = [key for key in ("stimuli", "labels") if key not in found]
+    if missing:
+        held = listing(f"{key} {list(item.shape)}" for key, item in found.items())
+        raise DataError(
+            f"{name!r} is neither a stimulus set (no 'wrench') nor an array file: it lacks {' and '.join(missing)};"
+            f" an array file has 'stimuli' [K, T, …] and 'labels' [K]. It holds: {held}."
+        )
+    stimuli, labels = found["stimuli"], found["labels"]
+    if stimuli.ndim < 2 or stimuli.dtype.kind not in "fiu":
+        raise DataError(
+            f"'stimuli' in {name!r} must be numbers of shape [K, T, …]; it is {list(stimuli.shape)} of {stimuli.dtype}."
+        )
+    if h5py.check_string_dtype(labels.dtype) is None or labels.shape != stimuli.shape[:1]:
+        raise DataError(
+            f"'labels' in {name!r} must be {stimuli.shape[0]} texts, one per stimulus;"
+            f" it is {list(labels.shape)} of {labels.dtype}."
+        )
+    texts = tuple(str(label) for label in labels.asstr()[:])
+    if len(set(texts)) < len(texts):
+        raise DataError(f"'labels' in {name!r} names a stimulus twice: {listing(texts)}.")
+    values = stimuli[()].astype(np.float32)
+    if not np.isfinite(values).all():
+        bad = sorted({texts[index[0]] for index in np.argwhere(~np.isfinite(values))})
+        raise DataError(f"'stimuli' in {name!r} has values that are not finite, in {listing(bad)}.")
+    numbers = content_hash(list(texts), values)
+    return Stimuli(texts, values, None, numbers, f"arrays {list(values.shape)} from {name}", numbers)
+
+
+def _dataset_of(stimuli: Stimuli) -> xr.Dataset:
+    if stimuli.dataset is None:
+        raise UsageError("These stimuli are arrays, in which whiskers have no names; leave the selection at 'all'.")
+    return stimuli.dataset

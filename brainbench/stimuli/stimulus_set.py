@@ -1,0 +1,64 @@
+"""Stimulus sets on disk: HDF5 through h5netcdf, written atomically, read with their hash checked."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from brainbench.core.contracts import check_stimulus_set
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.files import atomic_path, content_hash
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def hash_stimulus_set(dataset: xr.Dataset) -> str:
+    """Hash what a stimulus set says: labels, whiskers, times, forces and the configuration behind them."""
+    return content_hash(
+        {
+            "stimulus": [str(label) for label in dataset["stimulus"].values],
+            "whisker": [str(name) for name in dataset["whisker"].values],
+            **{key: dataset.attrs[key] for key in ("array", "scene", "fidelity", "seed", "backend")},
+        },
+        dataset["time"].values.astype("<f8"),
+        dataset["wrench"].values.astype("<f4"),
+    )
+
+
+def write_stimulus_set(dataset: xr.Dataset, path: str | os.PathLike[str]) -> Path:
+    """Write a stimulus set to an HDF5 file (netCDF4 layout), replacing an older one in one step.
+
+    Raises:
+        DataError: ``dataset`` is not a stimulus set.
+    """
+    with atomic_path(path) as temporary:
+        check_stimulus_set(dataset).to_netcdf(temporary, engine="h5netcdf")
+    return Path(path)
+
+
+def read_stimulus_set(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read a stimulus set into memory.
+
+    Raises:
+        DataError: the file is missing or damaged, is not a stimulus set, or its numbers do not match
+            the content hash it carries.
+    """
+    import xarray as xr
+
+    name = os.fspath(path)
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no stimulus-set file {name!r}.")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as stored:
+            dataset = stored.load()
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise DataError(f"{name!r} cannot be read as a stimulus set ({error}).") from error
+    check_stimulus_set(dataset)
+    if hash_stimulus_set(dataset) != dataset.attrs["content_hash"]:
+        raise DataError(
+            f"The numbers in {name!r} do not match the content hash in the file: it was damaged or edited;"
+            " simulate the stimuli again, or set the hash anew with brainbench.stimuli.stimulus_set.hash_stimulus_set."
+        )
+    return dataset

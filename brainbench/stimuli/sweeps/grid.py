@@ -1,0 +1,237 @@
+"""One grid of passive sweeps: which speeds, heights, rotations, distances and sizes, and where objects start.
+
+Frame and placing follow the released simulation: the object is scaled to a bounding-box diagonal, turned about
+the world's z, and placed by its turned bounding box: its lowest x lies at ``distance`` and its origin at
+``height``. It travels towards −y, over the whiskers from rostral to caudal.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.files import content_hash
+from brainbench.stimuli.motion.trajectories import Still, Translation
+from brainbench.stimuli.objects.placed_object import PlacedObject, Solid, euler_matrix, move_part
+from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Head, Scene
+from brainbench.stimuli.whiskers.array import WhiskerArray
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MOVERS = ("object", "head")
+PLACINGS = ("clear", "released")
+
+_HEAD_ONSET = 0.01
+"""Smooth start [s] of a travelling head, whose whiskers would feel a jump of velocity as a blow."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Values low, low + step, …, high, of which every draw takes one, all equally likely."""
+
+    low: float
+    high: float
+    step: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and self.step > 0 and self.low <= self.high < math.inf):
+            raise UsageError(f"A span ascends from low to high in positive steps; received {self!r}.")
+
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        return math.floor((self.high - self.low) / self.step + 1e-9) + 1
+
+    def draw(self, generator: np.random.Generator) -> float:
+        """Return one value."""
+        return self.low + self.step * int(generator.integers(self.count))
+
+
+Values = tuple[float, ...] | Span
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One pass of one object."""
+
+    speed: float
+    """Speed of the pass [m/s]."""
+    height: float
+    """Height z of the object's origin [m, world]."""
+    rotation: float
+    """Angle of the object about the world's z axis [rad]."""
+    distance: float
+    """Lowest x of the turned object [m, world]."""
+    size: float
+    """Bounding-box diagonal of the object before it is turned [m]."""
+    draw: int = 0
+    """Which draw of the sampled quantities this sweep belongs to."""
+
+    @property
+    def label(self) -> str:
+        """Conditions in mm, degrees and mm/s, in the manner of the released folders: ``n0_h-5_d5_t30_v30_s40``."""
+        values = {
+            "h": self.height * 1e3,
+            "d": self.distance * 1e3,
+            "t": math.degrees(self.rotation),
+            "v": self.speed * 1e3,
+            "s": self.size * 1e3,
+        }
+        return "_".join([f"n{self.draw}", *(f"{key}{round(value, 6) + 0.0:g}" for key, value in values.items())])
+
+
+@dataclass(frozen=True)
+class SweepGrid:
+    """A frozen set of sweep conditions; lists are combined, spans are sampled once per draw and object.
+
+    Raises:
+        UsageError: a list is empty, or a value lies outside its range.
+    """
+
+    speed: Values = (0.030,)
+    """[m/s]"""
+    height: Values = (0.0,)
+    """[m]"""
+    rotation: Values = (0.0,)
+    """[rad]"""
+    distance: Values = (0.005,)
+    """[m]"""
+    size: Values = (0.040,)
+    """[m]"""
+    turns: tuple[float, ...] = (0.0,)
+    """Angles [rad] added to each rotation."""
+    draws: int = 1
+    """How often the spans are sampled."""
+    heights_per_draw: int | None = None
+    """How many of the listed heights each draw uses, in rotation, so that all are used alike; None for all."""
+    seed: int = 0
+    """Seed of the draws; each object has draws of its own, named by seed and object name."""
+    start: float = 0.016
+    """Where the object starts along y [m]; see ``placing``."""
+    placing: Literal["clear", "released"] = "clear"
+    """``clear``: the face that leads has y = ``start`` at t = 0, in front of the whiskers. ``released``: the origin
+    lies at start + (lowest y of the turned object), as the published simulator computes it; large objects then
+    start *inside* the array, and what the whiskers feel is no brushing."""
+    mover: Literal["object", "head"] = "object"
+    """``object``: it travels towards −y past a still array. ``head``: the array travels towards +y past a still
+    object; the relative motion is the same, with a smooth start of 10 ms."""
+    species: str = "mouse"
+    head: Head = field(default_factory=Head)
+    """Where the array stands; its motion must be :class:`Still`."""
+    frames: Frames = field(default_factory=Frames)
+    published: str = ""
+    """What was published about this grid, printed beside our counts."""
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "height", "rotation", "distance", "size"):
+            values = getattr(self, name)
+            if not isinstance(values, Span):
+                object.__setattr__(self, name, tuple(map(float, values)))
+                if not values or not all(map(math.isfinite, values)):
+                    raise UsageError(f"{name} of a sweep grid needs at least one finite value; received {values!r}.")
+        for name in ("speed", "size"):
+            values = getattr(self, name)
+            if (values.low if isinstance(values, Span) else min(values)) <= 0:
+                raise UsageError(f"{name} of a sweep grid must be positive (SI units); received {values!r}.")
+        if self.draws < 1 or not self.turns:
+            raise UsageError(f"A sweep grid needs a draw and a turn; received {self.draws!r} and {self.turns!r}.")
+        if self.heights_per_draw is not None and (
+            isinstance(self.height, Span) or not 1 <= self.heights_per_draw <= len(self.height)
+        ):
+            raise UsageError(
+                f"heights_per_draw must lie between 1 and the number of listed heights; got {self.heights_per_draw!r}."
+            )
+        for kind, value, allowed in (("mover", self.mover, MOVERS), ("placing", self.placing, PLACINGS)):
+            if value not in allowed:
+                raise unknown_name(kind, str(value), allowed)
+        if not isinstance(self.head.motion, Still):
+            raise UsageError("The head of a sweep grid stands still at first; choose mover='head' to let it travel.")
+
+    @property
+    def count(self) -> int:
+        """Sweeps per object."""
+        heights = self.heights_per_draw or _choices(self.height)
+        others = (self.speed, self.rotation, self.distance, self.size)
+        return self.draws * heights * len(self.turns) * math.prod(map(_choices, others))
+
+    def sweeps(self, name: str = "") -> tuple[Sweep, ...]:
+        """Return the sweeps of the object called ``name``, [count], equal on every machine.
+
+        The name matters only where something is sampled.
+        """
+        generator = np.random.default_rng(int(content_hash(["sweeps", self.seed, name]), 16))
+        found = []
+        for draw in range(self.draws):
+            speed, rotation, distance, size = (
+                _values(values, generator) for values in (self.speed, self.rotation, self.distance, self.size)
+            )
+            heights = self._heights(draw, generator)
+            combined = itertools.product(heights, rotation, self.turns, distance, speed, size)
+            found += [Sweep(v, h, r + turn, d, s, draw) for h, r, turn, d, v, s in combined]
+        return tuple(found)
+
+    def scene(
+        self, solid: Solid, sweep: Sweep, *, label: str | None = None, array: WhiskerArray | None = None
+    ) -> Scene:
+        """Return one sweep as a scene, ready for :func:`brainbench.stimuli.simulate`.
+
+        Args:
+            solid: the object, of any size; it is scaled about its origin to ``sweep.size``.
+            sweep: the conditions.
+            label: name of the scene; the object's name and the conditions when None.
+            array: the whiskers; the right side of the grid's species when None.
+        """
+        scaled = solid.to_diagonal(sweep.size)
+        angles = (0.0, 0.0, sweep.rotation)
+        low = _turned_bounds(scaled, euler_matrix(angles))[0]
+        y = self.start - low[1] if self.placing == "clear" else self.start + low[1]
+        forward = Translation((0.0, sweep.speed, 0.0), _HEAD_ONSET)
+        backward = Translation((0.0, -sweep.speed, 0.0), 0.0)
+        moves = self.mover == "object"
+        placed = PlacedObject(
+            scaled, (sweep.distance - float(low[0]), float(y), sweep.height), angles, backward if moves else Still()
+        )
+        head = self.head if moves else Head(self.head.position, self.head.rotation, forward)
+        chosen = default_array(self.species) if array is None else array
+        name = f"{solid.name}/{sweep.label}" if label is None else label
+        return Scene(name, chosen, (placed,), Still(), head, self.frames)
+
+    def _heights(self, draw: int, generator: np.random.Generator) -> tuple[float, ...]:
+        values = _values(self.height, generator)
+        if self.heights_per_draw is None:
+            return values
+        first = draw * self.heights_per_draw
+        return tuple(values[(first + i) % len(values)] for i in range(self.heights_per_draw))
+
+
+def default_array(species: str) -> WhiskerArray:
+    """Return the right side of a species' array."""
+    makers = {"mouse": WhiskerArray.mouse, "rat": WhiskerArray.rat}
+    if species not in makers:
+        raise unknown_name("species", species, makers)
+    return makers[species]()
+
+
+def _choices(values: Values) -> int:
+    return 1 if isinstance(values, Span) else len(values)
+
+
+def _values(values: Values, generator: np.random.Generator) -> tuple[float, ...]:
+    return (values.draw(generator),) if isinstance(values, Span) else values
+
+
+def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
+    if solid.mesh is not None:
+        return solid.mesh.transformed(rotation).bounds
+    if solid.surface is not None:
+        return solid.surface.moved(rotation, np.zeros(3)).bounds()
+    corners = np.stack([move_part(part, rotation, np.zeros(3)).bounds() for part in solid.parts])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])

@@ -1,0 +1,130 @@
+"""Run shards on this machine."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from brainbench.core.errors import DataError
+from brainbench.stimuli.sweeps.shards import Prepared, make_shard, prepare_shard, simulate_shard, write_shard
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.sweeps.plan import ShardTask
+
+Done = Callable[[int], None]
+"""Called with the number of sweeps of a shard that is written."""
+
+WRITERS = 4
+"""Threads that write shards behind a GPU: one hashes about 1 GB/s."""
+AHEAD = 4
+"""Shards at least that are prepared ahead of the simulation; as many as there are processes to do it, if more."""
+
+
+def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done: Done) -> None:
+    """Make shards on a pool of processes, or one after the other through a GPU; call ``done`` after each.
+
+    Raises:
+        DataError: a process died.
+    """
+    count = workers or usable_processors()
+    try:
+        if tasks[0].settings.device != "cpu":
+            run_pipelined(tasks, folder, count, done)
+        elif min(count, len(tasks)) == 1:
+            for task in tasks:
+                done(make_shard(task, str(folder), count))
+        else:
+            _run_pool(tasks, folder, count, done)
+    except BrokenProcessPool as error:
+        raise DataError(
+            "A process of the pool ended unexpectedly, perhaps for want of memory, or because the script that started "
+            "it works outside of: if __name__ == '__main__':. The finished shards are kept: run the same again, with "
+            "fewer workers if this recurs."
+        ) from error
+
+
+def usable_processors() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _run_pool(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
+    processes = min(workers, len(tasks))
+    with _pool(processes) as pool:
+        futures = [pool.submit(make_shard, task, str(folder), max(1, workers // processes)) for task in tasks]
+        try:
+            for future in as_completed(futures):
+                done(future.result())
+        except BaseException:
+            _stop(pool)
+            raise
+
+
+def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
+    """Make shards one after the other in this process while others build objects and threads hash and write.
+
+    The objects of as many shards as there are workers and the forces of :data:`WRITERS` + 1 shards are in memory.
+    """
+    with _pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(WRITERS) as writers:
+        writing: deque[Future[int]] = deque()
+        try:
+            for task, prepared in _built_ahead(tasks, builders, max(AHEAD, workers)):
+                content = simulate_shard(task, prepared, workers)
+                if len(writing) == WRITERS:
+                    done(writing.popleft().result())
+                writing.append(writers.submit(write_shard, content, folder))
+                del content
+            while writing:
+                done(writing.popleft().result())
+        except BaseException:
+            _stop(builders)
+            raise
+
+
+def _built_ahead(
+    tasks: Sequence[ShardTask], builders: ProcessPoolExecutor, ahead: int
+) -> Iterator[tuple[ShardTask, Prepared]]:
+    coming: deque[tuple[ShardTask, Future[Prepared]]] = deque()
+    for task in tasks:
+        coming.append((task, builders.submit(prepare_shard, task)))
+        if len(coming) > ahead:
+            first, future = coming.popleft()
+            yield first, future.result()
+    while coming:
+        first, future = coming.popleft()
+        yield first, future.result()
+
+
+def _pool(processes: int) -> ProcessPoolExecutor:
+    # Not forked: physics engines and their threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker)
+
+
+def _stop(pool: ProcessPoolExecutor) -> None:
+    """End a pool without waiting for shards that are being made: nothing is there before it is complete."""
+    processes = list((getattr(pool, "_processes", None) or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.terminate()
+
+
+def _start_worker() -> None:
+    """Leave interrupts to the parent process, and end when it ends in whatever way."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.2)
+    os._exit(1)

@@ -1,0 +1,132 @@
+"""The manifest of a data set: what was asked for, every shard with its hash, every object, and what went wrong."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
+from brainbench.core.errors import DataError
+from brainbench.core.files import content_hash, provenance
+from brainbench.stimuli.sweeps.shards import UNUSABLE
+from brainbench.stimuli.sweeps.split import SPLITS
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
+
+MANIFEST = "manifest.json"
+
+_COUNTS = ("steps", "steps_in_full", "retried", "unstable", "unusable")
+
+
+def is_whole(path: Path, task: ShardTask) -> bool:
+    """Whether the file of a shard is there and complete.
+
+    Raises:
+        DataError: it is a shard of another data set.
+    """
+    import h5py
+
+    if not path.is_file():
+        return False
+    try:
+        with h5py.File(path, "r") as file:
+            found = str(file.attrs["config_hash"])
+            wrench: Any = file["wrench"]
+            end = wrench.id.get_offset() + wrench.size * wrench.dtype.itemsize
+            shape = wrench.shape
+    except (OSError, KeyError):
+        return False
+    if found != task.config_hash:
+        raise DataError(f"{str(path)!r} belongs to another data set; choose an empty folder, or remove what is there.")
+    return shape[0] == len(task) and path.stat().st_size >= end
+
+
+def make_manifest(plan: GenerationPlan, folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Put together the manifest of a finished data set from what its shards say.
+
+    Equal data sets have equal manifests on one machine: there is no time in it.
+
+    Raises:
+        DataError: a shard is missing or damaged, or an object differs between shards.
+    """
+    objects = _Objects(plan)
+    shards = [_read(Path(folder) / task.name, task, objects) for task in plan.shards]
+    totals = {name: sum(shard[name] for shard in shards) for name in _COUNTS}
+    about = provenance()
+    del about["time"]
+    return {
+        "format": SWEEPS_FORMAT,
+        "schema": SWEEPS_SCHEMA,
+        "content_hash": content_hash([[shard["name"], shard["content_hash"]] for shard in shards]),
+        "config_hash": plan.config_hash,
+        "config": plan.config,
+        "provenance": about,
+        "classes": list(plan.classes),
+        "sweeps": plan.sweeps,
+        **totals,
+        "splits": {split: _summary(item for item in shards if item["split"] == split) for split in SPLITS},
+        "shards": shards,
+        "objects": objects.found,
+    }
+
+
+class _Objects:
+    """Collects what the shards say of every object."""
+
+    def __init__(self, plan: GenerationPlan) -> None:
+        self.found: dict[str, dict[str, Any]] = {
+            name: {"label": item.label, "source": item.source, "hash": None, "sweeps": {}}
+            for name, item in plan.objects.items()
+        }
+
+    def add(self, name: str, digest: str, split: str, sweeps: int, reason: str) -> None:
+        entry = self.found[name]
+        if entry["hash"] not in (None, digest):
+            raise DataError(
+                f"The object {name!r} was not built alike in all shards (hashes {entry['hash']} and {digest}): its file"
+                " changed meanwhile, or machines differ; generate the data set again in an empty folder."
+            )
+        entry["hash"] = digest
+        entry["sweeps"][split] = entry["sweeps"].get(split, 0) + sweeps
+        if reason:
+            entry["unusable"] = reason
+
+
+def _read(path: Path, task: ShardTask, objects: _Objects) -> dict[str, Any]:
+    import h5py
+
+    try:
+        opened: Any = h5py.File(path, "r")
+        with opened as file:
+            counts = {name: int(file.attrs[name]) for name in _COUNTS}
+            digest = str(file.attrs["content_hash"])
+            hashes = [value.decode() for value in file["object_hash"][:]]
+            owner, status, reasons = file["owner"][:], file["status"][:], file["reason"][:]
+    except (OSError, KeyError) as error:
+        raise DataError(
+            f"The shard {str(path)!r} is missing or damaged ({error}); run the same command again."
+        ) from error
+    for index, item in enumerate(task.objects):
+        mine = np.flatnonzero(owner == index)
+        broken = mine[(status[mine] == UNUSABLE).any(axis=1)]
+        reason = reasons[broken[0]].decode() if len(broken) else ""
+        objects.add(item.name, hashes[index], task.split, len(mine), reason)
+    return {
+        "name": task.name,
+        "split": task.split,
+        "sweeps": len(task),
+        "bytes": path.stat().st_size,
+        "content_hash": digest,
+        **counts,
+    }
+
+
+def _summary(shards: Iterable[dict[str, Any]]) -> dict[str, int]:
+    chosen = list(shards)
+    counted = {name: sum(shard[name] for shard in chosen) for name in ("sweeps", "bytes", "unstable", "unusable")}
+    return {"shards": len(chosen), **counted}

@@ -1,0 +1,229 @@
+"""What a data set will hold: which sweeps, in which split, in which shard. Nothing is built or simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench import __version__
+from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.files import content_hash, to_plain
+from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.simulation import _PACKAGES
+from brainbench.stimuli.sweeps.grid import default_array
+from brainbench.stimuli.sweeps.split import SPLITS, SplitBy, split_objects, split_sweeps
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.objects.collections import NamedObject
+    from brainbench.stimuli.sweeps.grid import SweepGrid
+    from brainbench.stimuli.whiskers.array import WhiskerArray
+
+SHARD_SIZES = {"mujoco": 32, "bullet": 8}
+"""Sweeps per shard of slow backends, so that a kill costs minutes at most."""
+USUAL_SHARD = 512
+GPU_SHARD = 2048
+"""Sweeps per shard on a GPU, which takes thousands at a time."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a data set is made.
+
+    Raises:
+        UsageError: a value lies outside its range.
+    """
+
+    fidelity: Fidelity
+    backend: str = DEFAULT_BACKEND
+    device: str = "cpu"
+    split: SplitBy = "object"
+    seed: int = 0
+    """Seed of the split, of the order of the objects and of the sample; the grid has a seed of its own."""
+    limit: int | None = None
+    """Only the first sweeps of each object; all when None."""
+    sample: float | None = None
+    """Only this fraction of all sweeps, drawn at random; all when None."""
+    shard_size: int | None = None
+    """Sweeps per shard; by backend and device when None."""
+    retry: int = 5
+    """Whiskers that cannot be trusted are simulated again with steps divided by this, and those left by twice this
+    (backend ``rod``); 1 leaves them as they are."""
+
+    def __post_init__(self) -> None:
+        if self.split not in ("object", "sweep"):
+            raise unknown_name("split", str(self.split), ("object", "sweep"))
+        for name in ("limit", "shard_size"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise UsageError(f"{name} must be at least 1; received {value!r}.")
+        if self.retry < 1:
+            raise UsageError(f"retry divides the time step; it must be at least 1; received {self.retry!r}.")
+        if self.sample is not None and not 0 < self.sample <= 1:
+            raise UsageError(f"sample is a fraction above 0 and at most 1; received {self.sample!r}.")
+        if self.limit is not None and self.sample is not None:
+            raise UsageError("Give limit (the first sweeps of each object) or sample (a random fraction), not both.")
+
+    @property
+    def sweeps_per_shard(self) -> int:
+        """Sweeps of every shard but the last of each split."""
+        usual = USUAL_SHARD if self.device == "cpu" else GPU_SHARD
+        return self.shard_size or SHARD_SIZES.get(self.backend, usual)
+
+
+@dataclass(frozen=True, eq=False)
+class ShardTask:
+    """Everything that makes one shard, small enough to be sent to another process or machine."""
+
+    name: str
+    """File name."""
+    split: str
+    grid: SweepGrid
+    whiskers: str
+    objects: tuple[NamedObject, ...]
+    """The objects of this shard, in the order of their sweeps."""
+    owner: NDArray[np.int64]
+    """[sweep] index into ``objects``, ascending."""
+    within: NDArray[np.int64]
+    """[sweep] which sweep of its object."""
+    index: NDArray[np.int64]
+    """[sweep] number among all sweeps of the grid over all objects."""
+    classes: tuple[str, ...]
+    """Class labels of the whole data set, sorted."""
+    settings: Settings
+    config: Mapping[str, Any]
+    config_hash: str
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def bytes(self) -> int:
+        """About how large the file becomes."""
+        whiskers, frames = len(self.config["whiskers"]["names"]), self.grid.frames.count
+        return len(self) * (whiskers * (24 * frames + 5) + 200) + 40_000
+
+
+@dataclass(frozen=True, eq=False)
+class GenerationPlan:
+    """The shards of a data set.
+
+    Raises:
+        UsageError: there is no object, or the whisker selection names none.
+    """
+
+    recipe: str
+    """Name of the grid, for people."""
+    grid: SweepGrid
+    objects: Mapping[str, NamedObject]
+    settings: Settings
+    whiskers: str = "all"
+    """A selection; see :meth:`WhiskerArray.select`."""
+
+    def __post_init__(self) -> None:
+        if not self.objects:
+            raise UsageError("A data set of sweeps needs at least one object.")
+
+    @cached_property
+    def array(self) -> WhiskerArray:
+        """The whiskers."""
+        return default_array(self.grid.species).select(self.whiskers)
+
+    @cached_property
+    def classes(self) -> tuple[str, ...]:
+        """Class labels, sorted; a label's place is its number in the shards."""
+        return tuple(sorted({item.label for item in self.objects.values()}))
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine every byte of the data set."""
+        grid = {item.name: getattr(self.grid, item.name) for item in fields(self.grid) if item.name != "published"}
+        package = _PACKAGES.get(self.settings.backend)
+        return {
+            "format": SWEEPS_FORMAT,
+            "schema": SWEEPS_SCHEMA,
+            "recipe": self.recipe,
+            "grid": to_plain({**grid, "head": self.grid.head.config(), "frames": self.grid.frames.config()}),
+            "whiskers": {"names": list(self.array.names), "hash": content_hash(list(self.array))},
+            "objects": {
+                "count": len(self.objects),
+                "hash": content_hash([[item.name, item.label, item.source] for item in self.objects.values()]),
+            },
+            "classes": list(self.classes),
+            **to_plain(self.settings),
+            "shard_size": self.settings.sweeps_per_shard,
+            "version": __version__,
+            "engine": f"{package} {metadata.version(package)}" if package else self.settings.backend,
+        }
+
+    @cached_property
+    def config_hash(self) -> str:
+        """Hash of :attr:`config`."""
+        return content_hash(self.config)
+
+    @cached_property
+    def chosen(self) -> NDArray[np.bool_]:
+        """[object, sweep] whether a sweep belongs to the data set."""
+        settings, count = self.settings, self.grid.count
+        total = len(self.objects) * count
+        if settings.sample is None:
+            return np.broadcast_to(np.arange(count) < (settings.limit or count), (len(self.objects), count))
+        generator = np.random.default_rng(int(content_hash(["sample", settings.seed]), 16))
+        mask = np.zeros(total, dtype=bool)
+        mask[generator.choice(total, max(1, round(settings.sample * total)), replace=False)] = True
+        return mask.reshape(len(self.objects), count)
+
+    @cached_property
+    def splits(self) -> NDArray[np.int8]:
+        """[object, sweep] number of each sweep's split in :data:`SPLITS`."""
+        labels = {name: item.label for name, item in self.objects.items()}
+        if self.settings.split == "sweep":
+            return split_sweeps(list(labels.values()), self.grid.count, seed=self.settings.seed)
+        split = split_objects(labels, seed=self.settings.seed)
+        return np.broadcast_to(split[:, None], (len(self.objects), self.grid.count))
+
+    @property
+    def sweeps(self) -> int:
+        """Number of sweeps of the data set."""
+        return int(self.chosen.sum())
+
+    @cached_property
+    def shards(self) -> tuple[ShardTask, ...]:
+        """The shards: those of training first, objects in an order drawn by the seed, so that classes mix."""
+        names = list(self.objects)
+        items = list(self.objects.values())
+        order = np.array(sorted(range(len(names)), key=lambda i: content_hash(["order", self.settings.seed, names[i]])))
+        count, size = self.grid.count, self.settings.sweeps_per_shard
+        shards = []
+        for number, split in enumerate(SPLITS):
+            rank, within = np.nonzero((self.chosen & (self.splits == number))[order])
+            owners = order[rank]
+            for place, first in enumerate(range(0, len(owners), size)):
+                part = slice(first, first + size)
+                used = list(dict.fromkeys(owners[part].tolist()))
+                local = {owner: index for index, owner in enumerate(used)}
+                shards.append(
+                    ShardTask(
+                        name=f"{split}-{place:05d}.h5",
+                        split=split,
+                        grid=self.grid,
+                        whiskers=self.whiskers,
+                        objects=tuple(items[owner] for owner in used),
+                        owner=np.array([local[owner] for owner in owners[part].tolist()]),
+                        within=within[part],
+                        index=owners[part] * count + within[part],
+                        classes=self.classes,
+                        settings=self.settings,
+                        config=self.config,
+                        config_hash=self.config_hash,
+                    )
+                )
+        return tuple(shards)

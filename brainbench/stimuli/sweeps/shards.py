@@ -1,0 +1,250 @@
+"""One shard: build its objects, simulate its sweeps, write its file. The layout is described in ``docs/datasets.md``.
+
+The bytes of a shard depend on what was asked for alone: no time, no machine and no version of a library is in it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
+from brainbench.stimuli.objects.placed_object import Solid
+from brainbench.stimuli.sweeps.grid import Sweep, default_array
+from brainbench.stimuli.sweeps.simulation import simulate_sweeps
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.sweeps.plan import ShardTask
+
+OK, UNSTABLE, UNUSABLE = 0, 1, 2
+"""Values of ``status``: fine; the simulation failed; the object could not be built."""
+
+ALIGNMENT = 4096
+"""The forces begin at a multiple of this, so that pages of memory and of the file coincide."""
+
+_CONDITIONS = tuple(item.name for item in fields(Sweep))
+
+
+@dataclass(frozen=True, eq=False)
+class ShardContent:
+    """What a shard's file will hold."""
+
+    task: ShardTask
+    arrays: Mapping[str, NDArray[Any]]
+    """By name, in the order of the file; ``wrench`` is last."""
+    attributes: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What stands ready before a shard is simulated; made by another process while the GPU works."""
+
+    solids: tuple[Solid | None, ...]
+    """The objects of the shard; None for one that cannot be used."""
+    reasons: tuple[str, ...]
+    """Why an object cannot be used; empty for the others."""
+    tables: Mapping[str, NDArray[Any]]
+    """The arrays that do not depend on the simulation."""
+
+
+def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
+    """Prepare, simulate and write one shard with ``workers`` threads; return the number of its sweeps."""
+    return write_shard(simulate_shard(task, prepare_shard(task), workers), folder)
+
+
+def prepare_shard(task: ShardTask) -> Prepared:
+    """Build the objects of a shard and list its sweeps."""
+    solids: list[Solid | None] = []
+    reasons = []
+    for item in task.objects:
+        try:
+            solids.append(item.load())
+            reasons.append("")
+        except (DataError, UsageError) as error:
+            solids.append(None)
+            reasons.append(str(error) or type(error).__name__)
+    hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
+    return Prepared(tuple(solids), tuple(reasons), {**_tables(task, hashes), **_conditions(task)})
+
+
+def simulate_shard(task: ShardTask, prepared: Prepared, workers: int | None = None) -> ShardContent:
+    """Simulate the sweeps of a shard past its objects."""
+    count, frames = task.grid.count, task.grid.frames
+    whiskers = len(task.config["whiskers"]["names"])
+    place = {owner: rank for rank, owner in enumerate(i for i, solid in enumerate(prepared.solids) if solid)}
+    chosen = np.flatnonzero(np.isin(task.owner, list(place)))
+    shape = (len(task), frames.count, whiskers, 6)
+    contact = np.zeros((len(task), whiskers), dtype=np.float32)
+    status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
+    reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
+    steps = steps_in_full = retried = 0
+    wrench = np.empty((0, *shape[1:]), dtype=np.float32)
+    if len(chosen):
+        named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
+        batch = simulate_sweeps(
+            SweepScenes(task.grid, named, whiskers=task.whiskers),
+            [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()],
+            fidelity=task.settings.fidelity,
+            backend=task.settings.backend,
+            device=task.settings.device,
+            workers=workers,
+            retry=task.settings.retry,
+        )
+        if batch.wrench.shape != (len(chosen), *shape[1:]):
+            raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")
+        contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)
+        for index, reason in zip(chosen.tolist(), batch.reasons, strict=True):
+            reasons[index] = reason
+        steps, steps_in_full, retried = batch.steps, batch.steps_in_full, batch.retried
+        wrench = batch.wrench
+    if len(chosen) < len(task):
+        known, wrench = wrench, np.full(shape, np.nan, dtype=np.float32)
+        wrench[chosen] = known
+    arrays = {
+        **prepared.tables,
+        "contact": contact,
+        "status": status,
+        "reason": _texts(reasons),
+        "wrench": np.ascontiguousarray(wrench, dtype="<f4"),
+    }
+    attributes = {
+        "format": SWEEPS_FORMAT,
+        "schema": SWEEPS_SCHEMA,
+        "split": task.split,
+        "axes": frames.axes,
+        # An attribute has room for 64 kB; thousands of classes stand in the table of that name.
+        "config": to_json({key: item for key, item in task.config.items() if key != "classes"}, indent=None),
+        "config_hash": task.config_hash,
+        "steps": steps,
+        "steps_in_full": steps_in_full,
+        "retried": retried,
+        "unstable": int((status == UNSTABLE).any(axis=1).sum()),
+        "unusable": int((status == UNUSABLE).any(axis=1).sum()),
+    }
+    return ShardContent(task, arrays, attributes)
+
+
+def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
+    """Write the file of a shard so that it is there as a whole or not at all; return the number of its sweeps."""
+    import h5py
+
+    arrays, wrench = content.arrays, content.arrays["wrench"]
+    digest = hash_arrays(arrays)
+    with atomic_path(Path(folder) / content.task.name) as temporary:
+        with h5py.File(temporary, "w", alignment_threshold=ALIGNMENT, alignment_interval=ALIGNMENT) as file:
+            file.attrs.update({**content.attributes, "content_hash": digest})
+            for name, array in arrays.items():
+                if name != "wrench":
+                    file.create_dataset(name, data=array.astype(_stored(array)), track_times=False)
+            offset = _allocate(file, wrench.shape)
+            _name_axes(file)
+        # Past the library, which copies and lets no other thread write meanwhile.
+        with temporary.open("r+b", buffering=0) as stream:
+            stream.seek(offset)
+            _write_all(stream, wrench)
+    return len(content.task)
+
+
+def _tables(task: ShardTask, hashes: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return the names behind the numbers: times, whiskers, channels, classes and objects."""
+    mounts = list(default_array(task.grid.species).select(task.whiskers))
+    number = {label: index for index, label in enumerate(task.classes)}
+    return {
+        "time": task.grid.frames.times,
+        "whisker": _texts([mount.name for mount in mounts]),
+        "row": np.array([mount.row for mount in mounts], dtype=np.int16),
+        "col": np.array([mount.col for mount in mounts], dtype=np.int16),
+        "channel": _texts(CHANNELS),
+        "class": _texts(task.classes),
+        "object": _texts([item.name for item in task.objects]),
+        "object_class": np.array([number[item.label] for item in task.objects], dtype=np.int32),
+        "object_hash": _texts(hashes),
+    }
+
+
+def _hash_solid(solid: Solid) -> str:
+    """Hash what whiskers touch of a solid; what a decomposition was made from stands for it on every machine."""
+    if solid.origin is not None:
+        return content_hash(solid.origin, round(solid.diagonal, 12))
+    if solid.surface is not None:
+        return content_hash(solid.surface.vertices, solid.surface.faces)
+    return str(solid.config()["hash"])
+
+
+def _conditions(task: ShardTask) -> dict[str, NDArray[Any]]:
+    """Return, for each sweep, its number, class, object and conditions."""
+    sweeps: list[Sweep] = []
+    for owner, item in enumerate(task.objects):
+        every = task.grid.sweeps(item.name)
+        sweeps += [every[within] for within in task.within[task.owner == owner].tolist()]
+    number = {label: index for index, label in enumerate(task.classes)}
+    labels = np.array([number[item.label] for item in task.objects], dtype=np.int32)
+    kinds = {name: np.int32 if name == "draw" else np.float64 for name in _CONDITIONS}
+    return {
+        "sweep": task.index.astype(np.int64),
+        "label": labels[task.owner],
+        "owner": task.owner.astype(np.int32),
+        **{name: np.array([getattr(sweep, name) for sweep in sweeps], dtype=kinds[name]) for name in _CONDITIONS},
+    }
+
+
+def _texts(values: Any) -> NDArray[np.bytes_]:
+    """Texts as UTF-8 of a fixed length, which has the same bytes in every file."""
+    encoded = [str(value).encode() for value in values]
+    return np.array(encoded, dtype=f"S{max(1, *map(len, encoded))}")
+
+
+def _stored(array: NDArray[Any]) -> Any:
+    import h5py
+
+    if array.dtype.kind == "S":
+        return h5py.string_dtype("utf-8", array.dtype.itemsize)
+    return array.dtype.newbyteorder("<")
+
+
+def _allocate(file: Any, shape: tuple[int, ...]) -> int:
+    """Make room for the forces, contiguous and not yet written; return where in the file it is."""
+    import h5py
+
+    create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    create.set_layout(h5py.h5d.CONTIGUOUS)
+    create.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    create.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    create.set_obj_track_times(False)
+    kind = h5py.h5t.py_create(np.dtype("<f4"))
+    dataset = h5py.h5d.create(file.id, b"wrench", kind, h5py.h5s.create_simple(shape), create)
+    h5py.Dataset(dataset).attrs["units"] = "N (F), N m (M)"
+    return int(dataset.get_offset())
+
+
+def _name_axes(file: Any) -> None:
+    """Attach the tables as dimension scales, so that xarray opens the file with named axes."""
+    axes = {
+        "wrench": ("sweep", "time", "whisker", "channel"),
+        **dict.fromkeys(("contact", "status"), ("sweep", "whisker")),
+        **dict.fromkeys(("label", "owner", "reason", *_CONDITIONS), ("sweep",)),
+        **dict.fromkeys(("row", "col"), ("whisker",)),
+        **dict.fromkeys(("object_class", "object_hash"), ("object",)),
+    }
+    for scale in ("sweep", "time", "whisker", "channel", "class", "object"):
+        file[scale].make_scale(scale)
+    for name, scales in axes.items():
+        for axis, scale in enumerate(scales):
+            file[name].dims[axis].attach_scale(file[scale])
+
+
+def _write_all(stream: Any, array: NDArray[np.float32]) -> None:
+    """Write all bytes of an array; one call of the system writes at most 2 GiB."""
+    rest = memoryview(array.view(np.uint8).reshape(-1).data)
+    while rest:
+        rest = rest[stream.write(rest) :]

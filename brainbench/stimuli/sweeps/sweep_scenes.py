@@ -1,0 +1,183 @@
+"""Passive sweeps: objects brush past a still array, or the array past them, over the conditions of a grid.
+
+The two grids of the thesis (chapter 3, table 3.1) are :data:`GRIDS`. Nothing is built or simulated until a
+scene is asked for: 9981 objects × 208 sweeps are a few numbers and a list of names.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, cast, overload
+
+import numpy as np
+
+from brainbench.core.errors import UsageError, listing
+from brainbench.stimuli.objects.placed_object import Solid, euler_matrix
+from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Head, Scene
+from brainbench.stimuli.sweeps.grid import Span, Sweep, SweepGrid, default_array
+
+
+class SweepScenes(Sequence[Scene]):
+    """Every sweep of every object, built one at a time on request.
+
+    Raises:
+        UsageError: there is no object, or two have the same name.
+    """
+
+    def __init__(
+        self,
+        grid: SweepGrid,
+        objects: Iterable[Solid] | Mapping[str, Solid | Callable[[], Solid]],
+        *,
+        whiskers: str = "all",
+    ) -> None:
+        """Take ``objects`` as solids, or as a mapping from names to solids or to functions that load them."""
+        named: dict[str, Solid | Callable[[], Solid]]
+        if isinstance(objects, Mapping):
+            named = dict(cast("Mapping[str, Solid | Callable[[], Solid]]", objects))
+        else:
+            solids = list(objects)
+            names = [solid.name for solid in solids]
+            if len(set(names)) < len(names):
+                twice = sorted({name for name in names if names.count(name) > 1})
+                raise UsageError(f"Several objects are called {listing(twice)}; give a mapping from names to objects.")
+            named = {solid.name: solid for solid in solids}
+        if not named:
+            raise UsageError("Sweeps need at least one object to move past the whiskers.")
+        self.grid = grid
+        self.array = default_array(grid.species).select(whiskers)
+        self._objects = named
+        self._names = tuple(self._objects)
+        self._last: tuple[str, Solid] | None = None
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects."""
+        return self._names
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the scenes in order; no object is loaded."""
+        return tuple(f"{name}/{sweep.label}" for name, sweep in self.enumerate())
+
+    def enumerate(self) -> Iterator[tuple[str, Sweep]]:
+        """Yield (object name, sweep) in the order of the scenes, without loading or building anything."""
+        for name in self._names:
+            for sweep in self.grid.sweeps(name):
+                yield name, sweep
+
+    def __len__(self) -> int:
+        return len(self._names) * self.grid.count
+
+    @overload
+    def __getitem__(self, index: int) -> Scene: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Scene, ...]: ...
+    def __getitem__(self, index: int | slice) -> Scene | tuple[Scene, ...]:
+        """Build one scene, or those of a slice."""
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(*index.indices(len(self))))
+        which, within = divmod(range(len(self))[index], self.grid.count)
+        name = self._names[which]
+        sweep = self.grid.sweeps(name)[within]
+        return self.grid.scene(self.solid(name), sweep, label=f"{name}/{sweep.label}", array=self.array)
+
+    def __repr__(self) -> str:
+        return f"SweepScenes({len(self._names)} objects × {self.grid.count} sweeps = {len(self)} scenes)"
+
+    def solid(self, name: str) -> Solid:
+        """Return one of the objects; neighbouring calls for the same object load it once."""
+        # Neighbouring scenes share their object, and loading one may mean decomposing a mesh.
+        last = self._last
+        if last is None or last[0] != name:
+            item = self._objects[name]
+            # Threads may ask for different objects.
+            self._last = last = (name, item if isinstance(item, Solid) else item())
+        return last[1]
+
+
+def counts(scenes: SweepScenes) -> dict[str, Any]:
+    """Return how much a recipe enumerates: objects, sweeps per object, scenes, whiskers, draws, and what was published.
+
+    ``bytes`` is the size of all forces as float32 [scene, frame, whisker, channel].
+    """
+    grid = scenes.grid
+    per_scene = grid.frames.count * len(scenes.array) * 6 * 4
+    return {
+        "objects": len(scenes.objects),
+        "sweeps_per_object": grid.count,
+        "scenes": len(scenes),
+        "whiskers": len(scenes.array),
+        "draws": grid.draws,
+        "bytes": per_scene * len(scenes),
+        "published": grid.published,
+    }
+
+
+def _thesis_head() -> Head:
+    """Return the head of the released sweep scripts, (−6.934, −11.642, −2.598) mm and (0, 15.366, −16.198)°.
+
+    The origin of the array lies at (0, 13, 1.5) mm in the head.
+    """
+    rotation = (0.0, math.radians(15.366), math.radians(-16.198))
+    origin = np.array([-6.934, -11.642, -2.598]) + euler_matrix(rotation) @ np.array([0.0, 13.0, 1.5])
+    x, y, z = (origin * 1e-3).tolist()
+    return Head((x, y, z), rotation)
+
+
+def _degrees(*values: float) -> tuple[float, ...]:
+    return tuple(map(math.radians, values))
+
+
+GRIDS: dict[str, SweepGrid] = {
+    "thesis-low": SweepGrid(
+        speed=(0.030,),
+        height=(-0.005, 0.0),
+        rotation=_degrees(0, 30, 90, 120),
+        distance=(0.005, 0.008),
+        size=(0.040,),
+        start=0.016,
+        head=_thesis_head(),
+        frames=Frames(first=0.001, interval=0.009, count=110),
+        published="text and lists of table 3.1: 16 sweeps per object (159,696 over 9981 objects); "
+        "total printed in table 3.1: 316,192, which is no multiple of 9981",
+    ),
+    "thesis-high": SweepGrid(
+        speed=Span(0.030, 0.060, 0.001),
+        height=(-0.003, 0.0, 0.003),
+        rotation=Span(0.0, math.radians(89), math.radians(1)),
+        distance=(0.005,),
+        size=Span(0.020, 0.060, 0.001),
+        turns=_degrees(0, 90, 180, 270),
+        draws=26,
+        heights_per_draw=2,
+        start=0.020,
+        head=_thesis_head(),
+        frames=Frames(first=0.0, interval=1 / 110, count=110),
+        published="total of table 3.1: 2,076,048 = 208 per object; entries of table 3.1: 3 heights × 26 draws = 78; "
+        "text: 288; released scripts: 26 draws × 3 heights × 4 quarter turns = 312",
+    ),
+}
+"""The published grids, with the released head, start and frame times.
+
+``thesis-low``: 1000 Hz, 30 mm/s, heights −5 and 0 mm, rotations 0, 30, 90, 120°, distances 5 and 8 mm, 40 mm.
+
+``thesis-high``: 26 draws per object of speed (30–60 mm/s), size (20–60 mm) and rotation (0–89°, in whole mm/s, mm
+and degrees, as the released scripts draw them), each at the four quarter turns and at two of the three heights
+−3, 0, 3 mm in rotation, at 5 mm: 26 × 4 × 2 = 208, the only whole number of sweeps that agrees with the
+published total. Which heights the published set left out is not known. Of the draws the released scripts keep
+the last two for testing. The published low-fidelity physics at 110 Hz is not imitated: only the frames are.
+"""
+
+DESCRIPTIONS = {
+    "thesis-low": "Objects brushed past the right whiskers of a mouse (thesis, table 3.1, set 1: low variation)",
+    "thesis-high": "Objects brushed past the right whiskers of a mouse (thesis, table 3.1, set 2: high variation)",
+}
+
+
+def describe_grid(name: str) -> str:
+    """Return a grid's description with our count and, beside it, what was published."""
+    grid = GRIDS[name]
+    return f"{DESCRIPTIONS[name]}. Here: {grid.count} sweeps per object. Published: {grid.published}."

@@ -1,0 +1,321 @@
+"""Closed forms and reference solutions of whisker mechanics, free of any physics engine.
+
+A whisker is an Euler-Bernoulli rod clamped at its base (inextensible, no shear, no twist). Frame: base
+point at the origin, x along the whisker, bending in the x-y plane. SI units. All results were checked
+against published tables and independent quadrature in the tests.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.whiskers.whisker import Whisker
+
+_STEPS = 400
+_ELEMENTS = 160
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Equilibrium of a rod pressed by a frictionless peg, in the plane of bending."""
+
+    force: tuple[float, float]
+    """Force of the peg on the rod (Fx, Fy) [N]; equal to the action of the whisker on its base."""
+    moment: float
+    """Moment Mz of the whisker on its base about the base point [N·m]."""
+    arc: float
+    """Arc length of the contact [m]."""
+    slope: float
+    """Angle of the rod against x at the contact [rad]."""
+    point: tuple[float, float]
+    """Centre-line point at the contact [m]."""
+
+    @property
+    def wrench(self) -> NDArray[np.float64]:
+        """Action of the whisker on its base [6]: force (N), then moment (N·m)."""
+        return np.array([*self.force, 0.0, 0.0, 0.0, self.moment])
+
+
+def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
+    """Deflection [m] under a transverse point load F at arc length a of a straight cone, small bending.
+
+    δ = F a³/(3 E I_b) · r_b/r(a), exact for a linear taper.
+    """
+    _check_at(whisker, at)
+    _check_straight(whisker)
+    stiffness = float(whisker.bending_stiffness(0.0))
+    return force * at**3 / (3 * stiffness) * whisker.base_radius / float(whisker.radius(at))
+
+
+def point_load_slope(whisker: Whisker, force: float, at: float) -> float:
+    """Slope [rad] at a transverse point load F at arc length a of a straight cone, small bending.
+
+    F Lc²/(E I_b) · (1 − u)²(1 + 2u)/(6u²) with u = r(a)/r_b and Lc = L r_b/(r_b − r_t); its limit
+    F a²/(2 E I) for a cylinder.
+    """
+    _check_at(whisker, at)
+    _check_straight(whisker)
+    stiffness = float(whisker.bending_stiffness(0.0))
+    u = float(whisker.radius(at)) / whisker.base_radius
+    # a = Lc (1 − u), so Lc²(1 − u)² = a²: this form has no 0/0 for a cylinder.
+    return force * at**2 / stiffness * (1 + 2 * u) / (6 * u**2)
+
+
+def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]:
+    """Lowest bending frequencies [count] (Hz), base clamped, tip free, any taper and density gradient.
+
+    Euler-Bernoulli finite elements (cubic Hermite, 4-point quadrature of the exact E I(s) and mass).
+    For uniform density f_n = λ_n r_b √(E/ρ)/(4π L²), with λ_n depending on r_t/r_b alone.
+    """
+    from scipy.linalg import eigh
+
+    size = 2 * _ELEMENTS + 2
+    stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
+    length = whisker.arc_length / _ELEMENTS
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
+        shape = np.array(
+            [
+                1 - 3 * node**2 + 2 * node**3,
+                length * (node - 2 * node**2 + node**3),
+                3 * node**2 - 2 * node**3,
+                length * (node**3 - node**2),
+            ]
+        )
+        bend = np.array([-6 + 12 * node, length * (-4 + 6 * node), 6 - 12 * node, length * (6 * node - 2)]) / length**2
+        s = (np.arange(_ELEMENTS) + node) * length
+        for e, (k, m) in enumerate(zip(whisker.bending_stiffness(s), whisker.linear_density(s), strict=True)):
+            block = slice(2 * e, 2 * e + 4)
+            stiffness[block, block] += weight * length * k * np.outer(bend, bend)
+            mass[block, block] += weight * length * m * np.outer(shape, shape)
+    # Rotations scaled by the length make the matrices well conditioned; the base node is clamped.
+    scale = np.tile([1.0, 1 / whisker.arc_length], _ELEMENTS + 1)[2:]
+    stiffness = stiffness[2:, 2:] * np.outer(scale, scale)
+    mass = mass[2:, 2:] * np.outer(scale, scale)
+    inverse = eigh(mass, stiffness, eigvals_only=True, subset_by_index=[size - 2 - count, size - 3])[::-1]
+    return 1 / np.sqrt(inverse) / (2 * np.pi)
+
+
+@lru_cache(maxsize=256)
+def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
+    """Large bending by a frictionless point peg at the point (``at``, ``offset``) of the plane [m].
+
+    Solves x' = cos θ, y' = sin θ, E I(s)(θ' − κ₀(s)) = (a − x) Fy − (d − y) Fx with F normal to the rod at
+    the contact, on the branch that starts from the undeformed rod. The peg pushes towards +y when
+    ``offset`` lies above the rest shape, else towards −y.
+
+    Raises:
+        UsageError: there is no such equilibrium: the whisker slips off the peg before.
+    """
+    _check_at(whisker, at)
+    rest = whisker.curvature * at**2
+    return _Branch(whisker, at, 1 if offset >= rest else -1).reach(offset)
+
+
+def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radius: float, *, side: int = 1) -> Contact:
+    """Large bending by a frictionless round peg of radius ``peg_radius`` [m] with its axis at ``centre`` [m].
+
+    The rod's own radius counts: its centre line passes one radius sum from the axis. The peg pushes
+    towards +y for ``side`` 1 and towards −y for −1.
+
+    Raises:
+        UsageError: there is no such equilibrium, or the peg does not touch.
+    """
+    _check_at(whisker, centre[0])
+    return _Branch(whisker, centre[0], side, peg_radius).reach(centre[1])
+
+
+def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[float, float]:
+    """Axis [m] of the round peg of radius ``peg_radius`` [m] that holds ``contact``.
+
+    It lies one peg radius plus the local rod radius from the centre line, along the rod's normal.
+    """
+    gap = math.copysign(peg_radius + float(whisker.radius(contact.arc)), contact.moment)
+    return contact.point[0] + gap * math.sin(contact.slope), contact.point[1] - gap * math.cos(contact.slope)
+
+
+def slip_off_offset(whisker: Whisker, at: float, *, side: int = 1, peg_radius: float | None = None) -> float:
+    """Offset [m] at which a frictionless peg at distance ``at`` [m] loses the whisker.
+
+    Beyond it no equilibrium exists: the contact has run to the tip, or the rod yields without limit. The offset
+    is that of the centre-line point at the contact of a point peg, or of the axis of a round peg of ``peg_radius`` [m].
+    """
+    _check_at(whisker, at)
+    return _Branch(whisker, at, side, peg_radius).limit()
+
+
+class _Branch:
+    """Equilibria with one peg, ordered by the slope θc of the rod at the contact.
+
+    Given θc, the force f and the contact arc follow from integrating backwards from the contact, where
+    the moment is zero: θ' = κ₀ + M/(E I), M' = −f cos(θ − θc). Everything is mirrored to a push to +y.
+    """
+
+    _STRIDE = math.radians(2.0)
+
+    def __init__(self, whisker: Whisker, at: float, side: int, peg_radius: float | None = None) -> None:
+        if side not in (1, -1):
+            raise UsageError(f"side is 1 (push towards +y) or -1 (towards -y); received {side!r}.")
+        self.whisker, self.at, self.side, self.peg_radius = whisker, at, side, peg_radius
+        self.curvature = side * whisker.curvature
+
+    def reach(self, offset: float) -> Contact:
+        """Return the equilibrium with the peg at ``offset`` (signed)."""
+        from scipy.optimize import brentq
+
+        target = self.side * offset
+        before = None
+        for slope, guess, height in self._walk():
+            if height >= target:
+                if before is None:
+                    if math.isclose(height, target, abs_tol=1e-12 * self.at):
+                        return self._contact(slope, guess)
+                    raise UsageError(f"A peg at ({self.at:g}, {offset:g}) m does not touch the undeformed whisker.")
+                low = before
+
+                def miss(angle: float, low: tuple = low) -> float:
+                    return self._height(angle, self._settle(angle, low[1])) - target
+
+                root = cast("float", brentq(miss, low[0], slope, xtol=1e-13))
+                return self._contact(root, self._settle(root, guess))
+            before = (slope, guess)
+        raise UsageError(
+            f"A peg at ({self.at:g}, {offset:g}) m has no equilibrium with this whisker: it slips off at an offset "
+            f"of {self.side * self.limit():.4g} m; choose a smaller offset."
+        )
+
+    def limit(self) -> float:
+        """Return the largest offset (signed) that holds the whisker."""
+        from scipy.optimize import minimize_scalar
+
+        points = list(self._walk())
+        top = max(range(len(points)), key=lambda k: points[k][2])
+        low = points[max(top - 1, 0)]
+        found = minimize_scalar(
+            lambda angle: -self._height_or_nothing(angle, low[1]),
+            bounds=(low[0], points[top][0] + self._STRIDE),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        return self.side * max(points[top][2], -float(found.fun))
+
+    def _height_or_nothing(self, slope: float, guess: NDArray) -> float:
+        settled = self._settle(slope, guess)
+        return self._height(slope, settled) if self._valid(settled) else 0.0
+
+    def _walk(self):  # noqa: ANN202
+        """Yield (slope, (force, arc), peg offset) from the first touch on, while equilibria exist."""
+        rest = math.atan(2 * self.curvature * self.at)
+        slope, previous = rest, None
+        guess = np.array([0.0, self._rest_arc()])
+        # Near the fold the rod turns back over the peg: slopes beyond 90° are equilibria too.
+        while slope < math.pi + rest:
+            settled = self._settle(slope, guess)
+            height = self._height(slope, settled)
+            if not self._valid(settled):
+                return
+            yield slope, settled, height
+            guess = settled if previous is None else 2 * settled - previous
+            previous, slope = settled, slope + self._STRIDE
+
+    def _valid(self, settled: NDArray) -> bool:
+        return bool(np.isfinite(settled).all()) and settled[1] <= self.whisker.arc_length
+
+    def _rest_arc(self) -> float:
+        u = 2 * self.curvature * self.at
+        return self.at if abs(u) < 1e-9 else (u * math.sqrt(1 + u * u) + math.asinh(u)) / (4 * self.curvature)
+
+    def _settle(self, slope: float, guess: NDArray) -> NDArray[np.float64]:
+        """Newton's method for (force, arc) at one contact slope; NaN when it finds none."""
+        force_scale = float(self.whisker.bending_stiffness(0.0)) / self.at**2
+        scale = np.array([force_scale, self.at])
+        z = guess / scale
+        for _ in range(40):
+            residual = self._residual(slope, *(z * scale))
+            jacobian = np.stack(
+                [(self._residual(slope, *((z + e) * scale)) - residual) / 1e-7 for e in 1e-7 * np.eye(2)], axis=1
+            )
+            if not np.isfinite(jacobian).all() or abs(np.linalg.det(jacobian)) < 1e-14:
+                return np.full(2, math.nan)
+            step = np.linalg.solve(jacobian, residual)
+            z = z - step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-300))
+            if np.abs(step).max() < 1e-12:
+                return z * scale
+        return np.full(2, math.nan)
+
+    def _residual(self, slope: float, force: float, arc: float) -> NDArray[np.float64]:
+        angle, x, _, _ = self._integrate(slope, force, arc)
+        return np.array([angle, (x - self.at + self._gap(arc) * math.sin(slope)) / self.at])
+
+    def _height(self, slope: float, settled: NDArray) -> float:
+        """Offset of the peg that belongs to an equilibrium."""
+        if not np.isfinite(settled).all():
+            return math.nan
+        return self._integrate(slope, *settled)[2] - self._gap(settled[1]) * math.cos(slope)
+
+    def _gap(self, arc: float) -> float:
+        return 0.0 if self.peg_radius is None else self.peg_radius + float(self.whisker.radius(arc))
+
+    def _contact(self, slope: float, settled: NDArray) -> Contact:
+        force, arc = map(float, settled)
+        _, x, y, moment = self._integrate(slope, force, arc)
+        return Contact(
+            force=(-force * math.sin(slope), self.side * force * math.cos(slope)),
+            moment=self.side * moment,
+            arc=arc,
+            slope=self.side * slope,
+            point=(x, self.side * y),
+        )
+
+    def _integrate(self, slope: float, force: float, arc: float) -> tuple[float, float, float, float]:
+        """Base angle, contact point (x, y) and base moment, by Runge-Kutta steps from the contact to the base."""
+        half = np.linspace(arc, 0.0, 2 * _STEPS + 1)
+        flexibility = 1 / np.maximum(self.whisker.bending_stiffness(half), 1e-300)
+        rest = self._rest_curvature(half)
+        step = -arc / _STEPS
+        angle, moment, x, y = slope, 0.0, 0.0, 0.0
+        pairs = list(zip(flexibility.tolist(), rest.tolist(), strict=True))
+        for k in range(_STEPS):
+            (f0, c0), (f1, c1), (f2, c2) = pairs[2 * k : 2 * k + 3]
+            a1, m1 = c0 + moment * f0, -force * math.cos(angle - slope)
+            t2 = angle + step / 2 * a1
+            a2, m2 = c1 + (moment + step / 2 * m1) * f1, -force * math.cos(t2 - slope)
+            t3 = angle + step / 2 * a2
+            a3, m3 = c1 + (moment + step / 2 * m2) * f1, -force * math.cos(t3 - slope)
+            t4 = angle + step * a3
+            a4, m4 = c2 + (moment + step * m3) * f2, -force * math.cos(t4 - slope)
+            x -= step / 6 * (math.cos(angle) + 2 * math.cos(t2) + 2 * math.cos(t3) + math.cos(t4))
+            y -= step / 6 * (math.sin(angle) + 2 * math.sin(t2) + 2 * math.sin(t3) + math.sin(t4))
+            angle += step / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+            moment += step / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
+        return angle, x, y, moment
+
+    def _rest_curvature(self, s: NDArray) -> NDArray[np.float64]:
+        """Curvature of the rest shape [1/m]."""
+        return 2 * self.curvature * np.cos(self.whisker.tangent_angle(np.abs(s))) ** 3
+
+
+def _check_at(whisker: Whisker, at: float) -> None:
+    if not 0 < at <= whisker.arc_length:
+        raise UsageError(
+            f"The distance from the base must lie in 0 < at ≤ {whisker.arc_length:g} m, the arc length; "
+            f"received {at:g} m."
+        )
+
+
+def _check_straight(whisker: Whisker) -> None:
+    if whisker.curvature:
+        raise UsageError(
+            f"This closed form is for a straight whisker; this one has curvature {whisker.curvature:g} 1/m; "
+            "use elastica, which takes any curvature."
+        )

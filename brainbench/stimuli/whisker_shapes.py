@@ -1,0 +1,161 @@
+"""The shapes of whiskers over time, and the bending moments along them.
+
+A stimulus set holds forces only; shapes are simulated when a picture asks for them, up to the last
+instant it shows, and kept in the cache.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import DEFAULT_BACKEND, get_backend
+from brainbench.stimuli.engines.fidelity import Fidelity
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from brainbench.core.progress import Progress
+    from brainbench.stimuli.engines.protocol import Backend, Job
+    from brainbench.stimuli.scenes.scene import Scene
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Shapes of the whiskers of one scene. Letters: n instant, N link."""
+
+    scene: Scene
+    times: NDArray[np.float64]
+    """[n] s."""
+    joints: tuple[NDArray[np.float64], ...]
+    """Per whisker [n, N + 1, 3]: joints and tip (m, world); NaN from where its simulation became unstable."""
+    moments: tuple[NDArray[np.float64], ...]
+    """Per whisker [n, N + 1]: elastic bending moment at the joints and the tip (N·m, without sign)."""
+
+    @property
+    def unstable(self) -> tuple[str, ...]:
+        """Names of the whiskers whose shape is not known at every instant."""
+        pairs = zip(self.scene.names, self.joints, strict=True)
+        return tuple(name for name, points in pairs if not np.isfinite(points).all())
+
+
+def record(
+    scene: Scene,
+    times: ArrayLike,
+    *,
+    fidelity: Fidelity | str | None = None,
+    backend: Backend | str = DEFAULT_BACKEND,
+    progress: Progress | None = None,
+    cache: bool = True,
+) -> Recording:
+    """Simulate a scene and return the shapes of its whiskers.
+
+    Args:
+        scene: what to simulate; its frames do not matter.
+        times: instants [n] (s), increasing, not before t = 0.
+        fidelity, backend, progress: as for :func:`brainbench.stimuli.simulate`.
+        cache: read and keep shapes under ``brainbench.core.files.cache_dir("shapes")``.
+
+    Raises:
+        UsageError: the times do not increase, or the backend reports no shapes.
+    """
+    from brainbench.stimuli.simulation import cache_path
+
+    times = np.atleast_1d(np.asarray(times, dtype=float))
+    fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
+    fidelity = Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
+    engine = get_backend(backend) if isinstance(backend, str) else backend
+    jobs = [replace(job, times=times) for job in scene.jobs()]
+    path = None
+    if cache and isinstance(backend, str):
+        path = cache_path([scene], fidelity, engine.name, times, folder="shapes").with_suffix(".npz")
+    local = None if path is None else _read(path, len(jobs))
+    if local is None:
+        local = _simulate(jobs, fidelity, engine, progress)
+        if path is not None:
+            _write(path, local)
+    moments = tuple(bending_moments(job, points) for job, points in zip(jobs, local, strict=True))
+    # Jobs stand in the frame of their array as it was at t = 0.
+    origins = [part.head.position for part in scene.split() for _ in part.array]
+    places = zip(local, scene.axes, origins, strict=True)
+    joints = tuple(points @ axes.T + np.asarray(origin) for points, axes, origin in places)
+    return Recording(scene, times, joints, moments)
+
+
+def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the elastic moment [n, N + 1] (N·m) at each joint of a chain; zero at the tip.
+
+    The moment is the hinge's stiffness times the angle by which the link after the joint is turned from
+    its rest direction (:mod:`brainbench.stimuli.whiskers.chain`); damping and twist carry none of it.
+
+    Args:
+        job: the whisker, with the times [n] of the shapes.
+        joints: [n, N + 1, 3] m, in the frame of the job.
+    """
+    from brainbench.stimuli.engines.protocol import base_rotation
+    from brainbench.stimuli.whiskers.chain import build_chain
+
+    links = joints.shape[1] - 1
+    chain = build_chain(job.whisker, links)
+    along = np.diff(joints, axis=1)
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    frame = base_rotation(job.follicle.pose(job.times)[1])
+    moments = np.zeros(joints.shape[:2])
+    for link in range(links):
+        cosine, sine = np.cos(chain.rest_angles[link]), np.sin(chain.rest_angles[link])
+        frame = frame @ np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        x, y, z = np.moveaxis(np.einsum("nji,nj->ni", frame, along[:, link]), -1, 0)
+        about_y, about_z = np.arctan2(-z, x), np.arctan2(y, np.hypot(x, z))
+        moments[:, link] = chain.stiffness[link] * np.hypot(about_y, about_z)
+        # The new link's axes: x along it, turned by the hinges about y and z without twist.
+        across = np.stack([-np.cos(about_y) * np.sin(about_z), np.cos(about_z), np.sin(about_y) * np.sin(about_z)], -1)
+        second = np.einsum("nij,nj->ni", frame, across)
+        frame = np.stack([along[:, link], second, np.cross(along[:, link], second)], axis=-1)
+    return moments
+
+
+def _simulate(
+    jobs: Sequence[Job], fidelity: Fidelity, engine: Backend, progress: Progress | None
+) -> list[NDArray[np.float64]]:
+    report = None if progress is None else lambda done, total: progress(done, total, "simulating shapes")
+    traces = engine.run(jobs, fidelity, progress=report, record_shape=True)
+    shapes: list[Any] = [trace.link_positions for trace in traces]
+    if any(shape is None for shape in shapes):
+        raise UsageError(
+            f"The backend {engine.name!r} reports no whisker shapes, so nothing can be drawn; use 'rod' or 'mujoco'."
+        )
+    return shapes
+
+
+def _read(path: Path, count: int) -> list[NDArray[np.float64]] | None:
+    """Return the shapes in a cache file; None when there are none or they are damaged."""
+    import zipfile
+
+    if not path.is_file():
+        return None
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            return [stored[f"whisker{index}"].astype(float) for index in range(count)]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        _LOG.warning("cached shapes are damaged and are simulated again: %s", error)
+        return None
+
+
+def _write(path: Path, shapes: Sequence[NDArray[np.float64]]) -> None:
+    from brainbench.core.files import atomic_path
+
+    try:
+        with atomic_path(path) as temporary:
+            named: dict[str, Any] = {f"whisker{index}": shape for index, shape in enumerate(shapes)}
+            np.savez_compressed(temporary, **named)
+    except OSError as error:
+        _LOG.warning("the shapes could not be kept in the cache (%s)", error)

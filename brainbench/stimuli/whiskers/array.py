@@ -1,0 +1,291 @@
+"""Whisker arrays of the mouse and the rat, from published measurements or from the equations fitted to them.
+
+Array frame: origin at the mean of all base points of both sides, x to the animal's right, y rostral,
+z dorsal; metres. The tables under ``data/`` hold the published numbers (mm, rad) with their sources.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Any, Literal
+
+from brainbench.core.contracts import GRID_SHAPE
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.stimuli.whiskers.selection import match_whiskers
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+Side = Literal["right", "left", "both"]
+Source = Literal["average", "model"]
+SPECIES = ("mouse", "rat")
+SIDES = ("right", "left", "both")
+SOURCES = ("average", "model")
+
+_MM = 1e-3
+
+
+@dataclass(frozen=True)
+class MountedWhisker:
+    """One whisker with its place on the face."""
+
+    name: str
+    """Row letter and column number, such as ``C2``."""
+    side: Literal["right", "left"]
+    row: int
+    """0 for row A to 4 for row E."""
+    col: int
+    position: tuple[float, float, float]
+    """Base point [m, array frame]."""
+    angles: tuple[float, float, float]
+    """(θ, φ, ζ) at rest [rad]: Rz(θ − π/2) · Ry(−φ) · Rx(ζ + π/2) maps the base frame to the array frame."""
+    whisker: Whisker
+
+    @property
+    def cell(self) -> int:
+        """Flat index row·7 + col in the 5 × 7 grid."""
+        return self.row * GRID_SHAPE[1] + self.col
+
+    def mirrored(self) -> MountedWhisker:
+        """Return the whisker of the other side: x, θ and ζ change sign, the curvature does not."""
+        (x, y, z), (theta, phi, zeta) = self.position, self.angles
+        side = "left" if self.side == "right" else "right"
+        return dataclasses.replace(self, side=side, position=(-x, y, z), angles=(-theta, phi, -zeta))
+
+
+@dataclass(frozen=True)
+class WhiskerArray:
+    """An ordered set of mounted whiskers.
+
+    >>> WhiskerArray.mouse(whiskers="C0-C3").names
+    ('C0', 'C1', 'C2', 'C3')
+    """
+
+    species: str
+    mounts: tuple[MountedWhisker, ...]
+    citation: str = ""
+
+    @classmethod
+    def mouse(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
+        """Return the average mouse (Bresee et al. 2023): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E0–E5.
+
+        Args:
+            side: ``right`` (published), ``left`` (its exact mirror image) or ``both``.
+            whiskers: a selection as :meth:`select` takes it.
+            source: ``average``; there is no ``model`` of the mouse here.
+
+        Raises:
+            UsageError: a name is unknown, or the model equations of the mouse are asked for.
+        """
+        return _array("mouse", source).on_side(side).select(whiskers)
+
+    @classmethod
+    def rat(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
+        """Return the rat (Belli et al. 2018): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E1–E6.
+
+        Args:
+            side: ``right`` (published), ``left`` (its exact mirror image) or ``both``.
+            whiskers: a selection as :meth:`select` takes it.
+            source: ``average``, the measured means; or ``model``, the equations fitted to them, which give
+                arc length, curvature, base point and angles from row and column alone.
+
+        Raises:
+            UsageError: a name is unknown.
+        """
+        return _array("rat", source).on_side(side).select(whiskers)
+
+    def __iter__(self) -> Iterator[MountedWhisker]:
+        return iter(self.mounts)
+
+    def __len__(self) -> int:
+        return len(self.mounts)
+
+    def __getitem__(self, name: str) -> MountedWhisker:
+        return self.mounts[self._index(name)]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Unique names in order: ``C2``, or ``RC2`` and ``LC2`` when the array has both sides."""
+        both = len({mount.side for mount in self.mounts}) > 1
+        return tuple((mount.side[0].upper() if both else "") + mount.name for mount in self.mounts)
+
+    @property
+    def side(self) -> Side:
+        """``right``, ``left`` or ``both``."""
+        first = self.mounts[0].side
+        return first if all(mount.side == first for mount in self.mounts) else "both"
+
+    def on_side(self, side: Side) -> WhiskerArray:
+        """Return the one-sided array on the right, on the left or, mirrored, on both sides (right first)."""
+        if side not in SIDES:
+            raise unknown_name("side", str(side), SIDES)
+        if side == self.side:
+            return self
+        if self.side == "both":
+            mounts = tuple(mount for mount in self.mounts if mount.side == side)
+        else:
+            other = tuple(mount.mirrored() for mount in self.mounts)
+            pair = (self.mounts, other) if self.side == "right" else (other, self.mounts)
+            mounts = {"right": pair[0], "left": pair[1], "both": pair[0] + pair[1]}[side]
+        return dataclasses.replace(self, mounts=mounts)
+
+    def select(self, pattern: str = "all") -> WhiskerArray:
+        """Return the named whiskers, in the order of the array.
+
+        Args:
+            pattern: ``all``, ``C2,D1``, ``C0-C3``, ``C*`` …; see
+            :func:`brainbench.stimuli.whiskers.selection.match_whiskers`.
+
+        Raises:
+            UsageError: a term names no whisker; the message has the nearest name.
+        """
+        rows, cols = [mount.row for mount in self.mounts], [mount.col for mount in self.mounts]
+        chosen = match_whiskers(pattern, self.names, rows, cols)
+        return dataclasses.replace(self, mounts=tuple(self.mounts[index] for index in chosen))
+
+    def replace(self, pattern: str = "all", **changes: Any) -> WhiskerArray:
+        """Return a copy in which the selected whiskers have other properties.
+
+        Args:
+            pattern: a selection as :meth:`select` takes it.
+            changes: fields of :class:`Whisker` (SI units), or ``position`` and ``angles``.
+
+        Raises:
+            UsageError: there is no such whisker or no such field.
+        """
+        own = {"position", "angles"}
+        allowed = own | {field.name for field in dataclasses.fields(Whisker)}
+        for key in changes:
+            if key not in allowed:
+                raise unknown_name("whisker property", key, sorted(allowed))
+        mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in own}
+        rod = {key: value for key, value in changes.items() if key not in own}
+        chosen = set(self.select(pattern).mounts)
+        mounts = tuple(
+            dataclasses.replace(mount, whisker=dataclasses.replace(mount.whisker, **rod), **mounted)
+            if mount in chosen
+            else mount
+            for mount in self.mounts
+        )
+        return dataclasses.replace(self, mounts=mounts)
+
+    def _index(self, name: str) -> int:
+        upper = [item.upper() for item in self.names]
+        if name.upper() not in upper:
+            raise unknown_name("whisker", name, self.names)
+        return upper.index(name.upper())
+
+
+def published_whisker(arc_length: float, curvature: float, row: int, col: int, *, species: str = "rat") -> Whisker:
+    """Return a whisker with the published rules for its diameters and its material.
+
+    Args:
+        arc_length: mm, as the published tables give it.
+        curvature: A of y = A x² in 1/mm, positive as published.
+        row: 0 for row A.
+        col: column number.
+        species: whose rules; those of ``mouse`` and ``rat`` have the same numbers.
+    """
+    table = _read(species)
+    base, tip = _radii(arc_length, row, col, table["diameter"])
+    material = {key: item["value"] for key, item in table["material"].items()}
+    return Whisker(
+        arc_length=arc_length * _MM,
+        base_radius=base * _MM,
+        tip_radius=tip * _MM,
+        young_modulus=material["young_modulus_pa"],
+        density=tuple(material["density_base_tip_kg_m3"]),
+        damping_ratio=material["damping_ratio"],
+        # The published bend angles are negative: the whisker curves towards local −y.
+        curvature=-curvature / _MM,
+        friction=material["friction"],
+    )
+
+
+def _array(species: str, source: str) -> WhiskerArray:
+    if source not in SOURCES:
+        raise unknown_name("source of an array", source, SOURCES)
+    if source == "average":
+        return _published(species)
+    if "model" not in _read(species):
+        raise UsageError(
+            f"There are no model equations of the {species} here: those of Bresee et al. (2023) are in no source that "
+            "we could read, and the released mouse scripts hold the rat's; use source='average', or the rat's model."
+        )
+    return _modelled(species)
+
+
+@cache
+def _read(species: str) -> dict[str, Any]:
+    text = resources.files("brainbench.stimuli").joinpath("data", f"{species}.json").read_text(encoding="utf-8")
+    return json.loads(text)
+
+
+@cache
+def _published(species: str) -> WhiskerArray:
+    """Build one species' table: the right side."""
+    table = _read(species)
+    entries = (dict(zip(table["columns"], row, strict=True)) for row in table["whiskers"])
+    mounts = tuple(_mount(entry, species) for entry in entries)
+    return WhiskerArray(species=table["species"], mounts=mounts, citation=table["citation"])
+
+
+@cache
+def _modelled(species: str) -> WhiskerArray:
+    """Build the whiskers of one species' table from its model equations: the right side."""
+    model = _read(species)["model"]
+    mounts = []
+    for average in _published(species):
+        known = {"row": float(average.row + 1), "column": float(average.col + 1)}
+        for key in ("theta_bp", "phi_bp", "r_bp"):
+            known[key] = _evaluate(model[key], known)
+        azimuth, elevation = math.radians(known["theta_bp"]), math.radians(known["phi_bp"])
+        radius = known["r_bp"] * _MM
+        theta, phi, zeta = (math.radians(_evaluate(model[key], known)) for key in ("theta", "phi", "zeta"))
+        length, curvature = math.exp(_evaluate(model["log_arc_length"], known)), _evaluate(model["curvature"], known)
+        mounts.append(
+            dataclasses.replace(
+                average,
+                position=(
+                    radius * math.cos(azimuth),
+                    radius * math.sin(azimuth),
+                    radius * math.sin(elevation),
+                ),
+                angles=(theta, phi, zeta),
+                whisker=published_whisker(length, curvature, average.row, average.col, species=species),
+            )
+        )
+    return WhiskerArray(species=species, mounts=tuple(mounts), citation=model["citation"])
+
+
+def _evaluate(terms: dict[str, float], known: dict[str, float]) -> float:
+    """Sum the terms of one equation: a constant and coefficients of known quantities or of their squares."""
+    values = {"constant": 1.0, **known, **{f"{key}_squared": value**2 for key, value in known.items()}}
+    return sum(factor * values[name] for name, factor in terms.items())
+
+
+def _mount(entry: dict[str, Any], species: str) -> MountedWhisker:
+    size = (entry["arc_length_mm"], entry["curvature_per_mm"], entry["row"], entry["column"])
+    return MountedWhisker(
+        name=entry["name"],
+        side="right",
+        row=entry["row"],
+        col=entry["column"],
+        position=(entry["x_mm"] * _MM, entry["y_mm"] * _MM, entry["z_mm"] * _MM),
+        angles=(entry["theta_rad"], entry["phi_rad"], entry["zeta_rad"]),
+        whisker=published_whisker(*size, species=species),
+    )
+
+
+def _radii(arc_length: float, row: int, col: int, rule: dict[str, Any]) -> tuple[float, float]:
+    """Base and tip radius [mm] by the rat equations of Belli et al. (2017); their row counts from 1."""
+    base = rule["base_diameter"]
+    slope = rule["radius_slope"]
+    diameter = base["constant"] + base["arc_length"] * arc_length + base["row"] * (row + 1) + base["column"] * col
+    taper = slope["constant"] + slope["row"] * (row + 1) + slope["column"] * col + slope["column_squared"] * col**2
+    radius = diameter / 2
+    return radius, max((radius - taper * arc_length) / 2, rule["tip_radius_floor_mm"])

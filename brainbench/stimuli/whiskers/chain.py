@@ -1,0 +1,177 @@
+"""A whisker as a chain of rigid tapered links joined by pairs of elastic hinges.
+
+Joint i stands at arc length i L/N for the bending of the cell around it, half a cell at the base, so
+its compliance is about 1/k = ∫ ds/(E I) over that cell. (Lumping the compliance at one end of each
+link, or locking the base joint, changes the stiffness by up to a quarter.) The virtual work of bending
+is ∫ M²/(E I) ds; interpolating M² by a parabola through three joints instead of a constant per cell
+shifts a little compliance between neighbours and makes ten links as good as thirty. Joints lie on the
+rest curve, so the whole intrinsic curvature survives any number of links. Letters: N link, 0 = base.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.whiskers.whisker import Whisker
+
+_STEEPEST = 1.4
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Rigid links and elastic joints of one whisker; SI units, link frames with x along the link."""
+
+    whisker: Whisker
+    nodes: NDArray[np.float64]
+    """[N + 1] arc lengths of the joints and of the tip (m)."""
+    points: NDArray[np.float64]
+    """[N + 1, 2] rest positions of the nodes in the base frame (m)."""
+    lengths: NDArray[np.float64]
+    """[N] chord lengths of the links (m)."""
+    rest_angles: NDArray[np.float64]
+    """[N] rest rotation about z of each link against the one before, the first against the base (rad)."""
+    radii: NDArray[np.float64]
+    """[N] mean radius of each link (m)."""
+    masses: NDArray[np.float64]
+    """[N] link masses (kg)."""
+    centres: NDArray[np.float64]
+    """[N] distance of each centre of mass from the link's joint (m)."""
+    inertias: NDArray[np.float64]
+    """[N, 2] axial and transverse moment of inertia about the centre of mass (kg·m²)."""
+    stiffness: NDArray[np.float64]
+    """[N] bending stiffness of each hinge (N·m/rad), the same about both axes."""
+
+    @property
+    def links(self) -> int:
+        """Number of links N."""
+        return len(self.lengths)
+
+    def frequencies(self, count: int = 1) -> NDArray[np.float64]:
+        """Lowest natural angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
+        from scipy.linalg import eigh
+
+        last = min(count, self.links) - 1
+        # K a = ω² M a, solved as M a = ω⁻² K a: the wanted modes are then the largest, best-resolved ones.
+        inverse = eigh(
+            self._planar_mass(),
+            np.diag(self.stiffness),
+            eigvals_only=True,
+            subset_by_index=[self.links - 1 - last, self.links - 1],
+        )
+        return 1 / np.sqrt(inverse[::-1])
+
+    def mode_shape(self, mode: int) -> NDArray[np.float64]:
+        """Bend of each joint [N] (rad, largest 1) in one undamped mode of small planar motion, 0 for the first."""
+        from scipy.linalg import eigh
+
+        index = self.links - 1 - mode
+        _, shapes = eigh(self._planar_mass(), np.diag(self.stiffness), subset_by_index=[index, index])
+        return shapes[:, 0] / np.abs(shapes[:, 0]).max()
+
+    def damping(self, time_step: float) -> NDArray[np.float64]:
+        """Damping of each hinge [N] (N·m·s/rad) that gives the first mode the whisker's damping ratio.
+
+        A linearly implicit (backward Euler) step of length ``time_step`` (s) adds the damping of one
+        step: stiffness-proportional damping β k behaves as (β + dt) k. So β = max(2 ζ/ω₁ − dt, 0).
+        """
+        beta = 2 * self.whisker.damping_ratio / self.frequencies()[0] - time_step
+        return max(beta, 0.0) * self.stiffness
+
+    def achieved_damping_ratio(self, time_step: float) -> float:
+        """Damping ratio of the first mode with this step; above the whisker's own when the step is too long."""
+        return max(self.whisker.damping_ratio, float(self.frequencies()[0]) * time_step / 2)
+
+    def _planar_mass(self) -> NDArray[np.float64]:
+        """Joint-space inertia [N, N] of the straightened chain for small rotations about z."""
+        joints = np.concatenate([[0.0], np.cumsum(self.lengths)[:-1]])
+        centres = joints + self.centres
+        # arm[i, j]: lever of joint j at the centre of mass of link i, which it moves only when j ≤ i.
+        arm = np.tril(centres[:, None] - joints[None, :])
+        return (arm * self.masses[:, None]).T @ arm + np.tril(np.ones_like(arm)).T @ (
+            np.tril(np.ones_like(arm)) * self.inertias[:, 1:]
+        )
+
+
+def build_chain(whisker: Whisker, links: int) -> Chain:
+    """Cut ``whisker`` into ``links`` links of equal arc length.
+
+    Raises:
+        UsageError: fewer than two links were asked for.
+    """
+    if links < 2:
+        raise UsageError(f"A whisker needs at least 2 links to bend along its length; received {links}.")
+    nodes = np.linspace(0.0, whisker.arc_length, links + 1)
+    points = whisker.centre_line(nodes)
+    chords = np.diff(points, axis=0)
+    angles = np.arctan2(chords[:, 1], chords[:, 0])
+    lengths = np.linalg.norm(chords, axis=1)
+    masses, centres, inertias = _frusta(whisker, nodes, lengths)
+    return Chain(
+        whisker=whisker,
+        nodes=nodes,
+        points=points,
+        lengths=lengths,
+        rest_angles=np.diff(angles, prepend=0.0),
+        radii=whisker.radius((nodes[:-1] + nodes[1:]) / 2),
+        masses=masses,
+        centres=centres,
+        inertias=inertias,
+        stiffness=1 / _compliance(whisker, links),
+    )
+
+
+def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
+    """Compliance of each joint [N] (rad/(N·m)): product integration of M²/(E I) with M² quadratic around each cell."""
+    cell = whisker.arc_length / links
+    total = np.zeros(links + 1)
+    for i in range(links + 1):
+        low, high = max(0.0, (i - 0.5) * cell), min(whisker.arc_length, (i + 0.5) * cell)
+        s = low + (high - low) / 2 * (_NODES + 1)
+        flexibility = (high - low) / 2 * _WEIGHTS / whisker.bending_stiffness(s)
+        if i == links:
+            # Next to the free tip the moment of a tip load falls to zero linearly.
+            total[i - 1] += flexibility @ (s / cell - i) ** 2
+            continue
+        if whisker.radius(low) > _STEEPEST * whisker.radius(high):
+            # Across such a steep cell a parabola would take more from a neighbour than that has; keep it whole, with
+            # a moment that falls towards the tip as under loads spread along a cone.
+            total[i] += flexibility @ ((whisker.arc_length - s) / (whisker.arc_length - i * cell)) ** 3
+            continue
+        middle = max(i, 1)
+        x = s / cell - middle
+        for j, weight in enumerate((x * (x - 1) / 2, 1 - x**2, x * (x + 1) / 2), start=middle - 1):
+            total[j] += flexibility @ weight
+    # The free tip carries no moment, so what falls on it needs no joint.
+    return total[:links]
+
+
+def _frusta(whisker: Whisker, nodes: NDArray, lengths: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Mass [N], centre of mass [N] and inertia [N, 2] of conical frusta whose density varies linearly.
+
+    The mass of each arc is kept whole and spread along its chord.
+    """
+    low, high = nodes[:-1], nodes[1:]
+    masses = _integrate(whisker.linear_density, low, high)
+    first = _integrate(lambda s: whisker.linear_density(s) * (s - low[:, None]), low, high)
+    second = _integrate(lambda s: whisker.linear_density(s) * (s - low[:, None]) ** 2, low, high)
+    polar = _integrate(lambda s: whisker.linear_density(s) * whisker.radius(s) ** 2 / 4, low, high)
+    ratio = lengths / (high - low)
+    centres = first / masses * ratio
+    transverse = (second - first**2 / masses) * ratio**2 + polar
+    return masses, centres, np.stack([2 * polar, transverse], axis=-1)
+
+
+def _integrate(function, low: NDArray, high: NDArray) -> NDArray[np.float64]:  # noqa: ANN001
+    """Integrate a function of arc length over each interval [low, high] by Gauss-Legendre quadrature."""
+    half = (high - low) / 2
+    s = low[:, None] + half[:, None] * (_NODES + 1)
+    return half * (function(s) @ _WEIGHTS)

@@ -1,0 +1,145 @@
+"""One whisker: a tapered, intrinsically curved elastic rod.
+
+The base frame has its origin at the base point; the whisker leaves along +x and curves in the x-y
+plane with its concave side towards +y. Arc length s runs from 0 at the base to L at the tip. SI units.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True)
+class Whisker:
+    """Geometry and material of one whisker.
+
+    Radius and density vary linearly with arc length; the cross-section is a solid circle. The rest
+    shape is the parabola y = A x² (A = ``curvature``), measured along its arc.
+
+    Raises:
+        UsageError: a value is not finite or lies outside its physical range.
+    """
+
+    arc_length: float
+    """Length along the centre line L [m]."""
+    base_radius: float
+    """Radius at the base [m]."""
+    tip_radius: float
+    """Radius at the tip [m]; positive, because a real tip is cut or worn and a point has no stiffness."""
+    young_modulus: float
+    """Young's modulus E [Pa]."""
+    density: float | tuple[float, float]
+    """Mass density [kg/m³], one number or (base, tip)."""
+    damping_ratio: float
+    """Fraction of critical damping of the first bending mode (stiffness-proportional damping)."""
+    curvature: float = 0.0
+    """Coefficient A of the rest shape y = A x² [1/m]; negative bends towards −y."""
+    friction: float = 0.48
+    """Coulomb coefficient against objects that bring none of their own; .48 was measured on steel."""
+
+    def __post_init__(self) -> None:
+        for name in ("arc_length", "base_radius", "tip_radius", "young_modulus"):
+            _require(name, getattr(self, name), positive=True)
+        for name in ("damping_ratio", "friction"):
+            _require(name, getattr(self, name))
+        if not math.isfinite(self.curvature):
+            raise UsageError(f"curvature of a whisker must be a finite number (1/m); received {self.curvature!r}.")
+        if isinstance(self.density, (tuple, list)):
+            if len(self.density) != 2:
+                raise UsageError(
+                    f"density of a whisker is one number or (base, tip) in kg/m³; received {len(self.density)} values."
+                )
+            object.__setattr__(self, "density", (float(self.density[0]), float(self.density[1])))
+        for value in self.densities:
+            _require("density", value, positive=True)
+        thickest = max(self.base_radius, self.tip_radius)
+        if thickest > self.arc_length / 5:
+            raise UsageError(
+                f"A whisker of arc length {self.arc_length:g} m with radius {thickest:g} m"
+                " is no slender rod (radius above a fifth of the length); all lengths are in metres."
+            )
+
+    @property
+    def densities(self) -> tuple[float, float]:
+        """Density at base and tip [kg/m³]."""
+        return self.density if isinstance(self.density, tuple) else (float(self.density), float(self.density))
+
+    @property
+    def mass(self) -> float:
+        """Mass of the whole whisker [kg], the integral of ρ π r² (exact)."""
+        from numpy.polynomial import polynomial
+
+        shape = polynomial.polyint(polynomial.polymul(self._area_series(), self._density_series()))
+        return float(polynomial.polyval(1.0, shape)) * self.arc_length
+
+    def radius(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Radius [m] at arc length ``s`` [m]."""
+        return self.base_radius + (self.tip_radius - self.base_radius) * self._fraction(s)
+
+    def second_moment(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Second moment of area π r⁴/4 [m⁴] at arc length ``s`` [m]."""
+        return np.pi * self.radius(s) ** 4 / 4
+
+    def bending_stiffness(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Flexural rigidity E I [N·m²] at arc length ``s`` [m]."""
+        return self.young_modulus * self.second_moment(s)
+
+    def linear_density(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Mass per length ρ π r² [kg/m] at arc length ``s`` [m]."""
+        base, tip = self.densities
+        return (base + (tip - base) * self._fraction(s)) * np.pi * self.radius(s) ** 2
+
+    def centre_line(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Rest positions (x, y) [..., 2] in the base frame [m] at arc length ``s`` [m]."""
+        x = self._abscissa(s)
+        return np.stack([x, self.curvature * x**2], axis=-1)
+
+    def tangent_angle(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Angle of the rest centre line against +x [rad] at arc length ``s`` [m]."""
+        return np.arctan(2 * self.curvature * self._abscissa(s))
+
+    def _abscissa(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Invert s(x) = (u √(1+u²) + asinh u)/(4A), u = 2 A x, by Newton's method."""
+        s = np.asarray(s, dtype=float)
+        target = 4 * self.curvature * s
+        if abs(self.curvature) * self.arc_length < 1e-9:
+            return s.copy()
+        # Both bounds lie beyond the root of this convex function, so Newton's method descends to it.
+        u = np.sign(target) * np.minimum(np.abs(target) / 2, np.sqrt(np.abs(target)))
+        for _ in range(50):
+            root = np.sqrt(1 + u**2)
+            step = (u * root + np.arcsinh(u) - target) / (2 * root)
+            u = u - step
+            if np.all(np.abs(step) <= 1e-15 * (1 + np.abs(u))):
+                break
+        return u / (2 * self.curvature)
+
+    def _fraction(self, s: ArrayLike) -> NDArray[np.float64]:
+        return np.asarray(s, dtype=float) / self.arc_length
+
+    def _area_series(self) -> list[float]:
+        """Coefficients of π r² in powers of s/L."""
+        slope = self.tip_radius - self.base_radius
+        return [np.pi * self.base_radius**2, 2 * np.pi * self.base_radius * slope, np.pi * slope**2]
+
+    def _density_series(self) -> list[float]:
+        base, tip = self.densities
+        return [base, tip - base]
+
+
+def _require(name: str, value: float, *, positive: bool = False) -> None:
+    """Refuse values that are not finite, negative, or zero where that has no meaning."""
+    if not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
+        raise UsageError(f"{name} of a whisker must be a finite number in SI units; received {value!r}.")
+    if value < 0 or (positive and value == 0):
+        least = "positive" if positive else "zero or more"
+        raise UsageError(f"{name} of a whisker must be {least} (SI units); received {value!r}.")

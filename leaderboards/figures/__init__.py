@@ -1,0 +1,1 @@
+"""Figures of leaderboards: marks, plots, charts and architecture diagrams."""

@@ -1,0 +1,277 @@
+"""What the figures of a leaderboard are drawn with: axes, intervals, scatter plots, ablations, matrices."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from brainbench.core.records import Interval
+from leaderboards.entries import Entry, twins
+from leaderboards.figures.marks import colour_at, known
+from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, tick_text
+from leaderboards.text import number, span
+
+WIDTH = 760.0
+SHOWN = 60
+"""Most models in one figure; the table holds all."""
+_SHAPES = {"supervised": "square", "simclr": "cross", "simsiam": "up", "ae": "down", "untrained": "dot"}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure with its caption, or the reason why there is none."""
+
+    key: str
+    """Short name for links and files."""
+    title: str
+    caption: str
+    drawing: Drawing | None
+    lacking: str = ""
+    """What the records would have to hold; empty when the figure is drawn."""
+
+
+def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float, Interval | None]:
+    """Return slope, intercept, Pearson's r and its 95 % interval by Fisher's z (None below four points).
+
+    r is NaN when either variable is constant.
+    """
+    n = len(x)
+    mx, my = math.fsum(x) / n, math.fsum(y) / n
+    sxx = math.fsum((a - mx) ** 2 for a in x)
+    syy = math.fsum((b - my) ** 2 for b in y)
+    sxy = math.fsum((a - mx) * (b - my) for a, b in zip(x, y, strict=True))
+    if sxx == 0 or syy == 0:
+        return math.nan, math.nan, math.nan, None
+    r = max(-1.0, min(1.0, sxy / math.sqrt(sxx * syy)))
+    interval = None
+    if n > 3 and abs(r) < 1:
+        half = 1.959964 / math.sqrt(n - 3)
+        interval = Interval(math.tanh(math.atanh(r) - half), math.tanh(math.atanh(r) + half), 0.95, "Fisher's z")
+    return sxy / sxx, my - sxy / sxx * mx, r, interval
+
+
+def scatter(
+    key: str,
+    title: str,
+    points: Sequence[tuple[float, float, Entry]],
+    label: str,
+    *,
+    log: bool = False,
+    fit: bool = False,
+) -> Figure:
+    """Return a scatter plot of entries, with a regression line where one is asked for."""
+    height, left, bottom = 400.0, 56.0, 352.0
+    drawing = Drawing(WIDTH, height, f"{title}: {len(points)} models")
+    xs, ys = [x for x, *_ in points], [y for _, y, _ in points]
+    if log:
+        across = Scale(min(xs) / 1.4, max(xs) * 1.4, left, WIDTH - 190, log=True)
+    else:
+        across = scale_of(xs, left, WIDTH - 190)
+    up = scale_of(ys, bottom, 16, floor=None)
+    for tick in up.ticks:
+        drawing.line(left, up.at(tick), WIDTH - 190, up.at(tick), "one" if tick == 1 else "grid")
+        drawing.text(left - 8, up.at(tick) + 4, tick_text(tick), "end quiet")
+    for tick in across.ticks:
+        drawing.line(across.at(tick), 16, across.at(tick), bottom, "grid")
+        drawing.text(across.at(tick), bottom + 18, tick_text(tick), "mid quiet")
+    drawing.text((left + WIDTH - 190) / 2, height - 8, label, "mid")
+    drawing.text(left - 44, 12, "neural fit", "")
+    caption = ""
+    if fit:
+        caption = fitted(drawing, across, up, xs, ys)
+    colour = colours(encoder_of(entry) for *_, entry in points)
+    for x, y, entry in points:
+        kind = colour[encoder_of(entry)]
+        shape = _SHAPES.get(entry.card.objective or "", "diamond")
+        drawing.mark(across.at(x), up.at(y), shape, kind, f"{entry.name}: {label} {x:g}, fit {number(y)}", 4.5)
+    y = 24.0
+    for name, kind in colour.items():
+        drawing.mark(WIDTH - 172, y - 4, "dot", kind, size=4)
+        drawing.text(WIDTH - 160, y, cut(name, 26), "small")
+        y += 17
+    y += 8
+    for name in dict.fromkeys(entry.card.objective or "not stated" for *_, entry in points):
+        drawing.mark(WIDTH - 172, y - 4, _SHAPES.get(name, "diamond"), "c0", size=4)
+        drawing.text(WIDTH - 160, y, cut(name, 26), "small")
+        y += 17
+    drawing.height = max(height, y + 4)
+    return Figure(
+        key,
+        title,
+        f"{caption}Colours are encoders, shapes are objectives; untrained models are means over their seeds.",
+        drawing,
+    )
+
+
+def encoder_of(entry: Entry) -> str:
+    """Return the encoder for colours: with and without layer norm are one."""
+    return (entry.card.encoder or "not stated").removesuffix("-ln")
+
+
+def fitted(drawing: Drawing, across: Scale, up: Scale, xs: Sequence[float], ys: Sequence[float]) -> str:
+    """Draw the least-squares line with the 95 % band of its mean; return the caption's sentence."""
+    slope, start, r, interval = regression(xs, ys)
+    if math.isnan(r):
+        return "All accuracies or all scores are equal, so there is no line. "
+    from scipy.special import stdtrit
+
+    n, mx = len(xs), math.fsum(xs) / len(xs)
+    sxx = math.fsum((x - mx) ** 2 for x in xs)
+    rest = math.fsum((y - start - slope * x) ** 2 for x, y in zip(xs, ys, strict=True))
+    places = [min(xs) + (max(xs) - min(xs)) * i / 40 for i in range(41)]
+    if n > 2:
+        t = float(stdtrit(n - 2, 0.975)) * math.sqrt(rest / (n - 2))
+        half = [t * math.sqrt(1 / n + (x - mx) ** 2 / sxx) for x in places]
+        over = [(across.at(x), up.at(start + slope * x + h)) for x, h in zip(places, half, strict=True)]
+        under = [(across.at(x), up.at(start + slope * x - h)) for x, h in zip(places, half, strict=True)]
+        outline = "L".join(f"{x:.1f} {y:.1f}" for x, y in [*over, *under[::-1]])
+        drawing.path(f"M{outline}z", "fitband")
+    ends = (min(xs), max(xs))
+    first, last = ((across.at(x), up.at(start + slope * x)) for x in ends)
+    drawing.line(*first, *last, "fit")
+    text = f" {span(interval)}" if interval else ""
+    return f"Least-squares line with the 95 % band of its mean over {n} models: r = {number(r, 2)}{text}. "
+
+
+def ablation(
+    key: str,
+    title: str,
+    entries: Sequence[Entry],
+    level: Callable[[Entry], str],
+    held: Callable[[Entry], str],
+    what: str,
+) -> Figure:
+    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed, and on the same data."""
+    groups: dict[tuple[str, ...], dict[str, Entry]] = {}
+    for entry in entries:
+        if entry.trained and level(entry) and math.isfinite(entry.value):
+            model = (entry.architecture, entry.card.objective or "", held(entry), entry.card.accuracy_data or "")
+            groups.setdefault(model, {}).setdefault(level(entry), entry)
+    groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
+    if not groups:
+        return Figure(key, title, "", None, f"no model was trained with more than one {what}")
+    twin = twins(entries)
+    rows = [
+        (", ".join(part for part in model[:-1] if part) if i == 0 else "", label, entry)
+        for model, levels in groups.items()
+        for i, (label, entry) in enumerate(sorted(levels.items()))
+    ]
+    scale = score_scale([e.value for *_, e in rows], [e.interval for *_, e in rows], 400, WIDTH - 20)
+    colour = colours(label for _, label, _ in rows)
+    drawing = Drawing(WIDTH, 44 + 20 * len(rows), f"{title}: {len(groups)} models")
+    draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
+    for index, (name, label, entry) in enumerate(rows):
+        y = 44.0 + 20 * index
+        drawing.text(6, y + 4, cut(name, 50), "title small")
+        drawing.text(392, y + 4, cut(label, 22), "end")
+        draw_interval(drawing, scale, entry.interval, y, colour[label])
+        other = twin.get(entry.architecture)
+        if other is not None and math.isfinite(other.value):
+            drawing.mark(scale.at(other.value), y, "dot", "c0 open", f"untrained twin {number(other.value)}", 3.2)
+        top1 = f", top-1 {number(entry.card.top1)}" if entry.card.top1 is not None else ""
+        drawing.mark(
+            scale.at(entry.value), y, "dot", colour[label], f"{entry.name}, {label}: {number(entry.value)}{top1}"
+        )
+    return Figure(
+        key,
+        title,
+        f"Noise-corrected score with its interval by {what}; hollow grey points are untrained twins.",
+        drawing,
+    )
+
+
+def draw_matrix(
+    drawing: Drawing, x0: float, y0: float, side: float, pairs: Sequence[float], labels: Sequence[str]
+) -> None:
+    """Draw the upper triangle of an RDM as a square of shaded cells, with its labels."""
+    size = len(labels)
+    cell = side / size
+    finite = [value for value in pairs if math.isfinite(value)]
+    low, high = (min(finite), max(finite)) if finite else (0.0, 1.0)
+    drawing.rect(x0, y0, side, side, "box")
+    for value, (i, j) in zip(pairs, combinations(range(size), 2), strict=True):
+        share = (value - low) / (high - low) if high > low else 0.0
+        fill = colour_at(share) if math.isfinite(value) else "#808080"
+        tip = f"{labels[i]}, {labels[j]}: {value:.3g}"
+        drawing.rect(x0 + j * cell, y0 + i * cell, cell, cell, fill=fill, tip=tip)
+        drawing.rect(x0 + i * cell, y0 + j * cell, cell, cell, fill=fill, tip=tip)
+
+
+def score_scale(values: Sequence[float], intervals: Sequence[Interval | None], start: float, end: float) -> Scale:
+    """Return an axis from 0 to 1 that widens for values, and for interval ends as far as −1 and 1.5."""
+    ends = [end_ for i in intervals if i and known(i) for end_ in (i.low, i.high)]
+    finite = [value for value in (*values, *ends) if math.isfinite(value)]
+    low, high = max(min([0.0, *finite]), -1.0), min(max([1.0, *finite]), 1.5)
+    return Scale(low, high + 0.02, start, end)
+
+
+def draw_axis(drawing: Drawing, scale: Scale, top: float, bottom: float, label: str) -> None:
+    """Draw the ticks of a scale as grid lines, and its label."""
+    for tick in scale.ticks:
+        drawing.line(scale.at(tick), top, scale.at(tick), bottom, "one" if tick == 1 else "grid")
+        drawing.text(scale.at(tick), top - 6, tick_text(tick), "mid quiet")
+    drawing.text(scale.end, 11, label, "end quiet small")
+
+
+def draw_band(drawing: Drawing, scale: Scale, interval: Interval | None, top: float, bottom: float) -> None:
+    """Draw an interval as a band over the whole height."""
+    if interval is not None and known(interval):
+        drawing.rect(
+            scale.at(interval.low), top, scale.at(interval.high) - scale.at(interval.low), bottom - top, "band"
+        )
+
+
+def draw_interval(drawing: Drawing, scale: Scale, interval: Interval | None, y: float, kind: str) -> None:
+    """Draw an interval as a line with its ends."""
+    if interval is not None and known(interval):
+        drawing.line(scale.at(interval.low), y, scale.at(interval.high), y, f"span {kind}")
+
+
+def colours(names: Iterable[str]) -> dict[str, str]:
+    """Give each name a colour class, ``untrained`` grey, in the order in which they come."""
+    found: dict[str, str] = {}
+    for name in names:
+        if name not in found:
+            used = sum(kind != "c0" for kind in found.values())
+            found[name] = "c0" if name in ("untrained", "not stated") else f"c{used % COLOURS + 1}"
+    # Grey sets untrained networks back behind trained ones; alone they need not step back.
+    return dict.fromkeys(found, "c1") if len(found) == 1 else found
+
+
+_NAMES = dict(
+    zip(
+        [f"c{i}" for i in range(COLOURS + 1)],
+        ("grey", "blue", "orange", "teal", "violet", "ochre", "pink", "green", "sky"),
+        strict=True,
+    )
+)
+
+
+def legend_words(colour: dict[str, str]) -> str:
+    """Return the sentence that says what the colours mean."""
+    return "Colours: " + ", ".join(f"{name} {_NAMES[kind]}" for name, kind in colour.items()) + "." if colour else ""
+
+
+def cut_words(count: int, shown: int = SHOWN) -> str:
+    """Return the sentence that says how many models are shown, empty if all are."""
+    return f" Shown are the first {shown} of {count} models; the table holds all." if count > shown else ""
+
+
+def cut(text: str, length: int) -> str:
+    """Shorten a label; of a path the last part stays."""
+    text = text.rpartition("/")[2] or text
+    return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def cut_name(name: str, length: int) -> str:
+    """Shorten a model's name in its middle: its end says how it was trained. ``./`` marks one of a local folder.
+
+    >>> cut_name("local-dir:zhuang-intersection-ln-small.simclr.masked75", 30)
+    './zhuang-inter…simclr.masked75'
+    """
+    folder, mark, inside = name.partition("local-dir:")
+    text = f"./{inside}" if mark and not folder and "/" not in inside else name.rpartition("/")[2] or name
+    head = (length - 1) // 2
+    return text if len(text) <= length else f"{text[:head]}…{text[head + 1 - length :]}"

@@ -1,0 +1,1 @@
+"""Reports: of one score, and of a board for a paper's supplement."""

@@ -1,0 +1,312 @@
+"""Reports for a paper's supplement: methods, tables, vector figures and citations, as Markdown, HTML or PDF.
+
+Everything is said by the records. Figures are the SVG drawings of the site (:mod:`leaderboards.figures.charts`); PDF is
+printed by a Chromium browser where one is found, else by WeasyPrint (extra ``board``): both keep them vectors.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from brainbench.core.errors import DataError, unknown_name
+from brainbench.core.files import write_text
+from brainbench.core.records import ResultRecord
+from leaderboards import provenance
+from leaderboards import text as _words
+from leaderboards.entries import Entry, entries_of
+from leaderboards.figures.architecture import diagram
+from leaderboards.figures.charts import Figure, board_figures, layers_of
+from leaderboards.figures.svg import STYLE, standalone
+from leaderboards.ranking import Board, rank
+from leaderboards.report.citations import Reference, references
+from leaderboards.report.pdf import html_to_pdf
+from leaderboards.site.page import render
+from leaderboards.store import StoredRecord
+
+FORMATS = ("md", "html", "pdf")
+_WORDY = ("model", "baseline", "animal", "statement", "value", "layer", "status")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts."""
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    @property
+    def numbers(self) -> tuple[bool, ...]:
+        """Whether each column holds numbers, which are set flush right."""
+        return tuple(name not in _WORDY for name in self.columns)
+
+
+@dataclass(frozen=True)
+class Section:
+    """One board of a report."""
+
+    title: str
+    methods: str
+    tables: tuple[Table, ...]
+    figures: tuple[Figure, ...]
+    absent: tuple[Figure, ...]
+    """Figures that the records cannot fill."""
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A report before it has a format."""
+
+    title: str
+    synthetic: bool
+    sections: tuple[Section, ...]
+    references: tuple[Reference, ...]
+    commands: tuple[str, ...]
+    """Command lines that make the records again."""
+
+
+def write_paper(
+    records: Iterable[StoredRecord | ResultRecord],
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    title: str = "Leaderboard report",
+) -> list[Path]:
+    """Write a report and return its files, the main one first.
+
+    Markdown comes with a folder of SVG files and the citations as ``.bib``; HTML and PDF hold their figures, and
+    bring a ``.bib`` too. A single record gives the report of that model, with its architecture and layers.
+
+    Args:
+        records: What :func:`leaderboards.read_records` returned, or records in memory.
+        path: The main file.
+        format: ``md``, ``html`` or ``pdf``; by the file's suffix if not given.
+        title: Heading.
+
+    Raises:
+        UsageError: there is no such format.
+        DataError: there is no usable record.
+        MissingDependencyError: neither Chromium nor WeasyPrint is there to make a PDF.
+    """
+    path = Path(path)
+    kind = format or path.suffix.removeprefix(".").lower()
+    if kind not in FORMATS:
+        raise unknown_name("report format", kind, FORMATS)
+    found = [item.record if isinstance(item, StoredRecord) else item for item in records]
+    usable = [record for record in found if record is not None]
+    if not usable:
+        raise DataError("There are no usable result records for a report; make one with: brainbench score MODEL")
+    paper = make_paper(usable, title)
+    bib = write_text(path.with_suffix(".bib"), "\n\n".join(item.bibtex for item in paper.references) + "\n")
+    if kind == "md":
+        return [write_text(path, _markdown(paper, path)), bib, *_write_figures(paper, path)]
+    text = render("paper.html.j2", paper=paper, drawn=_inline)
+    if kind == "html":
+        return [write_text(path, text), bib]
+    html_to_pdf(text, path)
+    return [path, bib]
+
+
+def make_paper(records: Sequence[ResultRecord], title: str) -> Paper:
+    """Return the report of records, board by board."""
+    boards = rank(records)
+    commands = dict.fromkeys(text for record in records if (text := provenance.command(record.score)))
+    return Paper(
+        title,
+        any(board.synthetic for board in boards),
+        tuple(_section(board) for board in boards),
+        tuple(references(records)),
+        tuple(commands),
+    )
+
+
+def board_methods(board: Board, entries: Sequence[Entry]) -> str:
+    """Return a paragraph for a paper's methods section, made only of what the records state."""
+    score = max(entries, key=lambda entry: len(entry.score.layers)).score
+    if len(board.rows) == 1:
+        return _words.methods(board.rows[0].record)
+    seeds = max(entry.seeds for entry in entries)
+    versions = sorted({version for row in board.rows if (version := provenance.version(row.record.score))})
+    settings = provenance.settings(score)
+    text = (
+        f"{_words.plural(len(entries), 'model')} ({_words.plural(len(board.rows), 'record')}) were compared with "
+        f"{board.recordings} ({_words.plural(len(score.subjects), 'animal')}, "
+        f"{_words.plural(len(board.conditions), 'stimulus', 'stimuli')})"
+    )
+    text += f" by {board.metric}" if board.metric else ""
+    text += f", with noise correction by the estimator '{board.estimator}'."
+    text += f" Stimuli: {board.stimuli.rstrip('.')}." if board.stimuli else ""
+    fidelity = settings.get("fidelity")
+    text += f" They were simulated at the fidelity '{fidelity}'." if isinstance(fidelity, str) else ""
+    text += f" Time axis: {board.time}." if board.time else ""
+    text += f" Layer: {score.layer_rule}." if score.layer_rule else ""
+    text += f" Interval of a record: {_words.level(score.interval)}." if score.interval else ""
+    if seeds > 1:
+        text += (
+            f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, "
+            "their interval joins the t intervals over animals and over seeds in squares, and the spread is the "
+            "standard deviation over seeds."
+        )
+    # The mean under permutation is one record's own.
+    significance = re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method)
+    text += f" Significance: {significance}." if significance else ""
+    text += f" Noise ceiling: {score.ceiling.method}." if score.ceiling and score.ceiling.method else ""
+    text += f" Ranks are ranges. {board.ties}"
+    text += f" Computed with brainbench {', '.join(versions)}." if versions else ""
+    text += f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
+    text += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""
+    text += " The recordings are synthetic: the result says nothing about brains." if board.synthetic else ""
+    return text
+
+
+def _section(board: Board) -> Section:
+    entries = entries_of(board)
+    figures = board_figures(board, entries)
+    if len(entries) == 1:
+        figures = _single(entries[0]) + [figure for figure in figures if figure.key in ("fit", "rdms")]
+    tables = [_models(entries), _baselines(board)]
+    if len(entries) == 1:
+        tables += [_animals(entries[0]), _card(entries[0])]
+    return Section(
+        f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}",
+        board_methods(board, entries),
+        tuple(table for table in tables if table.rows),
+        tuple(figure for figure in figures if figure.drawing is not None),
+        tuple(figure for figure in figures if figure.drawing is None),
+    )
+
+
+def _single(entry: Entry) -> list[Figure]:
+    graph, layers = entry.card.graph, layers_of(entry)
+    found = []
+    if graph is not None:
+        caption = "Solid arrows act within the stream, dashed ones are feedback."
+        found.append(Figure("architecture", f"Architecture of {entry.name}", caption, diagram(graph, entry.name)))
+    if layers is not None:
+        caption = "Score of each layer; filled is the layer chosen on held-out data. For reading only."
+        found.append(Figure("layers", "Layers", caption, layers))
+    return found
+
+
+def _models(entries: Sequence[Entry]) -> Table:
+    columns = ("model", "rank", "score", "interval", "spread", "p", "raw r", "layer", "parameters", "top-1", "status")
+    rows = [
+        (
+            entry.name,
+            entry.rank,
+            _words.number(entry.value),
+            _words.span(entry.interval),
+            _words.number(entry.spread) if entry.seeds > 1 else "",
+            _words.probability(entry.p),
+            _words.number(entry.r),
+            entry.score.layer or "",
+            _words.count(entry.card.parameters),
+            "" if entry.card.top1 is None else _words.number(entry.card.top1),
+            entry.status,
+        )
+        for entry in entries
+    ]
+    used = [i for i in range(len(columns)) if any(row[i] for row in rows)]
+    kept = tuple(tuple(row[i] for i in used) for row in rows)
+    return Table("Models, best first.", tuple(columns[i] for i in used), kept)
+
+
+def _baselines(board: Board) -> Table:
+    rows = [
+        (item.name, _words.number(item.score.value), _words.span(item.score.interval), item.score.status)
+        for item in board.baselines
+    ]
+    return Table("Baselines and animal-to-animal.", ("baseline", "score", "interval", "status"), tuple(rows))
+
+
+def _animals(entry: Entry) -> Table:
+    columns = ("animal", "score", "raw r", "reliability", "units", "trials", "layer", "status")
+    rows = [
+        (
+            item.subject, _words.number(item.value), _words.number(item.r), _words.number(item.reliability, 2),
+            _words.count(item.units), _words.count(item.trials), item.layer or "", item.status,
+        )
+        for item in entry.score.subjects
+    ]  # fmt: skip
+    return Table("Animals, each at the layer chosen on the others.", columns, tuple(rows))
+
+
+def _card(entry: Entry) -> Table:
+    rows = (*_words.card_rows(entry.card), *_words.training_rows(entry.card))
+    return Table("The model.", ("statement", "value"), tuple(rows))
+
+
+def _inline(figure: Figure) -> str:
+    from markupsafe import Markup
+
+    return Markup(figure.drawing.render(style=STYLE)) if figure.drawing else Markup("")
+
+
+def _figure_path(path: Path, place: int, figure: Figure) -> Path:
+    return path.with_name(f"{path.stem}-figures") / f"{place}-{figure.key}.svg"
+
+
+def _write_figures(paper: Paper, path: Path) -> list[Path]:
+    return [
+        write_text(_figure_path(path, place, figure), standalone(figure.drawing))
+        for place, section in enumerate(paper.sections, start=1)
+        for figure in section.figures
+        if figure.drawing is not None
+    ]
+
+
+def _markdown(paper: Paper, path: Path) -> str:
+    lines = [f"# {_escape(paper.title)}", ""]
+    if paper.synthetic:
+        lines += [f"> **{_words.SYNTHETIC}**", ""]
+    for place, section in enumerate(paper.sections, start=1):
+        lines += [
+            f"## {_escape(section.title)}",
+            "",
+            "### Methods",
+            "",
+            _escape(section.methods),
+            "",
+            "### Results",
+            "",
+        ]
+        for table in section.tables:
+            lines += [_escape(table.caption), "", *_rows(table), ""]
+        for figure in section.figures:
+            target = _figure_path(path, place, figure).relative_to(path.parent).as_posix().replace(" ", "%20")
+            lines += [
+                f"![{_escape(figure.title)}]({target})",
+                "",
+                f"*{_escape(figure.title)}.* {_escape(figure.caption)}",
+                "",
+            ]
+        if section.absent:
+            lines += ["Not drawn: " + " ".join(f"{f.title}: {f.lacking}." for f in section.absent), ""]
+    if paper.commands:
+        lines += [
+            "## To make these records again",
+            "",
+            "```",
+            *(text.replace("`", "'") for text in paper.commands),
+            "```",
+            "",
+        ]
+    lines += ["## References", "", *(f"- {_escape(item.text)}" for item in paper.references), ""]
+    return "\n".join([*lines, f"BibTeX entries: `{path.with_suffix('.bib').name}`.", ""])
+
+
+def _rows(table: Table) -> list[str]:
+    ends = ["---:" if number else "---" for number in table.numbers]
+    lines = [table.columns, ends, *([_escape(cell) for cell in row] for row in table.rows)]
+    return ["| " + " | ".join(line) + " |" for line in lines]
+
+
+def _escape(text: str) -> str:
+    """Escape what Markdown or HTML inside it would read as markup."""
+    for mark in "\\`*_{}[]<>|#!":
+        text = text.replace(mark, f"\\{mark}" if mark not in "<>" else {"<": "&lt;", ">": "&gt;"}[mark])
+    return " ".join(text.split())

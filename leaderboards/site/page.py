@@ -1,0 +1,83 @@
+"""Fill the templates and lock the page: nothing but our own style and script can take effect."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.files import to_plain
+from leaderboards import text as _words
+from leaderboards.figures import marks
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+    from leaderboards.figures.svg import Drawing
+
+_TEMPLATES = Path(__file__).parents[1] / "templates"
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill ``template`` with every value escaped, under a content security policy.
+
+    The policy names our style and script by their hash, so even markup that slipped past the
+    escaping could not run, load or send anything.
+    """
+    from markupsafe import Markup
+
+    style = (_TEMPLATES / "page.css").read_text(encoding="utf-8")
+    script = (_TEMPLATES / "page.js").read_text(encoding="utf-8")
+    policy = (
+        f"default-src 'none'; img-src data:; style-src '{_source_hash(style)}'; script-src '{_source_hash(script)}'; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    page = _environment().get_template(template)
+    return page.render(**values, policy=policy, style=Markup(style), script=Markup(script))
+
+
+def drawn(drawing: Drawing | None) -> Any:
+    """Return a drawing as markup for a template, None for none."""
+    from markupsafe import Markup
+
+    return None if drawing is None else Markup(drawing.render())
+
+
+def script_json(value: Any) -> Any:
+    """Return ``value`` as JSON that can stand inside a script element: nothing in it can end the element."""
+    from markupsafe import Markup
+
+    text = json.dumps(to_plain(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for mark, escaped in (("<", "\\u003c"), (">", "\\u003e"), ("&", "\\u0026")):
+        text = text.replace(mark, escaped)
+    return Markup(text)
+
+
+@cache
+def _environment() -> Environment:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for helper in (_words.number, _words.probability, _words.count, _words.span, _words.level):
+        environment.filters[helper.__name__] = helper
+    environment.globals |= {
+        "STATUS": _words.STATUS,
+        "MARGIN": marks.MARGIN,
+        "SYNTHETIC": _words.SYNTHETIC,
+        "p_sentence": _words.p_sentence,
+        "colour_stops": marks.colour_stops(),
+    }
+    return environment
+
+
+def _source_hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,0 +1,231 @@
+"""What the pages say in words: numbers, verdicts and the methods sentence, all from the record."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
+from leaderboards import provenance as _origin
+from leaderboards.figures.marks import known
+from leaderboards.ranking import PAIRED_ANIMALS, paired_difference
+
+STATUS = {
+    "ok": "The recordings are reliable enough to trust this number.",
+    "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
+    "undefined": "No number exists.",
+}
+
+SYNTHETIC = "Synthetic demo recordings: ranks say nothing about brains."
+
+_CARD_LABELS = {
+    "family": "family",
+    "objective": "training objective",
+    "augmentation": "augmentation",
+    "parameters": "parameters",
+    "multiply_adds": "multiply-adds per time step",
+    "top1": "top-1 accuracy",
+    "top5": "top-5 accuracy",
+    "accuracy_interval": "accuracy interval",
+    "accuracy_data": "accuracy measured on",
+    "collapsed": "collapsed to one class",
+    "twin": "untrained twin",
+    "twin_top1": "top-1 accuracy of the untrained twin",
+    "twin_interval": "its interval",
+    "seed": "seed",
+    "weights": "weights (hash)",
+    "input": "input",
+    "encoder": "encoder",
+    "attender": "attender",
+    "citation": "architecture from",
+}
+"""Card fields that are a line of text; the training and the graph have their own places."""
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Format with a fixed number of digits and a true minus sign; NaN is ``undefined``."""
+    if value is None or not math.isfinite(value):
+        return "undefined"
+    text = f"{value:.{digits}f}"
+    return text.replace("-", "−") if float(text) else text.lstrip("-")
+
+
+def probability(value: float) -> str:
+    """Format a p-value with two significant digits."""
+    return f"{value:.2g}" if math.isfinite(value) else "undefined"
+
+
+def count(value: int | None) -> str:
+    """Format an integer with thousands separated."""
+    return "" if value is None else f"{value:,}"
+
+
+def plural(amount: int, one: str, many: str = "") -> str:
+    """Write an amount with its noun: ``1 result``, ``3 results``."""
+    return f"{amount} {one if amount == 1 else many or one + 's'}"
+
+
+def span(interval: Interval | None) -> str:
+    """Format an interval as ``[low, high]``; empty without one."""
+    return f"[{number(interval.low)}, {number(interval.high)}]" if interval else ""
+
+
+def level(interval: Interval) -> str:
+    """Say what kind of interval it is."""
+    return f"{100 * interval.level:g} % interval" + (f", {interval.method}" if interval.method else "")
+
+
+def p_sentence(score: Score) -> str:
+    """Say how the p-value was found and how small it could have been."""
+    parts = [score.p_method] if score.p_method else []
+    if math.isfinite(score.p_smallest):
+        least = probability(score.p_smallest)
+        reached = math.isfinite(score.p) and score.p <= score.p_smallest * (1 + 1e-9)
+        parts.append(
+            f"this is the smallest that {len(score.stimuli)} stimuli can give"
+            if reached
+            else f"the smallest possible is {least}"
+        )
+    return "; ".join(parts)
+
+
+def comparisons(record: ResultRecord) -> list[str]:
+    """Say how the score stands to each baseline: by the paired difference over animals, with few of them by overlap."""
+    score = record.score
+    others = list(record.baselines.items())
+    if record.animal_to_animal is not None:
+        others.append(("animal-to-animal", record.animal_to_animal))
+    if score.status != "ok" or score.interval is None or not known(score.interval):
+        return []
+    sentences = []
+    for name, other in others:
+        if other.status != "ok" or other.interval is None or not known(other.interval):
+            reason = "has no interval" if other.status == "ok" else f"is {other.status}"
+            sentences.append(f"Cannot be compared with {name}, which {reason}.")
+        elif (paired := paired_difference(score, other)) is not None:
+            mean, interval, animals = paired
+            verdict = "Above" if interval.low > 0 else "Below" if interval.high < 0 else "Not told apart from"
+            sentences.append(
+                f"{verdict} {name} ({number(other.value)}): difference {number(mean)} {span(interval)}, paired over "
+                f"{animals} animals."
+            )
+        elif score.interval.low > other.interval.high:
+            sentences.append(f"Above {name} ({number(other.value)}): the intervals do not overlap.")
+        elif score.interval.high < other.interval.low:
+            sentences.append(f"Below {name} ({number(other.value)}): the intervals do not overlap.")
+        else:
+            sentences.append(f"Not told apart from {name} ({number(other.value)}): the intervals overlap.")
+    if any("overlap" in sentence for sentence in sentences):
+        sentences.append(f"With fewer than {PAIRED_ANIMALS} animals in common no paired test is trusted.")
+    return sentences
+
+
+def methods(record: ResultRecord) -> str:
+    """Return a paragraph for a paper's methods section, made only of what the record states."""
+    score = record.score
+    text = (
+        f"The model {score.name} was compared with {_origin.recordings_name(score)} "
+        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
+        "by representational similarity analysis"
+    )
+    text += f" ({score.metric})" if score.metric else ""
+    text += f", with noise correction by the estimator '{score.estimator}'."
+    if _origin.time_rule(score):
+        text += f" Time axis: {_origin.time_rule(score)}."
+    if score.layer_rule:
+        text += f" Layer: {score.layer_rule}."
+    if score.interval:
+        text += f" Interval: {level(score.interval)}."
+    if score.p_method:
+        text += f" Significance: {score.p_method}."
+    if score.ceiling and score.ceiling.method:
+        text += f" Noise ceiling: {score.ceiling.method}."
+    version = score.provenance.get("version")
+    text += f" Computed with brainbench {version}." if version else ""
+    if record.synthetic:
+        text += " The recordings are synthetic: the result says nothing about brains."
+    return text
+
+
+def card_rows(card: ModelCard) -> list[tuple[str, str]]:
+    """Return what the model card states, as label and text; fields that do not apply are left out."""
+    rows = []
+    for item in fields(card):
+        value = getattr(card, item.name)
+        if item.name not in _CARD_LABELS or value is None or value == "":
+            continue
+        if isinstance(value, Interval):
+            value = f"{span(value)} ({level(value)})"
+        elif isinstance(value, bool):
+            value = "yes" if value else "no"
+        elif isinstance(value, int) and item.name != "seed":
+            value = count(value)
+        elif isinstance(value, float):
+            value = number(value)
+        rows.append((_CARD_LABELS[item.name], str(value)))
+    return rows
+
+
+def loading(record: ResultRecord) -> str:
+    """Return three lines of Python that load the model."""
+    card = record.card
+    name = record.score.name
+    if card is None or card.family in ("features computed elsewhere", ""):
+        return f"# {name}: activations that were computed elsewhere; the record names no model to load."
+    if card.family == "user module":
+        path = _origin.settings(record.score).get("model")
+        shown = path if isinstance(path, str) else name
+        made = f"model = load_user_model({shown!r}, seed={card.seed or 0})"
+        return f"from brainbench.models.user_models import load_user_model\n\n{made}"
+    seed = f", seed={card.seed}" if card.seed and card.objective == "untrained" else ""
+    made = f"model = brainbench.load_model({name!r}{seed})"
+    return f"import brainbench\n\n{made}  # [B, T, 30, 5, 7] in N and N·m → [B, classes]"
+
+
+def training_rows(card: ModelCard) -> list[tuple[str, str]]:
+    """Return what the card says of the training, as label and text."""
+    stated = {key: value for key, value in card.training.items() if value not in (None, "", {}, [])}
+    rows = [("objective", card.objective or ""), ("augmentation", card.augmentation or "")] if stated else []
+    rows += [
+        (key.replace("_", " "), _inline(value))
+        for key, value in sorted(stated.items())
+        if key not in ("augmentation", "objective")
+    ]
+    rows += [("untrained twin", card.twin)] if stated and card.twin else []
+    return [(label, text) for label, text in rows if text]
+
+
+def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the provenance as label and text, without the command, which the page shows by itself."""
+    rows = []
+    for key, value in sorted(provenance.items()):
+        # Groups of facts get a row for each; short lists, such as the packages' versions, stay together.
+        if isinstance(value, Mapping) and key not in ("packages", "pairs"):
+            # Each layer's p stands in the table of layers; other statistics are measured, so few digits say all.
+            found = {name: item for name, item in value.items() if (key, name) != ("statistics", "layer_tests")}
+            rows += [
+                (f"{key}: {name}", _rounded(item) if key == "statistics" else item) for name, item in found.items()
+            ]
+        elif key != "command":
+            rows.append((key, value))
+    return [(key.replace("_", " "), _inline(item)) for key, item in rows if item not in (None, "", {}, [])]
+
+
+def _rounded(value: Any) -> Any:
+    """Return a value with its floats at three significant digits."""
+    if isinstance(value, Mapping):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.3g}") if isinstance(value, float) else value
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {_inline(item)}" for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_inline(item) for item in value)
+    return value if isinstance(value, str) else json.dumps(value)

@@ -1,0 +1,233 @@
+"""The control loop of a deployed policy: read, check, decide, limit, send; stop safely when anything is wrong.
+
+A stop is final for the session: the hand holds where it is, and the reason is kept in words.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.deploy.monitor import LatencyHistogram, RateMonitor
+from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.deploy.driver import Driver, HandReading
+    from robotics_bridge.deploy.touch import RealTouch
+    from robotics_bridge.policies.export import Runner
+
+_log = logging.getLogger(__name__)
+
+VELOCITY = 0.2
+"""Factor on joint velocities in the group ``proprio``, as in the tasks."""
+Source = Callable[["HandReading"], "NDArray[np.floating]"]
+"""A further group of observations for a report, such as the goal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Actuation:
+    """From actions to targets, as the policy was trained; of an exported policy's contract."""
+
+    joints: tuple[str, ...]
+    """All driven joints J, in the order of ``proprio``."""
+    names: tuple[str, ...]
+    """Joints A that actions move."""
+    default: NDArray[np.float64]
+    """[A] targets of zero actions (rad)."""
+    scale: NDArray[np.float64]
+    """[A] change of the target per unit of action (rad)."""
+    low: NDArray[np.float64]
+    """[A] least targets (rad)."""
+    high: NDArray[np.float64]
+    """[A] greatest targets (rad)."""
+    frozen: Mapping[str, float] = field(default_factory=dict)
+    """Joint → position (rad) of those that actions do not move."""
+
+    @classmethod
+    def of(cls, deployment: Mapping[str, Any]) -> Actuation:
+        """Return the actuation of a contract's ``deployment``.
+
+        Raises:
+            UsageError: a part is missing, as in files that were not made from a trained run.
+        """
+        try:
+            mapping = deployment["action_map"]
+            arrays = {key: np.asarray(mapping[key], dtype=float) for key in ("default", "scale", "low", "high")}
+            return cls(
+                tuple(deployment["joints"]), tuple(mapping["names"]), **arrays, frozen=dict(deployment["frozen"])
+            )
+        except (KeyError, TypeError) as error:
+            raise UsageError(
+                f"The contract of the policy lacks {error} in 'deployment'; export it with brainbench policy export."
+            ) from error
+
+    def targets(self, action: NDArray[np.floating]) -> dict[str, float]:
+        """Return joint → target (rad) of an action [A]."""
+        moved = np.clip(self.default + self.scale * action, self.low, self.high)
+        return {**self.frozen, **dict(zip(self.names, moved.tolist(), strict=True))}
+
+
+@dataclass
+class Report:
+    """How a session went."""
+
+    status: str
+    """``finished`` or ``stopped``."""
+    reason: str
+    """Why it was stopped; empty if not."""
+    ticks: int
+    """Control steps that were decided."""
+    seconds: float
+    """Time of the session."""
+    latency: dict[str, Any]
+    """Of reading, deciding and sending, in ms."""
+    processor: dict[str, Any]
+    """The same in processor time of the loop's thread, which does not count waiting for a busy machine."""
+    rate: float
+    """Ticks per second."""
+    overruns: int
+    """Ticks that took longer than a control step."""
+    limited: int
+    """Ticks whose targets a limit of speed or position changed."""
+    link: dict[str, Any]
+    """Counters of the driver."""
+
+
+class Controller:
+    """Runs a policy on a hand.
+
+    Args:
+        run: The policy: groups → action [A] (:func:`~robotics_bridge.policies.export.read_policy`).
+        driver: The hand.
+        actuation: From actions to targets.
+        limits: In the order of the driver's joints.
+        groups: Names of the groups that the policy reads.
+        rate: Control steps per second.
+        touch: Makes the tactile group; needed when the policy reads it.
+        sources: Group → what gives it, for groups other than ``proprio`` and ``tactile``.
+        clock: Seconds.
+        sleep: Waits for so many seconds.
+        record: Called after each tick with (reading, groups, action, targets [J]).
+
+    Raises:
+        UsageError: a group has no source, or the hand lacks a joint.
+    """
+
+    def __init__(
+        self,
+        run: Runner,
+        driver: Driver,
+        actuation: Actuation,
+        limits: SafetyLimits,
+        *,
+        groups: tuple[str, ...],
+        rate: float = 40.0,
+        touch: RealTouch | None = None,
+        sources: Mapping[str, Source] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+        record: Callable[..., None] | None = None,
+    ) -> None:
+        self.run_policy, self.driver, self.actuation, self.limits = run, driver, actuation, limits
+        self.rate, self.touch, self.sources = rate, touch, dict(sources or {})
+        self.clock, self.sleep, self.record = clock, sleep, record
+        given = {"proprio", *self.sources, *(["tactile"] if touch is not None else [])}
+        if missing := [name for name in groups if name not in given]:
+            raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
+        if missing := [name for name in actuation.joints if name not in driver.joints]:
+            raise UsageError(f"The policy moves the joint {missing[0]!r}, which the hand does not have.")
+        self.groups = groups
+        self._order = [driver.joints.index(name) for name in actuation.joints]
+        self._action = np.zeros(len(actuation.names), np.float32)
+        self._targets: NDArray[np.float64] | None = None
+        self._offset, self._monitor = ClockOffset(), RateMonitor(rate, limits.rate_window)
+        self.latency, self.processor = LatencyHistogram(), LatencyHistogram()
+        self.limited = self.overruns = self.ticks = 0
+
+    def run(self, seconds: float) -> Report:
+        """Control for so many seconds, or until something is wrong; the hand is told to hold in the end."""
+        begun = self.clock()
+        reason: str | None = "the control loop was interrupted"
+        try:
+            reason = self._wait()
+            start = self.clock()
+            due = start
+            while reason is None and self.clock() - start < seconds:
+                before = self.clock()
+                reason = self._tick(before)
+                spent = self.clock() - before
+                self.overruns += spent > 1 / self.rate
+                due = max(due + 1 / self.rate, self.clock() - 1 / self.rate)
+                self.sleep(max(0.0, due - self.clock()))
+        finally:
+            # Whatever happened, an exception included: the hand holds.
+            self.driver.stop()
+            if reason:
+                _log.warning("Safe stop: %s.", reason)
+        elapsed = self.clock() - begun
+        return Report(
+            "stopped" if reason else "finished", reason or "", self.ticks, elapsed, self.latency.summary(),
+            self.processor.summary(), self.ticks / elapsed if elapsed > 0 else math.nan, self.overruns, self.limited,
+            dict(vars(self.driver.counters)),
+        )  # fmt: skip
+
+    def _wait(self) -> str | None:
+        """Wait for the first report."""
+        start = self.clock()
+        while self.driver.read() is None:
+            if self.clock() - start > self.limits.start_timeout:
+                return f"the hand said nothing for {self.limits.start_timeout:g} s"
+            self.sleep(0.005)
+        return None
+
+    def _tick(self, now: float) -> str | None:
+        busy = time.thread_time()
+        reading = self.driver.read()
+        if reading is None:
+            return "the hand gave no report"
+        reason = self.limits.fault(reading, self._offset.age(reading, now))
+        rate = self._monitor.tick(now)
+        if reason is None and rate < self.limits.rate_share * self.rate:
+            reason = f"control runs at {rate:.1f} Hz instead of {self.rate:g}"
+        if reason is not None:
+            return reason
+        obs = self._observe(reading)
+        if fault := next((name for name, value in obs.items() if not np.isfinite(value).all()), None):
+            return f"the observation {fault!r} holds values that are no numbers"
+        action = np.asarray(self.run_policy(obs, self.ticks == 0))
+        if not np.isfinite(action).all():
+            return "the policy gave values that are no numbers"
+        self._action = action.astype(np.float32)
+        targets = self._limit(self.actuation.targets(action), reading)
+        self.driver.send(targets)
+        self.latency.add(self.clock() - now)
+        self.processor.add(time.thread_time() - busy)
+        self.ticks += 1
+        if self.record is not None:
+            self.record(reading, obs, action, targets)
+        return None
+
+    def _observe(self, reading: HandReading) -> dict[str, NDArray[np.float32]]:
+        position, velocity = reading.position[self._order], reading.velocity[self._order]
+        obs = {"proprio": np.concatenate([position, VELOCITY * velocity, self._action]).astype(np.float32)}
+        if self.touch is not None and "tactile" in self.groups:
+            obs["tactile"] = self.touch(reading)
+        for name, source in self.sources.items():
+            obs[name] = np.asarray(source(reading), np.float32)
+        return {name: obs[name] for name in self.groups}
+
+    def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:
+        wanted = np.array([targets.get(name, reading.position[i]) for i, name in enumerate(self.driver.joints)])
+        before = reading.position if self._targets is None else self._targets
+        self._targets = self.limits.limit(wanted, before, 1 / self.rate)
+        self.limited += bool(np.any(np.abs(self._targets - wanted) > 1e-9))
+        return self._targets

@@ -1,0 +1,255 @@
+"""Episodes as a LeRobot data set (layout v3.0), written with our own Parquet and JSON; lerobot itself is not needed.
+
+Per frame: ``observation.state`` (joint positions, rad), ``observation.velocity``, ``action`` (joint targets, rad),
+``observation.tactile`` [N, 6] (force N and torque N·m of each point, link frame, about the link's origin) and
+``observation.wrench`` [6] (their sum in the palm's frame, about its origin). Where the points sit stands once in
+``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import DataError, UsageError, missing_dependency
+from brainbench.core.files import atomic_path, write_json
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.policies.encoders.finger_axes import Rays
+
+VERSION = "v3.0"
+_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_STATS = ("min", "max", "mean", "std", "count")
+_COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+
+
+@dataclass(frozen=True, eq=False)
+class TactilePoints:
+    """Where the points of ``observation.tactile`` sit. Letters: N point, L link."""
+
+    links: tuple[str, ...]
+    """L."""
+    link: NDArray[np.int64]
+    """[N] number of each point's link."""
+    position: NDArray[np.float64]
+    """[N, 3] in the link's frame (m)."""
+    normal: NDArray[np.float64]
+    """[N, 3] outward, link frame."""
+
+    @classmethod
+    def of(cls, layout: Mapping[str, Any]) -> TactilePoints:
+        """Return the active taxels of a hand's layout."""
+        counts = [int(probes.active.sum()) for probes in layout.values()]
+        position, normal = (
+            np.concatenate([getattr(probes, name)[probes.active] for probes in layout.values()])
+            for name in ("position", "normal")
+        )
+        return cls(tuple(layout), np.repeat(np.arange(len(counts)), counts), position, normal)
+
+
+@dataclass
+class Episode:
+    """Frames of one episode; every array has a row per frame T."""
+
+    task: str
+    """What was done, in words."""
+    state: list[NDArray[np.floating]] = field(default_factory=list)
+    """[T, J] joint positions (rad)."""
+    velocity: list[NDArray[np.floating]] = field(default_factory=list)
+    """[T, J] (rad/s)."""
+    action: list[NDArray[np.floating]] = field(default_factory=list)
+    """[T, J] joint targets (rad)."""
+    tactile: list[NDArray[np.floating]] = field(default_factory=list)
+    """[T, N, 6]."""
+    wrench: list[NDArray[np.floating]] = field(default_factory=list)
+    """[T, 6]."""
+
+    def add(
+        self,
+        state: NDArray[np.floating],
+        velocity: NDArray[np.floating],
+        action: NDArray[np.floating],
+        tactile: NDArray[np.floating],
+        wrench: NDArray[np.floating],
+    ) -> None:
+        """Append a frame."""
+        values = (state, velocity, action, tactile, wrench)
+        for store, value in zip(
+            (self.state, self.velocity, self.action, self.tactile, self.wrench), values, strict=True
+        ):
+            store.append(np.array(value, dtype=np.float32))
+
+
+def total_wrench(points: NDArray[np.floating], links: Sequence[str], link: NDArray[np.int64], rays: Rays) -> NDArray:
+    """Return the sum [6] of points' wrenches [N, 6] in the palm's frame, about its origin, fingers at reference."""
+    total = np.zeros(6)
+    for number, name in enumerate(links):
+        force, torque = np.split(points[link == number].sum(axis=0), 2)
+        turn, origin = rays.place[name]
+        total[:3] += turn @ force
+        total[3:] += turn @ torque + np.cross(origin, turn @ force)
+    return total
+
+
+def write_lerobot(
+    folder: str | Path,
+    episodes: Sequence[Episode],
+    *,
+    fps: float,
+    joints: Sequence[str],
+    points: TactilePoints,
+    robot: str = "xhand1",
+) -> Path:
+    """Write episodes as a data set that LeRobot opens.
+
+    Args:
+        folder: Where to; must not exist or be empty.
+        episodes: At least one frame each.
+        fps: Frames per second; a whole number, as LeRobot demands.
+        joints: Names of the joints J.
+        points: Where the tactile points sit.
+        robot: Name of the robot.
+
+    Raises:
+        UsageError: the folder is not empty, or an episode does not fit.
+        MissingDependencyError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow  # noqa: F401 - whether it is there, before anything is written
+    except ImportError as error:
+        raise missing_dependency("pyarrow", extra="board", purpose="Writing a LeRobot data set") from error
+    folder = Path(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise UsageError(f"{str(folder)!r} is not empty; a data set is written into a folder of its own.")
+    if not episodes or fps != round(fps):
+        raise UsageError(f"A data set needs episodes and a whole number of frames per second; received {fps!r}.")
+    shapes = {
+        "observation.state": (len(joints),), "observation.velocity": (len(joints),), "action": (len(joints),),
+        "observation.tactile": (len(points.link), 6), "observation.wrench": (6,),
+    }  # fmt: skip
+    tasks = list(dict.fromkeys(episode.task for episode in episodes))
+    tables, rows, first = [], [], 0
+    for number, episode in enumerate(episodes):
+        table = _frames(episode, number, first, tasks.index(episode.task), fps, shapes)
+        length = len(episode.state)
+        rows.append(_row(number, episode.task, first, length, table))
+        tables.append(table)
+        first += length
+    _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), tables, shapes)
+    _write_episodes(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", rows)
+    _write_tasks(folder / "meta" / "tasks.parquet", tasks)
+    whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+    write_json(folder / "meta" / "stats.json", {name: _stats(value) for name, value in whole.items()})
+    names = {"observation.tactile": ["point", "channel"], "observation.wrench": ["Fx", "Fy", "Fz", "Mx", "My", "Mz"]}
+    features = {
+        name: {"dtype": "float32", "shape": list(shape), "names": names.get(name, list(joints))}
+        for name, shape in shapes.items()
+    }
+    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTERS}
+    write_json(
+        folder / "meta" / "tactile.json",
+        {
+            "frame": "link axes; torques about the link's origin", "units": ["N", "N·m"], "links": points.links,
+            "link": points.link, "position": points.position, "normal": points.normal,
+        },
+    )  # fmt: skip
+    # Last, so that a folder with it is complete.
+    write_json(
+        folder / "meta" / "info.json",
+        {
+            "codebase_version": VERSION, "robot_type": robot, "total_episodes": len(episodes), "total_frames": first,
+            "total_tasks": len(tasks), "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
+            "fps": round(fps), "splits": {"train": f"0:{len(episodes)}"}, "data_path": _DATA, "video_path": None,
+            "features": features,
+        },
+    )  # fmt: skip
+    return folder
+
+
+def _frames(
+    episode: Episode, number: int, first: int, task: int, fps: float, shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, NDArray]:
+    length = len(episode.state)
+    parts = (episode.state, episode.velocity, episode.action, episode.tactile, episode.wrench)
+    found: dict[str, NDArray] = {}
+    for (name, shape), part in zip(shapes.items(), parts, strict=True):
+        values = np.asarray(part, dtype=np.float32)
+        if not length or values.shape != (length, *shape):
+            raise UsageError(f"{name} of episode {number} has the shape {values.shape}; expected {(length, *shape)}.")
+        if not np.isfinite(values).all():
+            raise DataError(f"{name} of episode {number} holds values that are no numbers.")
+        found[name] = values
+    found["timestamp"] = (np.arange(length) / fps).astype(np.float32)
+    frame = np.arange(length)
+    counters = (frame, np.full(length, number), first + frame, np.full(length, task))
+    return found | dict(zip(_COUNTERS, counters, strict=True))
+
+
+def _stats(values: NDArray) -> dict[str, list[Any]]:
+    flat = values.astype(np.float64)
+    found = {name: np.atleast_1d(getattr(np, name)(flat, axis=0)).tolist() for name in ("min", "max", "mean", "std")}
+    return {**found, "count": [len(values)]}
+
+
+def _row(number: int, task: str, first: int, length: int, table: Mapping[str, NDArray]) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "episode_index": number, "tasks": [task], "length": length, "dataset_from_index": first,
+        "dataset_to_index": first + length, "data/chunk_index": 0, "data/file_index": 0,
+        "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
+    }  # fmt: skip
+    return row | {
+        f"stats/{name}/{key}": value for name, values in table.items() for key, value in _stats(values).items()
+    }
+
+
+def _write_frames(path: Path, tables: list[dict[str, NDArray]], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    def kind(name: str) -> Any:
+        if name not in shapes:
+            return pa.float32() if name == "timestamp" else pa.int64()
+        inner = pa.float32()
+        for size in reversed(shapes[name]):
+            inner = pa.list_(inner, size) if len(shapes[name]) == 1 else pa.list_(inner)
+        return inner
+
+    schema = pa.schema([(name, kind(name)) for name in tables[0]])
+    with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, compression="snappy") as writer:
+        for table in tables:  # a row group per episode, so that one can be read alone
+            columns = [pa.array(values.tolist(), type=schema.field(name).type) for name, values in table.items()]
+            writer.write_table(pa.Table.from_arrays(columns, schema=schema))
+
+
+def _write_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with atomic_path(path) as temporary:
+        parquet.write_table(pa.Table.from_pylist(rows), temporary)
+
+
+def _write_tasks(path: Path, tasks: list[str]) -> None:
+    """Write the tasks as pandas does that has them as its index, for that is how LeRobot reads them."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
+    index = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
+    described = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [{**part, "metadata": None} for part in (column, index)],
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
+    with atomic_path(path) as temporary:
+        parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(described)}), temporary)

@@ -1,0 +1,110 @@
+"""When a hand must stop, and what it may be asked for. Radians, seconds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.deploy.driver import HandReading
+    from robotics_bridge.hands import Hand
+
+
+@dataclass(frozen=True, eq=False)
+class SafetyLimits:
+    """What is allowed.
+
+    Raises:
+        UsageError: a limit is not a sensible number.
+    """
+
+    low: NDArray[np.float64]
+    """[J] (rad)."""
+    high: NDArray[np.float64]
+    """[J] (rad)."""
+    speed: NDArray[np.float64]
+    """[J] (rad/s): fastest change of a target; twice that measured is absurd."""
+    pressure: float = 30.0
+    """Largest reading of a finger tip, in the maker's unit."""
+    margin: float = 0.15
+    """How far beyond its limits a joint may be measured (rad)."""
+    timeout: float = 0.1
+    """Oldest report to act upon (s)."""
+    start_timeout: float = 3.0
+    """Longest wait for the first report (s)."""
+    rate_share: float = 0.8
+    """Smallest share of the nominal control rate over the window."""
+    rate_window: float = 1.0
+    """Seconds over which the rate is judged."""
+
+    def __post_init__(self) -> None:
+        if not (len(self.low) == len(self.high) == len(self.speed)):
+            raise UsageError("Limits of position and speed need one number per joint each.")
+        if not ((np.asarray(self.low) < self.high).all() and (np.asarray(self.speed) > 0).all()):
+            raise UsageError("Every joint needs a lower limit below its upper one and a positive speed.")
+        for name in ("pressure", "margin", "timeout", "start_timeout", "rate_share", "rate_window"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise UsageError(f"The safety limit {name!r} is a positive number; received {value!r}.")
+
+    @classmethod
+    def of_hand(cls, hand: Hand, joints: tuple[str, ...], **changes: float) -> SafetyLimits:
+        """Return the limits of a hand's joints, in a given order.
+
+        Raises:
+            UsageError: the hand lacks a joint.
+        """
+        model = hand.model
+        names = {model.joint(index).name: index for index in range(model.njnt)}
+        if missing := [name for name in joints if name not in names]:
+            raise UsageError(f"The hand {hand.name!r} has no joint {missing[0]!r}.")
+        ranges = np.array([model.jnt_range[names[name]] for name in joints])
+        speeds = {joint.name: joint.velocity for joint in hand.spec.joints} if hand.spec is not None else {}
+        return cls(ranges[:, 0], ranges[:, 1], np.array([speeds.get(name, 5.0) for name in joints]), **changes)
+
+    def fault(self, reading: HandReading, age: float) -> str | None:
+        """Return why a report must not be acted upon, in words; None if it may."""
+        values = (reading.position, reading.velocity, reading.pressure)
+        if not all(np.isfinite(value).all() for value in values) or not math.isfinite(reading.time):
+            return "the hand reports values that are no numbers"
+        if age > self.timeout:
+            return f"the newest report is {1e3 * age:.0f} ms old (allowed {1e3 * self.timeout:.0f} ms)"
+        beyond = np.maximum(self.low - reading.position, reading.position - self.high) - self.margin
+        if (beyond > 0).any():
+            joint = int(beyond.argmax())
+            return f"joint {joint} is reported at {reading.position[joint]:.3g} rad, beyond its limits"
+        fast = np.abs(reading.velocity) - 2 * self.speed
+        if (fast > 0).any():
+            joint = int(fast.argmax())
+            return f"joint {joint} is reported to move at {reading.velocity[joint]:.3g} rad/s"
+        strongest = float(np.linalg.norm(reading.pressure, axis=1).max()) if reading.pressure.size else 0.0
+        if strongest > self.pressure:
+            return f"a finger tip is pressed with {strongest:.3g} (allowed {self.pressure:g})"
+        return None
+
+    def limit(self, targets: NDArray[np.float64], before: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+        """Return targets [J] within the limits of position, and of speed from the targets before."""
+        step = self.speed * dt
+        return np.clip(np.clip(targets, before - step, before + step), self.low, self.high)
+
+
+class ClockOffset:
+    """How late reports come, although the hand's clock and ours have different zeros.
+
+    The smallest difference between arrival and measurement seen so far counts as no delay.
+    """
+
+    def __init__(self) -> None:
+        self._least = math.inf
+
+    def age(self, reading: HandReading, now: float) -> float:
+        """Return how long ago a report was measured (s), beyond the shortest way seen."""
+        self._least = min(self._least, reading.arrived - reading.time)
+        return now - reading.time - self._least

@@ -1,0 +1,271 @@
+"""A simulated XHand1 behind a UDP socket: MuJoCo in real time, its own watchdog, and faults on request.
+
+Runs as a process of its own: ``with simulated_hand() as address: …``. It holds a ball, palm up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from robotics_bridge.deploy.messages import COMMAND, STATE, STOP, decode, encode
+from robotics_bridge.deploy.touch import PressureCalibration
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+HOLD_AFTER = 0.25
+"""Seconds without a command after which the hand holds by itself."""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong between hand and controller. Probabilities are per report.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    drop: float = 0.0
+    """Probability that a report is lost."""
+    delay: float = 0.0
+    """Seconds that reports are under way."""
+    delay_after: float = 0.0
+    """Seconds from the start until that delay sets in."""
+    jitter: float = 0.0
+    """Up to so many seconds more, drawn for each: reports overtake one another."""
+    damage: float = 0.0
+    """Probability that a byte of a report is changed."""
+    absurd: float = 0.0
+    """Probability that a joint is reported at 1000 rad."""
+    nan: float = 0.0
+    """Probability that a joint's position is no number."""
+    silent_after: float = 0.0
+    """Seconds after which the hand says nothing more; 0: never."""
+    frozen_after: float = 0.0
+    """Seconds after which it repeats one report (its time too) under new numbers; 0: never."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("drop", "damage", "absurd", "nan"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"The fault {name!r} is a probability; received {getattr(self, name)!r}.")
+        for name in ("delay", "delay_after", "jitter", "silent_after", "frozen_after"):
+            if not 0 <= getattr(self, name) < 3600:
+                raise UsageError(f"The fault {name!r} is a time in seconds; received {getattr(self, name)!r}.")
+
+    @classmethod
+    def parse(cls, texts: list[str]) -> Faults:
+        """Return the faults of texts such as ``drop=0.2``.
+
+        Raises:
+            UsageError: a fault is unknown or its value is no number.
+        """
+        known = [item.name.replace("_", "-") for item in fields(cls)]
+        values: dict[str, Any] = {}
+        for text in texts:
+            name, equals, value = text.partition("=")
+            if name not in known:
+                raise unknown_name("fault", name, known)
+            try:
+                values[name.replace("-", "_")] = int(value) if name == "seed" else float(value)
+            except ValueError:
+                raise UsageError(f"A fault is given as {name}=NUMBER; received {text!r}.") from None
+            if not equals:
+                raise UsageError(f"A fault is given as {name}=NUMBER; received {text!r}.")
+        return cls(**values)
+
+
+class SimulatedHand:
+    """The physics and readings of the hand; the socket is :func:`serve`'s business.
+
+    Args:
+        hand: Name of the hand.
+        rate: Reports per second; also the rate of the physics.
+        observe: Observation type that its skin gives; reports need ``agg_force`` on the tips.
+        placement: Of its taxels.
+        resolution: Of its taxels.
+    """
+
+    def __init__(
+        self,
+        hand: str = "xhand1",
+        rate: float = 200.0,
+        *,
+        observe: str = "agg_force",
+        placement: str = "tips",
+        resolution: str = "med",
+    ) -> None:
+        from robotics_bridge import hands
+        from robotics_bridge.hands.observations import sensors_for
+        from robotics_bridge.hands.scenes import OBJECT, holding
+        from robotics_bridge.physics import MujocoEngine
+        from robotics_bridge.sensors import SensorSuite
+
+        self.hand, self.rate = hands.load(hand), rate
+        self.engine = MujocoEngine(holding(self.hand, timestep=1 / rate), 1, threads=1)
+        self.observe, self.layout = observe, self.hand.layout(resolution, placement)
+        sensors = sensors_for(observe, self.layout, track=(OBJECT,))
+        self.suite = SensorSuite(self.engine.scene, sensors, num_envs=1)
+        self.suite.update(self.engine.state, 1 / rate)
+        self.calibration = PressureCalibration()
+        self.joints = self.hand.joints
+        self.fingers = tuple(self.hand.fingers)
+        model = self.engine.model
+        self._positions = [int(model.joint(name).qposadr[0]) for name in self.joints]
+        self._speeds = [int(model.joint(name).dofadr[0]) for name in self.joints]
+        self._drives = [model.actuator(name).id for name in self.joints]
+        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
+        self._rows = [self.fingers.index(tips[link]) for link in self.layout if link in tips]
+        # The first step and reading load what later ones use; real time begins after them.
+        self.step()
+        self.touch()
+        self.engine.reset()
+
+    def hold(self) -> None:
+        """Let the drives hold where the joints are."""
+        self.drive(self.position)
+
+    def drive(self, targets: NDArray[np.float64]) -> None:
+        """Set the targets [J] of the position drives."""
+        ctrl = self.engine.data[0].ctrl
+        ctrl[self._drives] = targets
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Joint positions [J] (rad)."""
+        return self.engine.data[0].qpos[self._positions].copy()
+
+    def step(self) -> None:
+        """Advance by one report."""
+        self.engine.step()
+        self.suite.update(self.engine.state, 1 / self.rate)
+
+    def touch(self) -> NDArray[np.float32]:
+        """Return what the skin gives [N, C]: items of the observation type, in the layout's order."""
+        from robotics_bridge.hands.observations import observation_type, observe
+
+        values = observe(self.observe, {link: self.suite.read(link) for link in self.layout}, self.layout)
+        return values.view(-1, observation_type(self.observe).channels).numpy()
+
+    def report(self) -> NDArray[np.float64]:
+        """Return positions, velocities and pressures [2J + 3F]."""
+        pressure = np.zeros((len(self.fingers), 3))
+        pressure[self._rows] = self.touch()
+        raw = self.calibration.pressure(self.fingers, pressure)
+        return np.concatenate([self.position, self.engine.data[0].qvel[self._speeds], raw.ravel()])
+
+
+def serve(hand: SimulatedHand, link: socket.socket, faults: Faults, seconds: float = 3600.0) -> None:
+    """Simulate in real time and answer on a bound UDP socket until the time is over."""
+    link.setblocking(False)
+    random = np.random.default_rng(faults.seed)
+    joints, fingers, start = len(hand.joints), len(hand.fingers), time.monotonic()
+    peer: Any = ()
+    waiting: list[tuple[float, bytes]] = []
+    heard, stopped, held, sequence, tick, newest = start, False, True, 0, 0, -1
+    frozen: tuple[NDArray[np.float64], float] | None = None
+    hand.hold()
+    while (now := time.monotonic()) - start < seconds:
+        with contextlib.suppress(BlockingIOError, ConnectionError):
+            while True:
+                data, sender = link.recvfrom(4096)
+                message = decode(data)
+                if message is None or message.kind != COMMAND:
+                    continue
+                peer = sender
+                if message.joints != joints:
+                    # A greeting: a new session, which begins in the posture of the last.
+                    stopped, newest = False, -1
+                elif message.flags & STOP:
+                    stopped = True
+                    hand.hold()
+                elif not stopped and message.sequence > newest and np.isfinite(message.values).all():
+                    hand.drive(message.values)
+                    heard, held, newest = now, False, message.sequence
+        if not held and now - heard > HOLD_AFTER:
+            hand.hold()
+            held = True
+        hand.step()
+        sequence += 1
+        values, stamp = hand.report(), now - start
+        if faults.frozen_after and stamp > faults.frozen_after:
+            frozen = frozen or (values, stamp)
+            values, stamp = frozen
+        if peer and not (faults.silent_after and now - start > faults.silent_after):
+            late = faults.delay if now - start >= faults.delay_after else 0.0
+            due = now + late + faults.jitter * random.random()
+            spoiled = _spoil(values, faults, random, joints, fingers, sequence, stamp)
+            waiting.extend((due, data) for data in spoiled)
+        for due, data in [item for item in waiting if item[0] <= now]:
+            waiting.remove((due, data))
+            with contextlib.suppress(OSError):
+                link.sendto(data, peer)
+        tick += 1
+        time.sleep(max(0.0, start + tick / hand.rate - time.monotonic()))
+
+
+def _spoil(
+    values: NDArray[np.float64],
+    faults: Faults,
+    random: np.random.Generator,
+    joints: int,
+    fingers: int,
+    sequence: int,
+    stamp: float,
+) -> Iterator[bytes]:
+    drop, damage, absurd, nan = random.random(4)
+    values = values.copy()
+    if absurd < faults.absurd:
+        values[int(random.integers(joints))] = 1000.0
+    if nan < faults.nan:
+        values[int(random.integers(joints))] = np.nan
+    data = bytearray(encode(STATE, values, joints=joints, fingers=fingers, sequence=sequence, time=stamp))
+    if damage < faults.damage:
+        data[int(random.integers(len(data)))] ^= 0xFF
+    if drop >= faults.drop:
+        yield bytes(data)
+
+
+def _process(name: str, rate: float, faults: Faults, seconds: float, ready: Any) -> None:
+    hand = SimulatedHand(name, rate)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.bind(("127.0.0.1", 0))
+        ready.send((link.getsockname()[1], hand.joints, hand.fingers))
+        serve(hand, link, faults, seconds)
+
+
+@contextlib.contextmanager
+def simulated_hand(
+    hand: str = "xhand1", *, rate: float = 200.0, faults: Faults | None = None, seconds: float = 600.0
+) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...]]]:
+    """Run a simulated hand in a process of its own; yield its address, joints and fingers.
+
+    Raises:
+        DataError: the process did not start.
+    """
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_process, args=(hand, rate, faults or Faults(), seconds, theirs), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        if not ours.poll(120):
+            raise DataError("The simulated hand did not start within two minutes.")
+        try:
+            port, joints, fingers = ours.recv()
+        except EOFError:
+            raise DataError("The simulated hand ended while it started.") from None
+        yield ("127.0.0.1", port), joints, fingers
+    finally:
+        process.terminate()
+        process.join(5)
+        ours.close()

@@ -1,0 +1,115 @@
+"""The tactile observation on a real hand: what the hand measures where it can, the simulated reading elsewhere.
+
+The simulator's layout [S, N, C] is kept (thesis, section 4.3.5): one value per finger fills all S slots of its link.
+``agg_force`` takes the scaled contact pressure itself, ``agg_bool`` whether its magnitude exceeds a threshold (4.31).
+Types with one value per taxel have no faithful counterpart on the XHand1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.deploy.driver import HandReading
+
+REAL_TYPES = ("agg_bool", "agg_force")
+"""Observation types that a real hand can measure."""
+Fallback = Callable[["HandReading"], "NDArray[np.floating]"]
+"""A simulated tactile group [S, N, C] for a report."""
+
+
+@dataclass(frozen=True)
+class PressureCalibration:
+    """From the maker's contact pressure to the simulator's ``agg_force``; the published values.
+
+    Raises:
+        UsageError: a value is not valid.
+    """
+
+    scale: float = 1000.0
+    """``agg_force`` of one unit of the maker's contact pressure."""
+    per_finger: Mapping[str, float] = field(default_factory=dict)
+    """Finger → scale of its own."""
+    axes: tuple[float, float, float] = (-1.0, -1.0, 1.0)
+    """Factor per axis: the hand reports x and y with the opposite sign."""
+    threshold: float = 0.05
+    """Contact pressure, in the maker's unit, above which a finger touches (η_real of 4.31)."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.scale, *self.per_finger.values(), *self.axes]).all() and self.threshold > 0):
+            raise UsageError("A pressure calibration needs finite scales and a positive threshold.")
+
+    def force(self, fingers: tuple[str, ...], pressure: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the simulator's ``agg_force`` [F, 3] of pressures [F, 3]."""
+        scales = np.array([self.per_finger.get(finger, self.scale) for finger in fingers])
+        return pressure * scales[:, None] * np.array(self.axes)
+
+    def pressure(self, fingers: tuple[str, ...], force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures [F, 3] that give an ``agg_force`` [F, 3]."""
+        scales = np.array([self.per_finger.get(finger, self.scale) for finger in fingers])
+        return force / (scales[:, None] * np.array(self.axes))
+
+
+class RealTouch:
+    """Makes the tactile group of a policy from reports.
+
+    Args:
+        observe: Observation type of the policy.
+        links: Its links, in order; one item each for the aggregated types.
+        shape: (S, N, C) of the group.
+        tips: Link → finger, for the links whose tip the hand senses.
+        fingers: Fingers in the order of the reports.
+        calibration: From the maker's unit to the simulator's.
+        fallback: Where the hand senses nothing; None leaves those items zero.
+
+    Raises:
+        UsageError: the type cannot be measured and nothing is simulated in its place.
+    """
+
+    def __init__(
+        self,
+        observe: str,
+        links: tuple[str, ...],
+        shape: tuple[int, int, int],
+        *,
+        tips: Mapping[str, str],
+        fingers: tuple[str, ...],
+        calibration: PressureCalibration | None = None,
+        fallback: Fallback | None = None,
+    ) -> None:
+        self.observe, self.shape, self.fallback = observe, shape, fallback
+        self.calibration, self.fingers = calibration or PressureCalibration(), fingers
+        sensed = [(item, tips.get(link, "")) for item, link in enumerate(links)]
+        self.measured = [(item, fingers.index(finger)) for item, finger in sensed if finger in fingers]
+        real = observe in REAL_TYPES
+        if not real and fallback is None:
+            raise UsageError(
+                f"A real hand cannot measure {observe!r}, one value per taxel; deploy a policy that was trained on "
+                "'agg_force' or 'agg_bool', or simulate its touch beside the hand."
+            )
+        if not real:
+            self.measured = []
+        elif shape[1] != len(links):
+            raise UsageError(f"{observe!r} has one item per link ({len(links)}); the policy reads {shape[1]}.")
+
+    def __call__(self, reading: HandReading) -> NDArray[np.float32]:
+        """Return the tactile group [S, N, C]."""
+        group = np.zeros(self.shape, np.float32)
+        if self.fallback is not None:
+            group[...] = self.fallback(reading)
+        if self.measured:
+            items, rows = (list(part) for part in zip(*self.measured, strict=True))
+            if self.observe == "agg_bool":
+                touching = np.linalg.norm(reading.pressure, axis=1) > self.calibration.threshold
+                group[:, items, 0] = touching[rows]
+            else:
+                group[:, items] = self.calibration.force(self.fingers, reading.pressure)[rows]
+        return group

@@ -1,0 +1,106 @@
+"""What finger tips and objects meet: net contact forces, and distances from tips to objects.
+
+Letters: B environment, F finger tip, K object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from robotics_bridge.tasks.rotations import conjugate, from_xyzw, rotate
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.envs.simulation import World
+    from robotics_bridge.tasks.scenes import TaskModel
+
+_REACH = 0.5
+"""Largest distance that is told (m)."""
+_LIMIT = 10.0
+"""Bounds of the components of a force on a finger tip, as published (N)."""
+
+
+class Contacts:
+    """Privileged senses of a task, read once per control step."""
+
+    def __init__(self, world: World, model: TaskModel, *, step_dt: float, seed: int) -> None:
+        import torch
+
+        from robotics_bridge.envs.kernels.actuation import environment_kernels
+        from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
+
+        wp, scene, device = warp(), world.engine.scene, world.warp_device
+        self._world, self._kernels, self._dt = world, environment_kernels(), step_dt
+        tips = list(model.tips)
+        self._tips = len(tips)
+        self.tip_links = torch.as_tensor([scene.link_index(tip) for tip in tips], device=world.device)
+        """[F] numbers of the links of finger tips."""
+        probes = {
+            tip: SurfaceDistanceProbe(
+                link=tip,
+                probes=Probes(np.array([point]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]), (1,)),
+                track=model.objects,
+                max_range=_REACH,
+            )
+            for tip, point in model.tips.items()
+        }
+        self._suite = SensorSuite(scene, probes, num_envs=world.num_envs, device=device, seed=seed)
+        (runtime,) = self._suite.runtimes
+        self.planes: torch.Tensor = wp.to_torch(runtime.measured())
+        """[1, B, F] distances in the order of the suite (m)."""
+        order = [runtime.places[tip].start for tip in tips]
+        self._order = torch.as_tensor(order, device=world.device)
+        rows = np.full(len(scene.geometries), -1, dtype=np.int32)
+        for row, link in enumerate((*tips, *model.objects)):
+            rows[list(scene.geometries_of(link))] = row
+        self._rows = wp.array(rows, dtype=wp.int32, device=device)
+        self._forces: Any = wp.zeros((world.num_envs, len(tips) + len(model.objects)), dtype=wp.vec3f, device=device)
+        self.forces: torch.Tensor = wp.to_torch(self._forces)
+        """[B, F + K, 3] net normal contact forces on finger tips, then on objects, world axes (N); a view."""
+
+    def read(self) -> None:
+        """Take forces and distances from the world's state."""
+        wp, state = warp(), self._world.state
+        self._forces.zero_()
+        inputs = [state.contact_count, state.contact_geom, state.contact_env, state.contact_normal]
+        inputs += [state.contact_force, self._rows, self._forces]
+        wp.launch(self._kernels.forces, dim=state.contact_env.shape[0], inputs=inputs, device=self._world.warp_device)
+        self._suite.update(state, self._dt)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Begin new episodes in some environments [B] bool."""
+        self._suite.reset(mask)
+
+    def refresh(self, mask: torch.Tensor) -> None:
+        """Take distances of new episodes, which have no contacts yet, from the refreshed state."""
+        self.forces.masked_fill_(mask[:, None, None], 0.0)
+        self._suite.update(self._world.state, self._dt)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return copies of what was read last."""
+        return {"forces": self.forces.clone(), "distances": self.planes.clone()}
+
+    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
+        """Take up what :meth:`state_dict` returned."""
+        self.forces.copy_(values["forces"])
+        self.planes.copy_(values["distances"])
+
+    def on_object(self, rows: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the size [B] of the force on the objects ``target`` [B] (N); ``rows`` numbers the environments."""
+        return self.forces[rows, self._tips + target].norm(dim=1)
+
+    @property
+    def tip_force(self) -> torch.Tensor:
+        """Net normal contact force [B, F, 3] on finger tips in their own frame, within ±10 N as published."""
+        turn = conjugate(from_xyzw(self._world.pose[:, self.tip_links, 3:]))
+        return rotate(turn, self.forces[:, : self._tips]).clamp(-_LIMIT, _LIMIT).nan_to_num()
+
+    @property
+    def surface_distance(self) -> torch.Tensor:
+        """Distance [B, F] from each finger tip to the object (m), at most 0.5."""
+        return self.planes[0].index_select(1, self._order).nan_to_num(_REACH)

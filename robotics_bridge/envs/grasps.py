@@ -1,0 +1,237 @@
+"""Grasps from which the screwdriver task starts: sampled around a seed, settled, and kept if they hold.
+
+A candidate is a random change of the seed's joints, the tool upright near its place with any yaw. Fingers that would
+begin inside the tool are opened until they hardly touch. It is kept if enough finger tips are near the surface,
+nothing penetrates, and the tool stays where it is while the drives hold (after the sampling of the thesis, whose
+settings are the defaults).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import DataError
+from brainbench.core.files import atomic_path, cache_dir, content_hash
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.hands import Hand
+    from robotics_bridge.tasks.scenes import TaskModel
+    from robotics_bridge.tasks.task import Task
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspSampling:
+    """How grasps are sought (released settings)."""
+
+    count: int = 64
+    """Grasps in total, shared evenly between shapes."""
+    perturb: float = 0.2
+    """Half range of the change of each joint [rad]."""
+    near_fingers: int = 3
+    """Finger tips that must be near the surface."""
+    near: float = 0.02
+    """What near means [m]."""
+    max_penetration: float = 0.003
+    """[m]."""
+    max_displacement: float = 0.01
+    """Of the object while it is held [m]."""
+    shift: float = 0.01
+    """Half range of the object's x and y [m]."""
+    hold: float = 0.5
+    """For how long it must be held [s]."""
+    squeeze: float = 0.06
+    """By how much targets lie beyond the surface that the fingers touch [rad]."""
+    tries: int = 4000
+    """Candidates per shape before giving up."""
+
+
+SETTINGS = {"xhand1": GraspSampling(), "sharpa": GraspSampling(near=0.01)}
+"""By hand; others take those of xhand1."""
+
+
+def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> dict[str, NDArray[np.float64]]:
+    """Return grasps for every shape of a task, sampled once and kept in the cache.
+
+    Returns:
+        ``joints`` [G, J] (rad) and ``target`` [G, J] of the drives, ``object`` [G, 7] poses (x y z, qw qx qy qz) and
+        ``rows`` [shapes, n]: which grasps belong to which shape.
+
+    Raises:
+        DataError: too few grasps were found.
+    """
+    settings = SETTINGS.get(hand.name, SETTINGS["xhand1"])
+    numbers = [
+        getattr(m, f) for m in model.models for f in ("geom_size", "geom_pos", "body_pos", "body_quat", "body_mass")
+    ]
+    key = content_hash(
+        asdict(settings), task.name, seed, *(np.round(n, 6).tolist() for n in numbers), model.rest.tolist()
+    )
+    path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
+    if path.is_file():
+        with np.load(path, allow_pickle=False) as found:
+            return dict(found)
+    each = max(settings.count // len(model.models), 1)
+    parts = [sample(task, hand, model, index, each, settings, seed) for index in range(len(model.models))]
+    grasps = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    grasps["rows"] = np.arange(each * len(parts), dtype=float).reshape(len(parts), each)
+    with atomic_path(path) as target, target.open("wb") as file:
+        np.savez(file, **grasps)  # type: ignore[arg-type]
+    return grasps
+
+
+def sample(
+    task: Task, hand: Hand, model: TaskModel, shape: int, count: int, settings: GraspSampling, seed: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return grasps ``joints``, ``target`` [n, J] and ``object`` [n, 7] of one shape.
+
+    Raises:
+        DataError: too few candidates held.
+    """
+    trial = _Trial(task, model, shape, settings)
+    rng = np.random.default_rng((seed, shape))
+    found: dict[str, list[NDArray[np.float64]]] = {"joints": [], "target": [], "object": []}
+    for _ in range(settings.tries):
+        if len(found["joints"]) == count:
+            break
+        joints = np.clip(
+            model.rest + rng.uniform(-settings.perturb, settings.perturb, len(model.rest)), model.low, model.high
+        )
+        place = np.append(rng.uniform(-settings.shift, settings.shift, 2), 0.0)
+        held = trial.run(joints, place, rng.uniform(-np.pi, np.pi))
+        if held is not None:
+            for name, value in held.items():
+                found[name].append(value)
+    if len(found["joints"]) < count:
+        raise DataError(
+            f"Only {len(found['joints'])} of {count} grasps of {model.shapes[shape].name!r} by hand {hand.name!r} "
+            f"held in {settings.tries} tries; set joints near a grasp (Task.joints) or another pose (Task.hand_poses)."
+        )
+    return {name: np.array(values) for name, values in found.items()}
+
+
+class _Trial:
+    """Tries candidates in one simulation."""
+
+    def __init__(self, task: Task, model: TaskModel, shape: int, settings: GraspSampling) -> None:
+        mujoco = mujoco_module()
+        self._mujoco, self._task, self._settings, self._model = mujoco, task, settings, model
+        self._m: Any = model.models[shape]
+        self._d = mujoco.MjData(self._m)
+        self._joints = np.array([self._m.joint(name).qposadr[0] for name in model.joints])
+        self._speeds = np.array([self._m.joint(name).dofadr[0] for name in model.joints])
+        self._drive = np.array([self._m.actuator(name).id for name in model.joints])
+        self._object = self._m.body(model.objects[0]).id
+        self._address = int(self._m.joint(model.objects[0]).qposadr[0])
+        self._tips = [(self._m.body(link).id, np.array(point)) for link, point in model.tips.items()]
+        self._chains = [self._above(body) for body, _ in self._tips]
+
+    def run(self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float) -> dict[str, Any] | None:
+        """Return the settled grasp, or None if it does not hold."""
+        s, d = self._settings, self._d
+        opened = self._opened(joints, place, yaw)
+        if opened is None or self._near() < s.near_fingers:
+            return None
+        target = np.clip(opened + s.squeeze * self._closing, self._model.low, self._model.high)
+        start = d.xpos[self._object].copy()
+        for _ in range(round(s.hold / self._m.opt.timestep)):
+            self._step(target)
+        pose = d.qpos[self._address : self._address + 7].copy()
+        axis = d.xmat[self._object].reshape(3, 3) @ np.array([0.0, 1.0, 0.0])
+        lost = np.linalg.norm(d.xpos[self._object] - start) > s.max_displacement or axis[2] < 0.995
+        if lost or not np.isfinite(d.qpos).all() or self._penetration() > s.max_penetration or self._fingers() < 2:
+            return None
+        return {"joints": d.qpos[self._joints].copy(), "target": target, "object": pose}
+
+    def _opened(
+        self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float
+    ) -> NDArray[np.float64] | None:
+        """Return joints at which no finger starts inside the tool, and note which way they close."""
+        chosen = joints.copy()
+        self._closing = np.zeros(len(joints))
+        for _ in range(12):
+            self._put(chosen, place, yaw)
+            depth = self._tip_depths()
+            if all(value <= 1e-3 for value in depth):
+                break
+            for columns, value in zip(self._chains, depth, strict=True):
+                if value > 1e-3:
+                    chosen[columns] -= 0.05 * np.sign(self._model.high[columns] + self._model.low[columns])
+            chosen = np.clip(chosen, self._model.low, self._model.high)
+        for columns in self._chains:
+            if any(self._model.joints[c] in self._model.moved for c in columns):
+                self._closing[columns] = np.sign(self._model.high[columns] + self._model.low[columns])
+        return chosen if self._penetration() <= self._settings.max_penetration else None
+
+    def _put(self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float) -> None:
+        d, mujoco = self._d, self._mujoco
+        mujoco.mj_resetData(self._m, d)
+        d.qpos[self._joints] = joints
+        quat = np.zeros(4)
+        turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+        mujoco.mju_mulQuat(quat, turn, np.array(self._task.placement.quaternion))
+        d.qpos[self._address : self._address + 7] = (*place, *quat)
+        mujoco.mj_forward(self._m, d)
+
+    def _step(self, target: NDArray[np.float64]) -> None:
+        d, model = self._d, self._model
+        torque = model.stiffness * (target - d.qpos[self._joints]) - model.damping * d.qvel[self._speeds]
+        d.ctrl[self._drive] = np.clip(torque, -model.effort, model.effort)
+        self._mujoco.mj_step(self._m, d)
+
+    def _above(self, body: int) -> NDArray[np.int64]:
+        """Return the numbers of the flexing joints that move a body; those that spread a finger are left alone."""
+        found = []
+        while body > 0:
+            for column, name in enumerate(self._model.joints):
+                low, high = self._model.low[column], self._model.high[column]
+                spreads = abs(low + high) < 0.5 * (high - low)
+                if self._m.jnt_bodyid[self._m.joint(name).id] == body and not spreads:
+                    found.append(column)
+            body = int(self._m.body_parentid[body])
+        return np.array(found, dtype=np.int64)
+
+    def _tip_depths(self) -> list[float]:
+        depth = {body: 0.0 for body, _ in self._tips}
+        for contact in self._d.contact:
+            bodies = self._m.geom_bodyid[list(contact.geom)].tolist()
+            for body, deepest in depth.items():
+                if body in bodies and self._object in bodies:
+                    depth[body] = max(deepest, -contact.dist)
+        return list(depth.values())
+
+    def _penetration(self) -> float:
+        depths = [-c.dist for c in self._d.contact if self._object in self._m.geom_bodyid[list(c.geom)]]
+        return max(depths, default=0.0)
+
+    def _fingers(self) -> int:
+        """Return how many finger tips touch the tool."""
+        tips = {body for body, _ in self._tips}
+        touching = set()
+        for contact in self._d.contact:
+            bodies = set(self._m.geom_bodyid[list(contact.geom)].tolist())
+            if self._object in bodies:
+                touching |= bodies & tips
+        return len(touching)
+
+    def _near(self) -> int:
+        """Return how many finger tips are near the tool."""
+        d, close = self._d, 0
+        geoms = np.flatnonzero(self._m.geom_bodyid == self._object)
+        for body, point in self._tips:
+            world = d.xpos[body] + d.xmat[body].reshape(3, 3) @ point
+            distance = min(self._distance(int(geom), world) for geom in geoms)
+            close += distance < self._settings.near
+        return close
+
+    def _distance(self, geom: int, point: NDArray[np.float64]) -> float:
+        """Return the distance of a point from a cylinder or capsule (m)."""
+        local = self._d.geom_xmat[geom].reshape(3, 3).T @ (point - self._d.geom_xpos[geom])
+        radius, half = self._m.geom_size[geom, :2]
+        beyond = np.array([max(np.hypot(local[0], local[1]) - radius, 0.0), max(abs(local[2]) - half, 0.0)])
+        return float(np.linalg.norm(beyond))

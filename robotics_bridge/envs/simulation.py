@@ -1,0 +1,178 @@
+"""The physics of a batch of environments as torch tensors, on either engine. Letters: B environment, J joint.
+
+With MuJoCo Warp the tensors are views of the engine's own memory; with C MuJoCo they are copies that this class keeps
+in step, so that what stands above knows no engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import mujoco_module, pick_device, warp
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    import torch
+
+FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "geom_friction")
+"""Numbers of the model that differ between environments and change at resets."""
+
+
+class World:
+    """Batched physics.
+
+    Args:
+        models: a ``mujoco.MjModel`` per shape of the object.
+        num_envs: B.
+        device: ``cpu`` or ``cuda``.
+        engine: ``mujoco`` or ``warp``.
+        threads: of C MuJoCo; None takes all processors.
+
+    Raises:
+        UsageError: the engine does not run on the device.
+    """
+
+    def __init__(
+        self, models: Sequence[Any], num_envs: int, *, device: str, engine: str, threads: int | None = None
+    ) -> None:
+        import torch
+
+        from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
+
+        if engine == "mujoco" and device != "cpu":
+            raise UsageError("C MuJoCo runs on the processor: use device='cpu', or engine='warp'.")
+        self.model = models[0]
+        self.num_envs = num_envs
+        free = int(mujoco_module().mjtJoint.mjJNT_FREE)
+        starts = zip(self.model.jnt_bodyid, self.model.jnt_type, self.model.jnt_dofadr, strict=True)
+        # A body whose centre of mass is not its origin is not simple: its inertia depends on how it lies.
+        self._free = {int(b): int(d) for b, kind, d in starts if kind == free and self.model.body_simple[b]}
+        order = np.arange(num_envs) % len(models)
+        self.shape_of = order
+        """Number [B] of the shape that each environment has."""
+        nominal = {name: np.stack([getattr(m, name) for m in models])[order] for name in FIELDS}
+        self.native = engine == "warp"
+        if self.native:
+            self.engine: Any = MujocoWarpEngine(list(models), num_envs, device=device, fields=nominal)
+            self.qpos, self.qvel, self.ctrl = self.engine.qpos, self.engine.qvel, self.engine.ctrl
+            self.push = warp().to_torch(self.engine.data.xfrc_applied)
+            self._warmstart = warp().to_torch(self.engine.data.qacc_warmstart)
+            self.fields = {name: self.engine.field(name) for name in FIELDS}
+        else:
+            for each in models:
+                # An environment that diverges shows it; C MuJoCo would put it back silently.
+                each.opt.disableflags |= mujoco_module().mjtDisableBit.mjDSBL_AUTORESET
+            self.engine = MujocoEngine(list(models), num_envs, fields=nominal, threads=threads)
+            self.qpos = torch.from_numpy(self.engine.qpos.astype(np.float32))
+            self.qvel = torch.from_numpy(self.engine.qvel.astype(np.float32))
+            self.ctrl = torch.zeros(num_envs, self.model.nu)
+            self.push = torch.zeros(num_envs, self.model.nbody, 6)
+            self.fields = {name: torch.from_numpy(np.array(nominal[name], np.float32)) for name in FIELDS}
+        self.device = self.qpos.device
+        self.state = self.engine.state
+        self.pose: torch.Tensor = self.state.pose_torch
+        """[B, L, 7] world poses of links (m; x y z, qx qy qz qw) as of the last step or refresh; a view."""
+        self._time = self.state.time_torch
+        self.warp_device = pick_device(device)
+        self.start = self.qpos.clone()
+        self._pushed = False
+
+    @property
+    def timestep(self) -> float:
+        """Duration of a physics step (s)."""
+        return self.engine.timestep
+
+    def step(self) -> None:
+        """Advance all environments by one physics step with ``ctrl`` and ``push``."""
+        if self.native:
+            self.engine.step()
+            return
+        self.engine.set(ctrl=self.ctrl.numpy())
+        self.engine.step()
+        self._pull()
+
+    def apply_push(self) -> None:
+        """Hand ``push`` (force and torque on bodies [B, nbody, 6], N and N·m, world axes) to the engine."""
+        if self.native:
+            return
+        pushing = bool(self.push.any())
+        if pushing or self._pushed:
+            self.engine.set(xfrc_applied=self.push.numpy())
+        self._pushed = pushing
+
+    def refresh(self) -> None:
+        """Bring poses and velocities of the state up to ``qpos`` and ``qvel``."""
+        self.engine.kinematics()
+
+    def reset(self, mask: torch.Tensor, qpos: torch.Tensor) -> None:
+        """Put some environments to positions, at rest, and make changed ``fields`` valid there.
+
+        Args:
+            mask: which [B] bool.
+            qpos: positions [B, nq]; rows of other environments are not looked at.
+        """
+        import torch
+
+        column = mask.unsqueeze(1)
+        self.qpos.copy_(torch.where(column, qpos, self.qpos))
+        self.qvel.masked_fill_(column, 0.0)
+        self.ctrl.masked_fill_(column, 0.0)
+        self.push.masked_fill_(column.unsqueeze(2), 0.0)
+        self._time.masked_fill_(mask, 0.0)
+        if self.native:
+            self._warmstart.masked_fill_(column, 0.0)
+            return
+        mujoco = mujoco_module()
+        for env in torch.nonzero(mask).flatten().tolist():
+            data = self.engine.data[env]
+            mujoco.mj_resetData(self.engine.model_of(env), data)
+            data.qpos[:] = self.qpos[env].numpy()
+            self._write_fields(env)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return everything that the next step depends on."""
+        import torch
+
+        own = {"ctrl": self.ctrl, "push": self.push, "qpos": self.qpos, "qvel": self.qvel}
+        own |= {f"field.{name}": value for name, value in self.fields.items()}
+        if self.native:
+            own["warmstart"] = self._warmstart
+            own["time"] = self._time
+        else:
+            own["integration"] = torch.from_numpy(self.engine.integration_state())
+        return {name: value.clone() for name, value in own.items()}
+
+    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
+        """Take up what :meth:`state_dict` returned."""
+        for name, value in self.fields.items():
+            value.copy_(values[f"field.{name}"])
+        for name in ("ctrl", "push", "qpos", "qvel"):
+            getattr(self, name).copy_(values[name])
+        if self.native:
+            self._warmstart.copy_(values["warmstart"])
+            self._time.copy_(values["time"])
+        else:
+            for env in range(self.num_envs):
+                self._write_fields(env)
+            self.engine.set_integration_state(values["integration"].numpy())
+        self.refresh()
+
+    def _write_fields(self, env: int) -> None:
+        values = {name: value[env].numpy() for name, value in self.fields.items()}
+        # C MuJoCo takes the inertia of free bodies from here, not from their masses.
+        inertia = np.array(self.engine.model_of(env).dof_M0)
+        for body, first in self._free.items():
+            inertia[first : first + 3], inertia[first + 3 : first + 6] = (
+                values["body_mass"][body],
+                values["body_inertia"][body],
+            )
+        self.engine.set_fields(env, {**values, "dof_M0": inertia})
+
+    def _pull(self) -> None:
+        qpos, qvel = self.qpos.numpy(), self.qvel.numpy()
+        for env, data in enumerate(self.engine.data):
+            qpos[env] = data.qpos
+            qvel[env] = data.qvel

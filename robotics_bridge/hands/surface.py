@@ -1,0 +1,122 @@
+"""Probes on the surface of any link of a MuJoCo model, by casting a bundle of parallel rays onto it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import UsageError
+from robotics_bridge.sensors.probes.placement import Probes
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+def link_points(model: Any, body: int) -> NDArray[np.float64]:
+    """Return points [n, 3] that span a body's solids, in its frame (m): vertices of meshes, corners of the rest."""
+    mujoco = mujoco_module()
+    points = []
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    for geom in geoms_of(model, body):
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+        local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+        if int(model.geom_type[geom]) == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = int(model.geom_dataid[geom])
+            first = int(model.mesh_vertadr[mesh])
+            local = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+        points.append(local @ matrix.reshape(3, 3).T + model.geom_pos[geom])
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+def geoms_of(model: Any, body: int) -> list[int]:
+    """Return the geometries of a body that collide, or all of them where none does."""
+    first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+    mine = list(range(first, first + count)) if count else []
+    solid = [geom for geom in mine if model.geom_contype[geom] or model.geom_conaffinity[geom]]
+    return solid or mine
+
+
+def cast_grid(
+    model: Any,
+    link: str,
+    rows: int,
+    columns: int,
+    *,
+    facing: ArrayLike,
+    radius: float,
+    along: ArrayLike | None = None,
+    extent: float = 0.8,
+) -> Probes:
+    """Lay a grid on the side of a link that faces a direction.
+
+    Rays run against ``facing`` over a share ``extent`` of the link; columns run along ``along``, by default the longest
+    extent across ``facing``. Rays that miss the link leave fillers.
+
+    Raises:
+        UsageError: the model has no such link, or the link has no surface there.
+    """
+    mujoco = mujoco_module()
+
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link)
+    if body < 0:
+        raise UsageError(f"The model has no link {link!r}.")
+    corners = link_points(model, body)
+    if not len(corners):
+        raise UsageError(f"Link {link!r} has no geometry, so no probe can lie on it.")
+    up = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
+    u, v = _plane(up, corners, along)
+    low, high = (
+        (corners @ np.stack([u, v, up], axis=1)).min(axis=0),
+        (corners @ np.stack([u, v, up], axis=1)).max(axis=0),
+    )
+    middle, half = (low + high) / 2, (high - low) / 2 * extent
+    x = middle[0] + (np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)) * half[0]
+    y = middle[1] + (np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)) * half[1]
+    start = high[2] + 0.01
+    position, normal, radii = np.zeros((rows * columns, 3)), np.tile(up, (rows * columns, 1)), np.zeros(rows * columns)
+    for index, (row, column) in enumerate(np.ndindex(rows, columns)):
+        origin = x[column] * u + y[row] * v + start * up
+        hit = _nearest(model, geoms_of(model, body), origin, -up)
+        position[index] = origin - up * (hit[0] if hit else start)
+        if hit:
+            normal[index], radii[index] = hit[1], radius
+    if not radii.any():
+        raise UsageError(f"Link {link!r} has no surface that faces {tuple(np.round(up, 3))}.")
+    return Probes(position, normal, radii, (rows, columns))
+
+
+def _plane(up: NDArray, corners: NDArray, along: ArrayLike | None) -> tuple[NDArray, NDArray]:
+    """Return the directions of columns and rows across ``up``."""
+    if along is None:
+        extent = np.ptp(corners, axis=0)
+        extent[np.argmax(np.abs(up))] = -1
+        along = np.eye(3)[np.argmax(extent)]
+    u = np.asarray(along, dtype=float)
+    u = u - up * (u @ up)
+    u = u / np.linalg.norm(u)
+    return u, np.cross(up, u)
+
+
+def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) -> tuple[float, NDArray] | None:
+    """Return distance and surface normal where a ray first meets one of the geometries (body's frame)."""
+    mujoco = mujoco_module()
+
+    data = mujoco.MjData(model)
+    best: tuple[float, NDArray] | None = None
+    for geom in geoms:
+        matrix, normal = np.zeros(9), np.zeros(3)
+        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+        kind = int(model.geom_type[geom])
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            data.geom_xpos[geom], data.geom_xmat[geom] = model.geom_pos[geom], matrix
+            distance = mujoco.mj_rayMesh(model, data, geom, origin, direction, normal)
+        else:
+            distance = mujoco.mju_rayGeom(
+                model.geom_pos[geom], matrix, model.geom_size[geom], origin, direction, kind, normal
+            )
+        if distance >= 0 and (best is None or distance < best[0]):
+            best = (distance, normal)
+    return best

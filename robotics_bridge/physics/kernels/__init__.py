@@ -1,0 +1,1 @@
+"""Warp kernels that fill and check a hand state."""

@@ -1,0 +1,1 @@
+"""Tactile encoders of policies: from taxels to features."""

@@ -1,0 +1,406 @@
+"""All tactile encoders of the comparison under one form: (readings [B, S, N, C], h_in [B, H]) → ([B, F], h_out).
+
+Small ones are learned with the policy; any other name is a network of :func:`brainbench.load_model`, the same object
+that a leaderboard ranks. A state of zeros is the one before the first step, and rows are independent. ``published``
+sizes are those of the thesis (section 4.3.4). Letters: B batch, S sub-step, N item, C channel, F feature, H state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+import torch
+from torch import nn
+
+from brainbench.core.contracts import GRID_SHAPE
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.models.cells import GRU
+from brainbench.models.registry import list_models
+from robotics_bridge import hands
+from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.policies.encoders.calibration import HandCalibration
+from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, PictureGRU
+from robotics_bridge.policies.encoders.front_end import FrontEnd, Learning
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.encoders.timing import Time
+
+AUTO = "auto"
+"""The published choice: ``tactile_convrnn`` where every link has a grid of taxels, ``rnn`` elsewhere."""
+_HIDDEN, _CHANNELS, _KERNEL = 64, (16, 32), 3
+_COUNTED = 1 << 24
+"""Values per channel whose squares are added up at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderConfig:
+    """A tactile encoder and what it reads; plain values only, so that it can stand in a file."""
+
+    name: str = AUTO
+    """An arm (:data:`ARMS`), or the name of a network."""
+    hand: str = "xhand1"
+    """Name or file of the hand whose taxels it reads; the next three as of a student."""
+    observe: str = "force_torque"
+    placement: str = "hand"
+    resolution: str = "med"
+    slots: int = 5
+    """S, physics steps in a control step."""
+    features: int = 32
+    """F: size of the embedding that the head gets."""
+    time: Time = "native"
+    """Of a network: the clock (:mod:`~robotics_bridge.policies.encoders.timing`)."""
+    learning: Learning = "frozen"
+    """Of a network: ``frozen`` or ``finetuned``."""
+    seed: int = 0
+    """Of an untrained network."""
+    pretrained: str | None = None
+    """Of a network with a tag: its weights."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of a network: what its builder takes, such as ``{"unroll": "full"}``."""
+    calibration: HandCalibration = field(default_factory=HandCalibration)
+    """What a newton is to a network."""
+
+    @classmethod
+    def of(cls, value: Mapping[str, Any] | EncoderConfig) -> EncoderConfig:
+        """Return a configuration from a mapping of its fields.
+
+        Raises:
+            UsageError: a field does not exist.
+        """
+        if isinstance(value, EncoderConfig):
+            return value
+        known = [item.name for item in fields(cls)]
+        for name in value:
+            if name not in known:
+                raise unknown_name("setting of a tactile encoder", name, known)
+        return cls(**{**value, "calibration": HandCalibration.of(value.get("calibration"))})
+
+    def plain(self) -> dict[str, Any]:
+        """Return the fields as JSON types; :meth:`of` undoes it."""
+        return asdict(self)
+
+    @property
+    def arm(self) -> str:
+        """The name, with ``auto`` resolved."""
+        if self.name != AUTO:
+            return self.name
+        return "rnn" if observation_type(self.observe).per_link else "tactile_convrnn"
+
+    def build(self) -> TactileEncoder:
+        """Return the encoder with new weights (the global random state), or a network's own.
+
+        Raises:
+            UsageError: a name is unknown, or the arm cannot read the observation type.
+        """
+        if self.arm in ARMS:
+            return ARMS[self.arm](self)
+        if ":" not in self.arm and self.arm.partition(".")[0] not in list_models():
+            raise unknown_name(
+                "tactile encoder", self.arm, (*ARMS, *list_models()), hint="See networks with: brainbench models list"
+            )
+        return _Network(self)
+
+
+class TactileEncoder(nn.Module):
+    """What all arms share.
+
+    Args:
+        config: Which encoder, and what it reads; fixes :attr:`shape` and the state.
+    """
+
+    state_size: int = 0
+    """H."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.features: int = config.features
+        kind = observation_type(config.observe)
+        layout = hands.load(config.hand).layout(config.resolution, config.placement)
+        counts = [1 if kind.per_link else int(probes.active.sum()) for probes in layout.values()]
+        self.shape: tuple[int, int, int] = (config.slots, sum(counts), kind.channels)
+        """(S, N, C)."""
+
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding [B, F], h_out [B, H])."""
+        raise NotImplementedError
+
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embeddings [L, B, F], h_out [B, H]) of L steps, with as few and as large products as there can be.
+
+        Args:
+            taxels: Readings [L, B, S, N, C].
+            h_in: Memory.
+            ended: Where [L, B] the memory is forgotten after a step; None for nowhere.
+        """
+        found = []
+        for step, reading in enumerate(taxels):
+            y, h_in = self(reading, h_in)
+            found.append(y)
+            if ended is not None:
+                h_in = torch.where(ended[step][:, None], 0.0, h_in)
+        return torch.stack(found), h_in
+
+    @property
+    def frozen_part(self) -> FrontEnd | None:
+        """The part without gradients, whose features can be computed once and kept; None if there is none."""
+        return None
+
+    def embed(self, features: torch.Tensor) -> torch.Tensor:
+        """Return the embedding [B, F] of what :attr:`frozen_part` gave."""
+        raise NotImplementedError
+
+    def observe_scale(self, taxels: torch.Tensor) -> None:
+        """Take readings [T, B, S, N, C] into account in the scale of the input."""
+
+
+class RunningScale(nn.Module):
+    """x / rms per channel, the root mean square of all values seen that are not zero; silence stays silence.
+
+    Args:
+        channels: C; the last axis of what is scaled.
+    """
+
+    total: torch.Tensor
+    count: torch.Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.register_buffer("total", torch.zeros(channels, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros(channels, dtype=torch.float64))
+
+    def update(self, x: torch.Tensor) -> None:
+        """Count values [..., C]; those that are not finite are left out."""
+        # In parts: in double precision, a rollout of many taxels would fill a GPU.
+        for flat in x.detach().reshape(-1, x.shape[-1]).split(_COUNTED):
+            used = (flat != 0) & torch.isfinite(flat)
+            self.total += torch.where(used, flat, 0).double().pow(2).sum(0)
+            self.count += used.sum(0)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the scaled values."""
+        mean = torch.where(self.count > 0, self.total / self.count.clamp(min=1), 1.0).clamp(min=1e-24)
+        return x / mean.sqrt().to(x.dtype)
+
+
+class _Learned(TactileEncoder):
+    """An encoder that is learned with the policy."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        self.scale = RunningScale(self.shape[2])
+
+    def observe_scale(self, taxels: torch.Tensor) -> None:
+        self.scale.update(taxels)
+
+
+class _Flat(_Learned):
+    """A multilayer perceptron on all values; published hidden sizes 64 and 64."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        slots, items, channels = self.shape
+        self.net = nn.Sequential(
+            nn.Linear(slots * items * channels, _HIDDEN), nn.ELU(), nn.Linear(_HIDDEN, _HIDDEN), nn.ELU(),
+            nn.Linear(_HIDDEN, self.features),
+        )  # fmt: skip
+
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.net(self.scale(taxels).flatten(1)), h_in
+
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return _at_once(self, taxels, h_in)
+
+
+class _Recurrent(_Learned):
+    """An LSTM on all values; published hidden size 64."""
+
+    state_size = 2 * _HIDDEN
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        slots, items, channels = self.shape
+        self.cell = nn.LSTMCell(slots * items * channels, _HIDDEN)
+        self.head = nn.Linear(_HIDDEN, self.features)
+
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        hidden, memory = h_in.chunk(2, 1)
+        hidden, memory = self.cell(self.scale(taxels).flatten(1), (hidden, memory))
+        return self.head(hidden), torch.cat((hidden, memory), 1)
+
+
+class _Images(_Learned):
+    """What the convolutional arms share: the readings as images, one per link, or one of the whole hand."""
+
+    canvas = False
+    index: torch.Tensor
+    """Item in every cell of every link's image; N for none."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        slots, items, channels = self.shape
+        if self.canvas:
+            grid = TaxelGrid(
+                config.hand, placement=config.placement, resolution=config.resolution, observe=config.observe
+            )
+            # Wrenches of sites differ from readings of taxels, so they have a scale of their own.
+            self.grid, self.scale = grid, RunningScale(6)
+            self.images, self.rows, self.columns, self.planes = 1, *GRID_SHAPE, 6 * slots
+            return
+        layout = hands.load(config.hand).layout(config.resolution, config.placement)
+        if observation_type(config.observe).per_link or any(len(probes.shape) != 2 for probes in layout.values()):
+            raise UsageError(
+                f"{config.arm!r} needs a grid of taxels on every link, which {config.observe!r} of this layout does "
+                "not give; use 'mlp', 'rnn' or a canvas."
+            )
+        self.images, self.planes = len(layout), slots * channels
+        self.rows = max(probes.shape[0] for probes in layout.values())
+        self.columns = max(probes.shape[1] for probes in layout.values())
+        index = torch.full((self.images, self.rows, self.columns), items, dtype=torch.long)
+        first = 0
+        for image, probes in enumerate(layout.values()):
+            active = torch.from_numpy(probes.active.copy())
+            cells = torch.full((len(probes),), items, dtype=torch.long)
+            cells[active] = torch.arange(first, first + int(active.sum()))
+            rows, columns = probes.shape
+            index[image, :rows, :columns] = cells.view(rows, columns)
+            first += int(active.sum())
+        self.register_buffer("index", index.flatten(), persistent=False)
+
+    def observe_scale(self, taxels: torch.Tensor) -> None:
+        if self.canvas:
+            self.scale.update(self.grid(taxels.flatten(0, -4)).unflatten(1, (-1, 6)).movedim(2, -1))
+        else:
+            self.scale.update(taxels)
+
+    def pictures(self, taxels: torch.Tensor) -> torch.Tensor:
+        """Return images [B·images, planes, rows, columns]."""
+        if self.canvas:
+            grid = self.grid(taxels).unflatten(1, (-1, 6))
+            return self.scale(grid.movedim(2, -1)).movedim(-1, 2).flatten(1, 2)
+        planes = self.scale(taxels).permute(0, 1, 3, 2).flatten(1, 2)
+        cells = torch.cat((planes, torch.zeros_like(planes[..., :1])), 2)[..., self.index]
+        return cells.unflatten(2, (self.images, self.rows, self.columns)).transpose(1, 2).flatten(0, 1)
+
+
+class _Convolution(_Images):
+    """Two convolutions (published channels 16 and 32, kernel 3) on each link's grid, averaged over it."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        first, second = _CHANNELS
+        self.net = nn.Sequential(
+            nn.Conv2d(self.planes, first, _KERNEL, padding=1), nn.ELU(),
+            nn.Conv2d(first, second, _KERNEL, padding=1), nn.ELU(),
+        )  # fmt: skip
+        # A canvas is one picture whose places differ in meaning; a link's grid is read as a whole.
+        places = self.rows * self.columns if self.canvas else self.images
+        self.head = nn.Linear(second * places, self.features)
+
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        maps = self.net(self.pictures(taxels))
+        values = maps if self.canvas else maps.mean((2, 3))
+        return self.head(values.reshape(taxels.shape[0], -1)), h_in
+
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return _at_once(self, taxels, h_in)
+
+
+class _ConvolutionCanvas(_Convolution):
+    canvas = True
+
+
+class _ConvRecurrent(_Images):
+    """A convolutional gated recurrent cell (published: 16 channels, kernel 3, layer norm) on each link's grid."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        self.cell = GRU(self.planes, _CHANNELS[0], kernel_size=_KERNEL, layer_norm=True)
+        places = self.rows * self.columns if self.canvas else self.images
+        self.head = nn.Linear(_CHANNELS[0] * places, self.features)
+        self.state_size = self.images * _CHANNELS[0] * self.rows * self.columns
+        small = self.rows * self.columns <= MOST_CELLS
+        self.products: PictureGRU | None = PictureGRU(self.rows, self.columns, _KERNEL) if small else None
+
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        state = h_in.reshape(-1, _CHANNELS[0], self.rows, self.columns)
+        y, state = self.cell(self.pictures(taxels), state)
+        return self._answer(y, taxels.shape[0]), state.reshape(h_in.shape)
+
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        # Processors convolve faster than they multiply.
+        if self.products is None or not taxels.is_cuda:
+            return super().unroll(taxels, h_in, ended)
+        return self.unroll_as_products(taxels, h_in, ended)
+
+    def unroll_as_products(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return what :meth:`unroll` returns, by :class:`~robotics_bridge.policies.encoders.conv_gru.PictureGRU`."""
+        assert self.products is not None
+        steps, batch = taxels.shape[:2]
+        pictures = self.pictures(taxels.flatten(0, 1)).flatten(1).unflatten(0, (steps, -1))
+        gone = None if ended is None else ended.repeat_interleave(self.images, 1)
+        y, state = self.products(self.cell, pictures, h_in.reshape(pictures.shape[1], -1), gone)
+        y = y.flatten(0, 1).unflatten(1, (-1, self.rows, self.columns))
+        return self._answer(y, steps * batch).unflatten(0, (steps, batch)), state.reshape(h_in.shape)
+
+    def _answer(self, y: torch.Tensor, batch: int) -> torch.Tensor:
+        return self.head((y if self.canvas else y.mean((2, 3))).reshape(batch, -1))
+
+
+class _ConvRecurrentCanvas(_ConvRecurrent):
+    canvas = True
+
+
+class _Network(TactileEncoder):
+    """A scored network, normalised features, and a learned linear map to the embedding."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        grid = TaxelGrid(config.hand, placement=config.placement, resolution=config.resolution, observe=config.observe)
+        self.front: FrontEnd = FrontEnd(
+            config.arm, grid, time=config.time, learning=config.learning, calibration=config.calibration,
+            seed=config.seed, pretrained=config.pretrained, options=config.options,
+        )  # fmt: skip
+        self.state_size = self.front.state_size
+        # Features of untrained and trained networks differ by orders of magnitude; the head should not care.
+        self.norm = nn.LayerNorm(self.front.features, elementwise_affine=False, eps=1e-12)
+        self.project: nn.Linear = nn.Linear(self.front.features, self.features)
+
+    @property
+    def frozen_part(self) -> FrontEnd | None:
+        return self.front if self.config.learning == "frozen" else None
+
+    def embed(self, features: torch.Tensor) -> torch.Tensor:
+        return self.project(self.norm(features))
+
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        features, h_out = self.front(taxels, h_in)
+        return self.embed(features), h_out
+
+
+def _at_once(encoder: TactileEncoder, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what ``unroll`` returns for an encoder without memory."""
+    y, _ = encoder(taxels.flatten(0, 1), h_in)
+    return y.unflatten(0, taxels.shape[:2]), h_in
+
+
+ARMS: Mapping[str, Callable[[EncoderConfig], TactileEncoder]] = {
+    "mlp": _Flat,
+    "rnn": _Recurrent,
+    "tactile_cnn": _Convolution,
+    "tactile_convrnn": _ConvRecurrent,
+    "tactile_canvas_cnn": _ConvolutionCanvas,
+    "tactile_canvas_convrnn": _ConvRecurrentCanvas,
+}
+"""Encoders that are learned with the policy, by their published names. ``canvas``: on the 5 × 7 grid of the hand."""

@@ -1,0 +1,84 @@
+"""What a newton on the skin of a hand is to an encoder that was made for whiskers of a few micronewtons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE
+from brainbench.core.errors import DataError, UsageError
+from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE
+
+if TYPE_CHECKING:
+    import torch
+
+_TOUCHING = 1e-3
+"""Cells below this share of the strongest one do not count as touched."""
+
+
+@dataclass(frozen=True)
+class HandCalibration:
+    """Force and moment of one site of a hand that look to the encoder as its own unit.
+
+    One number for all three axes of each kind, so that directions are kept. The encoder's own normaliser, per channel,
+    follows; one that was fitted to whiskers therefore sees values of the size that it was fitted to.
+
+    Raises:
+        UsageError: a value is not a positive number.
+    """
+
+    force: float = 0.5
+    """N that count as :data:`~brainbench.models.normaliser.FORCE_SCALE`."""
+    moment: float = 5e-3
+    """N·m that count as :data:`~brainbench.models.normaliser.MOMENT_SCALE`."""
+
+    def __post_init__(self) -> None:
+        for name in ("force", "moment"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+                raise UsageError(f"The {name} of a hand calibration is a positive number; received {value!r}.")
+
+    @classmethod
+    def fit(cls, grid: torch.Tensor) -> HandCalibration:
+        """Return the calibration at which touched sites have a root mean square of one unit.
+
+        Args:
+            grid: Recorded grids [..., S·6, 5, 7] (N, N·m) of
+            :class:`~robotics_bridge.policies.encoders.taxel_grid.TaxelGrid`.
+
+        Raises:
+            DataError: nothing touches in the recording, or it holds values that are no numbers.
+        """
+        import torch
+
+        if grid.ndim < 3 or grid.shape[-2:] != GRID_SHAPE or grid.shape[-3] % len(CHANNELS):
+            raise UsageError(f"A recording has the shape [..., S·6, 5, 7]; received {list(grid.shape)}.")
+        if not torch.isfinite(grid).all():
+            raise DataError("The recording holds values that are not finite, so the hand cannot be calibrated on it.")
+        cells = grid.double().reshape(-1, len(CHANNELS), GRID_SHAPE[0] * GRID_SHAPE[1]).transpose(1, 2).flatten(0, 1)
+        strength = cells[:, :3].norm(dim=1)
+        touched = cells[strength > _TOUCHING * strength.max()]
+        if not len(touched):
+            raise DataError("Nothing touches the hand in this recording, so it cannot be calibrated on it.")
+        force, moment = (float(part.pow(2).mean().sqrt()) for part in (touched[:, :3], touched[:, 3:]))
+        if not moment > 0:
+            raise DataError("The recording holds forces without any moment; calibrate on readings of a whole grid.")
+        return cls(force, moment)
+
+    @classmethod
+    def of(cls, value: HandCalibration | Mapping[str, Any] | None) -> HandCalibration:
+        """Return a calibration from itself, a mapping of its fields, or None for the default."""
+        if isinstance(value, cls):
+            return value
+        if value is None:
+            return cls()
+        if not isinstance(value, Mapping) or not set(value) <= {"force", "moment"}:
+            raise UsageError(f"A hand calibration has the fields 'force' and 'moment'; received {value!r}.")
+        return cls(**value)
+
+    def gains(self, sub_steps: int) -> list[float]:
+        """Return the factor of each channel (sub-step-major) from SI on the hand to SI at a whisker's base."""
+        force, moment = FORCE_SCALE / self.force, MOMENT_SCALE / self.moment
+        return [force if name.startswith("F") else moment for name in CHANNELS] * sub_steps

@@ -1,0 +1,453 @@
+"""Distil a teacher into a student that feels: DAgger with decoders, teacher mixing and aggregation, exactly resumable.
+
+The run's folder holds ``config.json`` (the student and how to build it again), ``model.safetensors``,
+``state.safetensors`` (where it stands, environments included), ``log.jsonl`` and ``tensorboard/``. A run that was
+killed goes on from its last state when it is started again and ends with the weights of an unbroken one.
+
+One iteration (Ross et al. 2011): the student acts, in a share of steps the teacher; the teacher names its action for
+every observation; the student learns those actions by truncated backpropagation through time, from this rollout and
+from aggregated ones, together with decoders of what the teacher knows (thesis, table 4.5).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import nn
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import atomic_path, provenance, read_json, to_plain, write_json
+from brainbench.core.progress import Progress
+from brainbench.models.training.logs import RunLog
+from brainbench.models.training.state import load_state, save_state
+from robotics_bridge.policies.shipped import student_path
+from robotics_bridge.policies.student import TACTILE, TactilePolicy
+from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.rollouts import Recorder, Rollout
+
+_log = logging.getLogger(__name__)
+
+CONFIG, MODEL, STATE = "config.json", "model.safetensors", "state.safetensors"
+_LEAST_VARIANCE = 1e-4
+
+
+class Teacher(Protocol):
+    """Who knows what to do."""
+
+    def act(self, obs: Any, /) -> torch.Tensor:
+        """Return actions [B, A] for observation groups."""
+        ...
+
+
+@dataclass(frozen=True)
+class DistillResult:
+    """How a run ended."""
+
+    status: Literal["finished", "stopped", "diverged"]
+    """``stopped``: the time or the iterations allowed were over; start it again to go on."""
+    reason: str
+    folder: Path
+    iterations: int
+    """Iterations done in all."""
+    loss: float
+    """Behaviour-cloning loss of the last iteration."""
+    seconds: float
+    """Time of this session."""
+
+
+def distill(
+    config: DistillConfig,
+    out: str | Path,
+    *,
+    env: Any,
+    teacher: Teacher,
+    stop_after: float | None = None,
+    stop_at: int | None = None,
+    graphs: bool = True,
+    progress: Progress | None = None,
+) -> DistillResult:
+    """Teach a student, or go on with a run that was interrupted.
+
+    Args:
+        config: What is distilled.
+        out: The run's folder.
+        env: Environment of :func:`robotics_bridge.tasks.make` with the configuration's observation type.
+        teacher: Of :func:`robotics_bridge.policies.training.teacher.load_teacher`.
+        stop_after: Save the state and return after so many seconds.
+        stop_at: Save the state and return after so many iterations in all.
+        graphs: On CUDA, record a step of learning and replay it.
+        progress: Called with (iterations done, iterations in all, what).
+
+    Returns:
+        How it ended. A loss that is not finite ends it as ``diverged``; the last saved state stays.
+
+    Raises:
+        UsageError: the folder holds another run, or the environment does not fit.
+        DataError: a file of the run is damaged.
+    """
+    devices = [env.device] if torch.device(env.device).type == "cuda" else []
+    with torch.random.fork_rng(devices=devices):
+        torch.manual_seed(config.seed)
+        run = _Run(config.resolved(env.task.student), Path(out), env, teacher, graphs=graphs)
+        # Products as exact as PyTorch's convolutions are by default.
+        before = torch.get_float32_matmul_precision()
+        if devices:
+            torch.set_float32_matmul_precision("high")
+        try:
+            allowed = math.inf if stop_after is None else stop_after
+            return run.run(allowed, stop_at, progress or (lambda done, total, what: None))
+        finally:
+            torch.set_float32_matmul_precision(before)
+            run.log.close()
+
+
+class _Learner(nn.Module):
+    """All that a state file holds as weights: student, decoders, and the environments as buffers."""
+
+    def __init__(self, student: TactilePolicy, decoders: nn.ModuleDict) -> None:
+        super().__init__()
+        self.student: TactilePolicy = student
+        self.decoders: nn.ModuleDict = decoders
+        self.world = nn.Module()
+
+    def keep(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        for name, value in tensors.items():
+            self.world.register_buffer(name.replace(".", "/"), value)
+
+    def kept(self, prefix: str) -> dict[str, torch.Tensor]:
+        found = {name.replace("/", "."): value for name, value in self.world.named_buffers(recurse=False)}
+        return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
+
+
+class _Run:
+    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Teacher, *, graphs: bool = True) -> None:
+        self.config, self.out, self.env, self.teacher = config, out, env, teacher
+        self.device = torch.device(env.device)
+        read = [name for name in env.task.groups["student"] if name != TACTILE]
+        self.groups: list[str] = [*read, TACTILE] if config.tactile is not None else read
+        self.student = build_student(config, env.observation_shapes, self.groups, env.num_actions).to(self.device)
+        self.decoders = env.task.decoders
+        heads = {
+            head.target: _head(self.student.core.features, head.hidden, math.prod(env.observation_shapes[head.target]))
+            for head in self.decoders
+        }
+        self.learner = _Learner(self.student, nn.ModuleDict(heads)).to(self.device)
+        weights = [weight for weight in self.learner.parameters() if weight.requires_grad]
+        rate = config.learning_rate or 1e-4
+        cuda = self.device.type == "cuda"
+        self.optimizer = torch.optim.Adam(weights, lr=rate, fused=cuda, capturable=cuda)
+        tactile = self.student.core.tactile
+        self.front = tactile.frozen_part if tactile is not None else None
+        self.precision = torch.bfloat16 if config.precision == "bf16" else None
+        self.student.core.precision = self.precision
+        self.step = ChunkStep(self._loss, weights, self.optimizer, clip=config.max_grad_norm, record=cuda and graphs)
+        self.observations: dict[str, torch.Tensor] = env.reset()
+        # First episodes end at different times, so that no rollout holds only beginnings.
+        env.episode_length_buf.copy_(torch.randint_like(env.episode_length_buf, int(env.max_episode_length)))
+        self.memory = self.student.zeros(env.num_envs, kept=self.front is not None)
+        self.touched = self.front.init_state(env.num_envs) if self.front is not None else self.memory[:, :0]
+        self.kept: list[tuple[int, Rollout]] = []
+        self.iteration, self.loss = 0, math.nan
+        self._claim()
+        if (out / STATE).is_file():
+            self._restore()
+        self.log = RunLog(out, step=self.iteration)
+
+    def run(self, allowed: float, stop_at: int | None, progress: Progress) -> DistillResult:
+        started, total = time.monotonic(), self.config.iterations or 0
+        status: Literal["finished", "stopped", "diverged"] = "finished"
+        reason = ""
+        while self.iteration < total:
+            begun = time.perf_counter()
+            rollout = self._act(self.config.share(self.iteration))
+            acted = time.perf_counter()
+            losses = self._learn(rollout)
+            if not all(math.isfinite(value) for value in losses.values()):
+                status, reason = "diverged", f"The loss of iteration {self.iteration + 1} is not finite."
+                break
+            self.loss = losses["behaviour"]
+            self.iteration += 1
+            self._report(losses, acted - begun, time.perf_counter() - acted, rollout)
+            progress(self.iteration, total, "distilling")
+            last = self.iteration == total
+            late = time.monotonic() - started > allowed and not last
+            enough = stop_at is not None and self.iteration >= stop_at and not last
+            if last or late or enough or self.iteration % self.config.save_interval == 0:
+                self._save()
+            if late or enough:
+                why = f"{allowed:g} seconds were over." if late else f"{stop_at} iterations were asked for."
+                status, reason = "stopped", why
+                break
+        seconds = time.monotonic() - started
+        return DistillResult(status, reason, self.out, self.iteration, self.loss, seconds)
+
+    @torch.no_grad()
+    def _act(self, share: float) -> Rollout:
+        """Collect a rollout."""
+        recorder = Recorder(self.config.steps_per_env, self.memory)
+        targets = [head.target for head in self.decoders]
+        kept = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
+        self.student.eval()
+        for _ in range(self.config.steps_per_env):
+            obs = self.observations
+            features = None
+            if self.front is not None:
+                with torch.autocast(self.device.type, self.precision, enabled=self.precision is not None):
+                    features, self.touched = self.front(obs[TACTILE], self.touched)
+                features, self.touched = features.float(), self.touched.float()
+                recorder.put(features=features)
+            # The environment may write its next observations over these.
+            recorder.put(**{name: obs[name] for name in kept})
+            now = {name: obs[name][None] for name in self.groups}
+            latent, memory = self.student.unroll(now, self.memory, None, None if features is None else features[None])
+            own = self.student.action_of(latent[0]).float()
+            right = self.teacher.act(obs).float()
+            taught = torch.rand(len(own), 1, device=self.device) < share
+            self.observations, _, terminated, truncated, _ = self.env.step(torch.where(taught, right, own))
+            ended = terminated | truncated
+            recorder.put(teacher=right, student=own, ended=ended)
+            recorder.next()
+            self.memory = torch.where(ended[:, None], 0.0, memory.float())
+            if self.front is not None:
+                self.touched = torch.where(ended[:, None], 0.0, self.touched)
+        return recorder.finish([*self.groups, *targets])
+
+    def _learn(self, rollout: Rollout) -> dict[str, float]:
+        """Take the steps of one iteration; return the mean losses over its first epoch on the new rollout."""
+        self.learner.train()
+        self.student.update_normalization(rollout.groups)
+        if self.config.aggregate:
+            self.kept = [*self.kept, (self.iteration, rollout)][-self.config.aggregate :]
+        losses: dict[str, torch.Tensor] = {}
+        for _ in range(self.config.epochs or 1):
+            found = self._pass(rollout)
+            losses = losses or found
+            older = [item for _, item in self.kept if item is not rollout]
+            if older:
+                self._pass(older[int(torch.randint(len(older), ()))])
+        return {name: float(value) for name, value in losses.items()}
+
+    def _pass(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Go once through a rollout, a gradient step every ``gradient_length`` steps."""
+        length = self.config.gradient_length or 1
+        memory = rollout.memory
+        scale = torch.ones(rollout.teacher.shape[-1], device=self.device)
+        if self.config.loss == "inv_var_mse":
+            scale = 1 / rollout.teacher.flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
+        sums: dict[str, torch.Tensor] = {}
+        for first in range(0, rollout.steps, length):
+            chunk = rollout.chunk(first, length)
+            share = len(chunk["teacher"]) / rollout.steps
+            parts, memory = self.step({**chunk, "memory": memory, "scale": scale})
+            sums = {name: sums.get(name, 0) + share * value for name, value in parts.items()}
+        return sums
+
+    def _loss(self, given: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Return the parts of the loss of a chunk and the memory after it."""
+        latent, memory = self.student.unroll(given, given["memory"], given["ended"], given.get("features"))
+        parts = {"behaviour": self._behaviour(self.student.action_of(latent), given)}
+        for head in self.decoders:
+            aim = given[head.target].flatten(2) * head.scale
+            parts[head.target] = head.weight * nn.functional.mse_loss(self.learner.decoders[head.target](latent), aim)
+        return parts, memory
+
+    def _behaviour(self, action: torch.Tensor, given: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        right, scale = given["teacher"], given["scale"]
+        error = (action - right).pow(2) * scale
+        if self.config.clip is not None:
+            # As PPO clips values: what moved further than allowed in this iteration gains nothing more.
+            old = given["student"]
+            near = old + (action - old).clamp(-self.config.clip, self.config.clip)
+            error = torch.maximum(error, (near - right).pow(2) * scale)
+        return error.mean()
+
+    def _report(self, losses: Mapping[str, float], acting: float, learning: float, rollout: Rollout) -> None:
+        steps = rollout.steps * self.env.num_envs
+        self.log.write("loss", self.iteration, **losses)
+        self.log.write("time", self.iteration, acting=acting, learning=learning, steps_per_second=steps / acting)
+        self.log.write("teacher", self.iteration, share=self.config.share(self.iteration - 1))
+        episodes = self.env.statistics()
+        if episodes.get("episodes"):
+            self.log.write("episode", self.iteration, **{key: float(value) for key, value in episodes.items()})
+
+    # --- files -------------------------------------------------------------------------------------------------
+
+    def _claim(self) -> None:
+        """Write the run's configuration, or check that the folder holds this run."""
+        path = self.out / CONFIG
+        mine = to_plain(self.config.plain())
+        if path.is_file():
+            found = read_json(path).get("distill")
+            differing = sorted(key for key in mine if not isinstance(found, dict) or found.get(key) != mine[key])
+            if differing:
+                raise UsageError(
+                    f"{str(self.out)!r} holds another student (its {differing[0]} differs); choose another folder, or "
+                    "delete it to start anew."
+                )
+            return
+        write_json(path, describe_run(self.config, self.student, self.env))
+
+    def _world(self) -> dict[str, torch.Tensor]:
+        # The memory of noisy sensors is in no file, so such a run starts new episodes at every state it saves.
+        if self.config.noisy:
+            self.observations = self.env.reset()
+            self.memory, self.touched = torch.zeros_like(self.memory), torch.zeros_like(self.touched)
+        own = {f"env.{name}": value for name, value in self.env.state_dict().items()}
+        return {**own, "run.memory": self.memory, "run.touched": self.touched}
+
+    def _save(self) -> None:
+        self.learner.keep(self._world())
+        numbers = [number for number, _ in self.kept]
+        for number, rollout in self.kept:
+            path = self.out / "rollouts" / f"{number}.safetensors"
+            if not path.is_file():
+                rollout.save(path)
+        plain = {"iteration": self.iteration, "loss": self.loss, "rollouts": numbers}
+        save_state(self.out / STATE, self.learner, self.optimizer, plain)
+        save_student(self.out / MODEL, self.student)
+        for path in (self.out / "rollouts").glob("*.safetensors"):
+            if int(path.stem) not in numbers:
+                path.unlink()
+
+    def _restore(self) -> None:
+        self.learner.keep(self._world())
+        plain = load_state(self.out / STATE, self.learner, self.optimizer)
+        self.iteration, self.loss = int(plain["iteration"]), float(plain["loss"])
+        cuda = self.device.type == "cuda"
+        for group in self.optimizer.param_groups:
+            group |= {"fused": cuda, "capturable": cuda}
+        for entries in self.optimizer.state.values():
+            entries["step"] = entries["step"].to(self.device)
+        self.env.load_state_dict(self.learner.kept("env."))
+        self.observations = self.env.observations
+        own = self.learner.kept("run.")
+        self.memory, self.touched = own["memory"].clone(), own["touched"].clone()
+        self.kept = [
+            (number, Rollout.load(self.out / "rollouts" / f"{number}.safetensors", self.device))
+            for number in plain["rollouts"]
+        ]
+
+
+def build_student(
+    config: DistillConfig, shapes: Mapping[str, tuple[int, ...]], groups: list[str], actions: int
+) -> TactilePolicy:
+    """Return a student with new weights (the global random state).
+
+    Args:
+        config: What is distilled.
+        shapes: Group → shape per environment.
+        groups: What the student reads.
+        actions: A.
+
+    Raises:
+        UsageError: the shapes do not fit the tactile encoder.
+    """
+    from tensordict import TensorDict
+
+    example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
+    tactile = config.tactile
+    return TactilePolicy(
+        example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
+        tactile=tactile.plain() if tactile is not None else None,
+    )  # fmt: skip
+
+
+def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dict[str, Any]:
+    """Return what a run's ``config.json`` holds: the student, its input, and what a robot needs to run it."""
+    actions = env.action_map
+    return {
+        "brainbench_student": 1,
+        "distill": config.plain(),
+        "network": student.config,
+        # A list: the order counts, and JSON keeps that of lists alone.
+        "groups": [[name, list(shape)] for name, shape in student.shapes.items()],
+        "actions": env.num_actions,
+        "deployment": {
+            "task": config.task,
+            "hand": config.hand,
+            "observe": config.observe,
+            "placement": config.placement,
+            "resolution": config.resolution,
+            "rate": 1 / env.step_dt,
+            "sub_steps": env.decimation,
+            "joints": list(env.joint_names),
+            "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},
+            "frozen": dict(env.frozen),
+            "links": list(env.tactile.links) if env.tactile is not None else [],
+        },
+        "provenance": provenance(),
+    }
+
+
+def save_student(path: Path, student: TactilePolicy) -> None:
+    """Write a student's weights and normalisers."""
+    from safetensors.torch import save_file
+
+    state = {name: value.detach().cpu().contiguous().clone() for name, value in student.state_dict().items()}
+    with atomic_path(path) as temporary:
+        save_file(state, temporary)
+
+
+def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
+    """Return a distilled student in evaluation mode, and its run's configuration.
+
+    Args:
+        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_students`.
+        device: Of its weights.
+
+    Raises:
+        UsageError: there is no such folder or name.
+        DataError: the folder holds no student, or its weights are damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    folder = student_path(folder)
+    described = read_json(folder / CONFIG)
+    if not isinstance(described, dict) or described.get("brainbench_student") != 1:
+        raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")
+    if not (folder / MODEL).is_file():
+        raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
+    config = DistillConfig.of(described["distill"])
+    shapes = {name: tuple(shape) for name, shape in described["groups"]}
+    with torch.random.fork_rng(devices=[]):
+        student = build_student(config, shapes, list(shapes), int(described["actions"]))
+    try:
+        student.load_state_dict(load_file(folder / MODEL))
+    except (SafetensorError, RuntimeError, json.JSONDecodeError) as error:
+        raise DataError(f"The weights in {str(folder)!r} are damaged or of another student ({error}).") from error
+    return student.to(device).eval(), described
+
+
+class StudentPolicy:
+    """A student as a function of observations that remembers per environment, for playing and evaluation."""
+
+    def __init__(self, student: TactilePolicy) -> None:
+        self.student = student.eval()
+        self.student.reset()
+
+    def __call__(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Return actions [B, A]."""
+        with torch.no_grad():
+            return self.student.action_of(self.student.get_latent(obs))
+
+    act = __call__
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Forget all environments, or those in a mask [B]."""
+        self.student.reset(mask)
+
+
+def _head(features: int, hidden: tuple[int, ...], outputs: int) -> nn.Module:
+    sizes = (features, *hidden)
+    layers = [part for a, b in zip(sizes, hidden, strict=False) for part in (nn.Linear(a, b), nn.ELU())]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))

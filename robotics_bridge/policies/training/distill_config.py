@@ -1,0 +1,146 @@
+"""What is distilled, from whom and how: one student of the sweep as plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.policies.encoders.arms import AUTO, EncoderConfig
+from robotics_bridge.policies.student import EMBEDDERS
+
+if TYPE_CHECKING:
+    from robotics_bridge.tasks.settings import StudentSettings
+
+LOSSES = ("mse", "inv_var_mse")
+"""``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillConfig:
+    """A student. Settings of None are the task's own (thesis, table 4.4).
+
+    Raises:
+        UsageError: a value is not allowed.
+    """
+
+    task: str
+    teacher: str = ""
+    """Folder of the teacher's run, or the name of a shipped teacher."""
+    hand: str = "xhand1"
+    """Name or file (:func:`robotics_bridge.hands.load`)."""
+    variant: str = "default"
+    """Configuration of the task: ``default`` or ``published``."""
+    observe: str = "force_torque"
+    """Observation type of table 4.3, or ``agg_bool``."""
+    placement: str = "hand"
+    """Where taxels sit: ``tips``, ``fingers``, ``palm`` or ``hand``."""
+    resolution: str = "med"
+    """How many there are: ``low``, ``med`` or ``high``."""
+    noisy: bool = False
+    """Whether they have the published noise (table 4.12)."""
+    encoder: str = AUTO
+    """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
+    encoder_settings: Mapping[str, Any] = field(default_factory=dict)
+    """Further fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`: time, learning, seed, …"""
+    embedder: str = "mlp"
+    """Of flat groups: ``none``, ``mlp`` or ``lstm``."""
+    hidden: tuple[int, ...] = (512, 256, 128)
+    """Widths of the head's layers."""
+    num_envs: int = 4096
+    """Environments at once."""
+    steps_per_env: int = 24
+    """Control steps of every environment in an iteration."""
+    iterations: int | None = None
+    learning_rate: float | None = None
+    epochs: int | None = None
+    """Passes over the steps of an iteration."""
+    gradient_length: int | None = None
+    """Steps through which gradients flow back in time."""
+    clip: float | None = None
+    """Largest change of an action within an iteration that still lowers the loss."""
+    max_grad_norm: float | None = None
+    """Norm to which longer gradients are cut."""
+    loss: str | None = None
+    """One of :data:`LOSSES`."""
+    teacher_share: float = 0.0
+    """Share of actions that the teacher takes at the start (β of DAgger); 0 is the published, on-policy way."""
+    teacher_iterations: int = 0
+    """Iterations over which that share falls linearly to 0; 0 keeps it."""
+    aggregate: int = 0
+    """Earlier rollouts that are kept and learned from again."""
+    save_interval: int = 100
+    """Iterations from one saved state to the next."""
+    seed: int = 0
+    """Of weights, episodes and the teacher's share."""
+    precision: str = "float32"
+    """Of the tactile encoder in learning and acting: ``float32`` or ``bf16`` (mixed). The rest is single."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        observation_type(self.observe)
+        for name, value, allowed in (
+            ("encoder of flat groups", self.embedder, EMBEDDERS),
+            ("loss", self.loss or "mse", LOSSES),
+            ("precision", self.precision, ("float32", "bf16")),
+        ):
+            if value not in allowed:
+                raise unknown_name(name, value, allowed)
+        if not 0 <= self.teacher_share <= 1:
+            raise UsageError(f"The teacher's share lies between 0 and 1; received {self.teacher_share!r}.")
+        positive = {"num_envs", "steps_per_env", "save_interval", "iterations", "epochs", "gradient_length"}
+        for name in (*sorted(positive), "teacher_iterations", "aggregate", "seed"):
+            value, least = getattr(self, name), int(name in positive)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+                raise UsageError(f"{name} is a whole number of at least {least}; received {value!r}.")
+
+    @classmethod
+    def of(cls, value: Mapping[str, Any]) -> DistillConfig:
+        """Return a configuration from a mapping of its fields.
+
+        Raises:
+            UsageError: a field does not exist.
+        """
+        known = [item.name for item in fields(cls)]
+        for name in value:
+            if name not in known:
+                raise unknown_name("setting of a student", name, known)
+        return cls(**value)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the fields as JSON types; :meth:`of` undoes it."""
+        return asdict(self)
+
+    def resolved(self, settings: StudentSettings) -> DistillConfig:
+        """Return the configuration with the task's own settings where it has none."""
+        open_fields = ("iterations", "learning_rate", "epochs", "gradient_length", "clip", "max_grad_norm", "loss")
+        own = {name: getattr(settings, name) for name in open_fields if getattr(self, name) is None}
+        return replace(self, **own)
+
+    @property
+    def tactile(self) -> EncoderConfig | None:
+        """The tactile encoder; None without touch."""
+        if observation_type(self.observe).sensor is None:
+            return None
+        named = {"name": self.encoder, "hand": self.hand, "observe": self.observe}
+        return EncoderConfig.of(
+            {**self.encoder_settings, **named, "placement": self.placement, "resolution": self.resolution}
+        )
+
+    @property
+    def name(self) -> str:
+        """What distinguishes the student from its neighbours, for folders and reports."""
+        parts = [self.task, self.hand, self.observe]
+        if self.tactile is not None:
+            learning = f"-{self.tactile.learning}" if "learning" in self.encoder_settings else ""
+            arm = self.tactile.arm.replace("/", "-").replace(":", "-")
+            parts += [self.placement, self.resolution, "noisy" if self.noisy else "clean", f"{arm}{learning}"]
+        return "_".join([*parts, f"seed{self.seed}"])
+
+    def share(self, iteration: int) -> float:
+        """Return the teacher's share of the actions in an iteration (from 0)."""
+        if not self.teacher_iterations:
+            return self.teacher_share
+        return self.teacher_share * max(0.0, 1 - iteration / self.teacher_iterations)

@@ -1,0 +1,85 @@
+"""Nested states (optimizers, environments) as flat tensors and plain numbers, so that no pickle is needed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.files import atomic_path
+
+if TYPE_CHECKING:
+    import torch
+
+_LEAF = "__tensor__"
+
+
+def flatten(tree: Any, prefix: str = "") -> tuple[dict[str, torch.Tensor], Any]:
+    """Split a tree of dictionaries, lists, tensors and numbers into named tensors and a JSON-able rest."""
+    import torch
+
+    tensors: dict[str, torch.Tensor] = {}
+    if isinstance(tree, torch.Tensor):
+        return {prefix: tree}, {_LEAF: prefix}
+    if isinstance(tree, Mapping):
+        pairs = []
+        for key, value in tree.items():
+            found, rest = flatten(value, f"{prefix}/{key}")
+            tensors |= found
+            # JSON knows only text as keys; optimizers number their parameters.
+            pairs.append(["int" if isinstance(key, int) else "str", str(key), rest])
+        return tensors, {"__dict__": pairs}
+    if isinstance(tree, (list, tuple)):
+        items = []
+        for index, value in enumerate(tree):
+            found, rest = flatten(value, f"{prefix}/{index}")
+            tensors |= found
+            items.append(rest)
+        return tensors, {"__tuple__" if isinstance(tree, tuple) else "__list__": items}
+    return tensors, tree
+
+
+def restore(rest: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
+    """Put together what :func:`flatten` split."""
+    if isinstance(rest, dict):
+        if _LEAF in rest:
+            return tensors[rest[_LEAF]]
+        if "__dict__" in rest:
+            return {int(k) if kind == "int" else k: restore(v, tensors) for kind, k, v in rest["__dict__"]}
+        if "__tuple__" in rest:
+            return tuple(restore(value, tensors) for value in rest["__tuple__"])
+        if "__list__" in rest:
+            return [restore(value, tensors) for value in rest["__list__"]]
+    return rest
+
+
+def save(path: str | os.PathLike[str], tree: Any) -> None:
+    """Write a tree to one safetensors file, replaced as a whole."""
+    from safetensors.torch import save_file
+
+    tensors, rest = flatten(tree)
+    ready = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    with atomic_path(path) as target:
+        save_file(ready, str(target), metadata={"tree": json.dumps(rest)})
+
+
+def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
+    """Read a tree.
+
+    Raises:
+        DataError: the file is missing or holds no tree.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
+    try:
+        with safe_open(str(path), framework="pt", device=device) as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            metadata = file.metadata() or {}
+        return restore(json.loads(metadata["tree"]), tensors)
+    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise DataError(f"{str(path)!r} is damaged or not one of ours: {error}.") from error

@@ -1,0 +1,157 @@
+"""One student from its configuration alone: environment, teacher, distillation, evaluation."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import read_json, write_json
+from brainbench.core.progress import Progress
+from robotics_bridge.policies.encoders.arms import ARMS
+from robotics_bridge.policies.encoders.calibration import HandCalibration
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.report import EVALUATION, GRADED
+from robotics_bridge.policies.shipped import list_teachers
+from robotics_bridge.policies.training.distill import CONFIG, DistillResult, StudentPolicy, distill, load_student
+from robotics_bridge.policies.training.distill_config import DistillConfig
+
+_log = logging.getLogger(__name__)
+
+SEEDS = (1000, 1001, 1002)
+"""Seeds of the environments in which students are evaluated; none of them is one of training."""
+_CALIBRATION_STEPS, _CALIBRATION_ENVS = 80, 64
+"""Two seconds of control, in so many environments."""
+
+
+@dataclass(frozen=True)
+class Student:
+    """A student that was distilled, and how it does."""
+
+    folder: Path
+    result: DistillResult
+    evaluations: tuple[dict[str, Any], ...]
+    """One per evaluation seed; empty when none was asked for, or the run diverged."""
+
+
+def train_student(
+    config: DistillConfig,
+    out: str | Path,
+    *,
+    device: str = "cpu",
+    episodes: int = 100,
+    seeds: Sequence[int] = SEEDS,
+    stop_after: float | None = None,
+    stop_at: int | None = None,
+    progress: Progress | None = None,
+) -> Student:
+    """Distil a student, or go on with an interrupted one, and evaluate it, also when its time is over.
+
+    Args:
+        config: What is distilled; ``teacher`` names a folder or a shipped one.
+        out: The run's folder; a finished and evaluated run is left as it is.
+        device: ``cpu``, or ``cuda`` for MuJoCo Warp.
+        episodes: Per evaluation seed; 0 evaluates nothing. An evaluation says how many iterations the student had.
+        seeds: Of the evaluation.
+        stop_after: Seconds after which the state is saved and learning stops.
+        stop_at: Iterations after which it does.
+        progress: Called with (done, in all, what).
+
+    Raises:
+        UsageError: no teacher is named, or something does not fit.
+        DataError: a file is missing or damaged.
+    """
+    from robotics_bridge import tasks
+    from robotics_bridge.policies.training.teacher import load_teacher
+
+    if not config.teacher:
+        raise UsageError(
+            "A student needs a teacher: the folder of a run of brainbench policy train, or a shipped one "
+            f"({', '.join(list_teachers())})."
+        )
+    out = Path(out)
+    env = tasks.make(
+        config.task, num_envs=config.num_envs, device=device, hand=config.hand, config=config.variant,
+        observe=config.observe, placement=config.placement, resolution=config.resolution, noisy=config.noisy,
+        seed=config.seed,
+    )  # fmt: skip
+    teacher = load_teacher(config.teacher, env)
+    config = calibrated(config, env, teacher, out)
+    result = distill(
+        config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress
+    )  # fmt: skip
+    if result.status == "diverged" or not episodes:
+        return Student(out, result, ())
+    found = evaluate_student(
+        out, env, episodes=episodes, seeds=seeds, iterations=result.iterations, progress=progress
+    )  # fmt: skip
+    return Student(out, result, found)
+
+
+def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:
+    """Return the configuration with a hand calibration for a network, measured while the teacher acts.
+
+    Nothing changes for encoders that are learned with the policy, or where a calibration is given. A run that was
+    begun keeps the one it began with.
+    """
+    tactile = config.tactile
+    if tactile is None or tactile.arm in ARMS or "calibration" in config.encoder_settings:
+        return config
+    if (out / CONFIG).is_file():
+        found = read_json(out / CONFIG).get("distill", {}).get("encoder_settings", {}).get("calibration")
+    else:
+        found = asdict(_measure(config, env, teacher))
+    settings = dict(config.encoder_settings) if found is None else {**config.encoder_settings, "calibration": found}
+    return replace(config, encoder_settings=settings)
+
+
+def _measure(config: DistillConfig, env: Any, teacher: Any) -> HandCalibration:
+    grid = TaxelGrid(config.hand, placement=config.placement, resolution=config.resolution, observe=config.observe)
+    grid = grid.to(env.device)
+    observations, felt = env.reset(), []
+    for _ in range(_CALIBRATION_STEPS):
+        felt.append(grid(observations["tactile"][:_CALIBRATION_ENVS]).cpu())
+        observations, *_ = env.step(teacher.act(observations))
+    try:
+        return HandCalibration.fit(torch.stack(felt))
+    except DataError:
+        _log.warning("The teacher touched nothing in %d steps; the default calibration is used.", _CALIBRATION_STEPS)
+        return HandCalibration()
+
+
+def evaluate_student(
+    folder: str | Path,
+    env: Any,
+    *,
+    episodes: int = 100,
+    seeds: Sequence[int] = SEEDS,
+    iterations: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[dict[str, Any], ...]:
+    """Run whole episodes with a student and write ``evaluation.json``, one entry per seed.
+
+    An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
+    ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
+    """
+    from robotics_bridge.policies.evaluate import evaluate
+
+    student, _ = load_student(folder, device=str(env.device))
+    policy, found = StudentPolicy(student), []
+    for number, seed in enumerate(seeds):
+        result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
+        found.append(
+            {
+                "seed": seed, "success": [float(item) for item in result.success], "diverged": result.diverged,
+                "iterations": iterations,
+                **{name: [float(item) for item in getattr(result, name)] for name in GRADED},
+            }
+        )  # fmt: skip
+        if progress is not None:
+            progress(number + 1, len(seeds), "evaluating")
+    write_json(Path(folder) / EVALUATION, found)
+    return tuple(found)

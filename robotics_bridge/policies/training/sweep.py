@@ -1,0 +1,190 @@
+"""A sweep of students as one TOML file: what it expands to, and how many that are.
+
+Per entry (task, hand, placements) the baseline ``none`` and the product of observation types, placements, resolutions
+and clean or noisy readings (thesis, table 4.10). Subsets: ``all``; ``types``, every type at the pinned resolution and
+noise; ``encoders``, the arms of tactile encoders there; or one type's name, all its resolutions and noise.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from robotics_bridge.hands.layouts import check_names
+from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.policies.training.distill_config import DistillConfig
+
+PUBLISHED = Path(__file__).parents[1] / "sweeps" / "table-4.10.toml"
+"""The sweep of the thesis."""
+SUBSETS = ("all", "types", "encoders")
+_KEYS = {
+    "types", "extra_types", "resolutions", "noisy", "seeds", "variant", "teacher", "pinned", "encoders", "entries",
+    "settings",
+}  # fmt: skip
+_ENTRY = {"task", "hand", "placements", "iterations", "settings"}
+
+
+@dataclass(frozen=True)
+class SweepEntry:
+    """A line of table 4.10."""
+
+    task: str
+    hand: str
+    placements: tuple[str, ...]
+    settings: Mapping[str, Any]
+    """Further fields of every student, such as ``iterations``."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A file of students."""
+
+    name: str
+    entries: tuple[SweepEntry, ...]
+    types: tuple[str, ...]
+    """Observation types, each at every placement of an entry."""
+    extra_types: tuple[str, ...]
+    """Types beyond the published ones."""
+    resolutions: tuple[str, ...]
+    """Of the taxels, in the subset ``all`` and in that of one type."""
+    noisy: tuple[bool, ...]
+    """Without noise, with it, or both; in the same subsets."""
+    seeds: tuple[int, ...]
+    """Training seeds, every student once with each."""
+    pinned_resolution: str
+    """The one resolution of the subsets ``types`` and ``encoders``."""
+    pinned_noisy: bool
+    """Whether taxels have noise in these."""
+    encoder_types: tuple[str, ...]
+    """Observation types of the subset ``encoders``."""
+    arms: tuple[Mapping[str, Any], ...]
+    """Encoder and its settings, for the subset ``encoders``."""
+    variant: str
+    """Configuration of the tasks."""
+    teacher: str
+    """Folder of a teacher's run, with ``{task}`` and ``{hand}``."""
+
+    def students(self, subset: str = "all") -> list[DistillConfig]:
+        """Return every student of a subset: ``all``, ``types``, ``encoders`` or an observation type.
+
+        Raises:
+            UsageError: there is no such subset.
+        """
+        every = (*self.types, *self.extra_types)
+        if subset not in (*SUBSETS, *every):
+            raise unknown_name("subset of the sweep", subset, (*SUBSETS, *every))
+        found = [
+            student
+            for entry in self.entries
+            for seed in self.seeds
+            for student in self._of_entry(entry, seed, subset, every)
+        ]
+        names = Counter(student.name for student in found)
+        if repeated := [name for name, count in names.items() if count > 1]:
+            raise UsageError(f"The sweep {self.name!r} names the student {repeated[0]!r} twice.")
+        return found
+
+    def _of_entry(self, entry: SweepEntry, seed: int, subset: str, every: Sequence[str]) -> list[DistillConfig]:
+        common = {
+            "task": entry.task, "hand": entry.hand, "variant": self.variant, "seed": seed, **entry.settings,
+            "teacher": self.teacher.format(task=entry.task, hand=entry.hand),
+        }  # fmt: skip
+        if subset == "encoders":
+            pinned = {"resolution": self.pinned_resolution, "noisy": self.pinned_noisy}
+            return [
+                DistillConfig(
+                    **common, **pinned, observe=kind, placement=placement, encoder=arm["encoder"],
+                    encoder_settings={key: value for key, value in arm.items() if key != "encoder"},
+                )
+                for kind, placement, arm in product(self.encoder_types, entry.placements, self.arms)
+            ]  # fmt: skip
+        types = every if subset in SUBSETS else (subset,)
+        pin = subset == "types"
+        resolutions = (self.pinned_resolution,) if pin else self.resolutions
+        noises = (self.pinned_noisy,) if pin else self.noisy
+        return [
+            DistillConfig(**common, observe="none"),
+            *(
+                DistillConfig(**common, observe=kind, placement=placement, resolution=resolution, noisy=noisy)
+                for kind, placement, resolution, noisy in product(types, entry.placements, resolutions, noises)
+            ),
+        ]
+
+    def count(self, subset: str = "all") -> dict[str, Any]:
+        """Return how many students there are: in all, without the extra types, and per entry."""
+        students = self.students(subset)
+        published = [student for student in students if student.observe not in self.extra_types]
+        entries = Counter(f"{student.task} {student.hand}" for student in students)
+        types = Counter(student.observe for student in students)
+        return {"students": len(students), "published": len(published), "entries": entries, "types": types}
+
+
+def read_sweep(path: str | Path = PUBLISHED) -> Sweep:
+    """Read a sweep.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: the file is no TOML.
+        UsageError: a key or name in it is unknown, or an entry is incomplete.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no sweep {str(path)!r}; the published one is {PUBLISHED.name}.")
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{str(path)!r} is not a TOML file ({error}).") from error
+    _known(document, _KEYS, "key of a sweep")
+    entries = tuple(_entry(item, document.get("settings", {})) for item in document.get("entries", ()))
+    if not entries:
+        raise UsageError(f"The sweep {str(path)!r} has no entries; each is a table [[entries]] with a task and a hand.")
+    pinned, encoders = document.get("pinned", {}), document.get("encoders", {})
+    _known(pinned, {"resolution", "noisy"}, "key of 'pinned'")
+    _known(encoders, {"types", "arms"}, "key of 'encoders'")
+    sweep = Sweep(
+        name=path.stem,
+        entries=entries,
+        types=tuple(document.get("types", ())),
+        extra_types=tuple(document.get("extra_types", ())),
+        resolutions=tuple(document.get("resolutions", ("med",))),
+        noisy=tuple(document.get("noisy", (False,))),
+        seeds=tuple(document.get("seeds", (0,))),
+        pinned_resolution=pinned.get("resolution", "med"),
+        pinned_noisy=bool(pinned.get("noisy", False)),
+        encoder_types=tuple(encoders.get("types", ())),
+        arms=tuple(encoders.get("arms", ())),
+        variant=document.get("variant", "default"),
+        teacher=document.get("teacher", "teachers/{task}-{hand}"),
+    )
+    for kind in (*sweep.types, *sweep.extra_types, *sweep.encoder_types):
+        observation_type(kind)
+    for entry in entries:
+        for placement, resolution in product(entry.placements, (*sweep.resolutions, sweep.pinned_resolution)):
+            check_names(resolution, placement)
+    for arm in sweep.arms:
+        if "encoder" not in arm:
+            raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {dict(arm)!r}.")
+    return sweep
+
+
+def _entry(item: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
+    _known(item, _ENTRY, "key of a sweep's entry")
+    for key in ("task", "hand", "placements"):
+        if not item.get(key):
+            raise UsageError(f"An entry of a sweep needs {key!r}; received {dict(item)!r}.")
+    own = {**settings, **item.get("settings", {})}
+    if "iterations" in item:
+        own["iterations"] = item["iterations"]
+    return SweepEntry(item["task"], item["hand"], tuple(item["placements"]), own)
+
+
+def _known(mapping: Mapping[str, Any], known: set[str], what: str) -> None:
+    for key in mapping:
+        if key not in known:
+            raise unknown_name(what, key, sorted(known))

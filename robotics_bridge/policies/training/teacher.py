@@ -1,0 +1,434 @@
+"""The privileged teacher: PPO with curiosity (RND) and a critic that sees more, through rsl_rl (thesis, table 4.4).
+
+A run is a folder: ``config.json``, ``model_<iteration>.safetensors`` (actor and critic), ``resume.safetensors``
+(all that the next iteration depends on), ``log.jsonl`` and TensorBoard events. Started again, it goes on exactly.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency
+from brainbench.core.files import file_hash, provenance, read_json, write_json
+from robotics_bridge.envs.rsl_rl import RslRlEnv
+from robotics_bridge.policies.shipped import teacher_path
+from robotics_bridge.policies.training import state_tree
+from robotics_bridge.tasks.settings import TeacherSettings
+
+if TYPE_CHECKING:
+    import torch
+    from tensordict import TensorDict
+
+    from robotics_bridge.envs.env import Env
+
+_LOG = logging.getLogger(__name__)
+RESUME = "resume.safetensors"
+
+
+@dataclass(frozen=True)
+class TeacherResult:
+    """What a training run came to."""
+
+    run: Path
+    iterations: int
+    """Done since the run began."""
+    steps: int
+    """Control steps of all environments since the run began."""
+    seconds: float
+    """Of this call."""
+    history: tuple[Mapping[str, float], ...]
+    """Lines of ``log.jsonl`` written by this call."""
+
+
+class Policy:
+    """A trained actor that acts on observation groups: ``policy(observations) -> [B, A]`` (mean actions).
+
+    Args:
+        actor: Model class of rsl_rl, put into evaluation mode.
+        num_envs: B, environments it acts in.
+        device: Of the actions.
+    """
+
+    def __init__(self, actor: torch.nn.Module, num_envs: int, device: Any) -> None:
+        self.actor = actor.eval()
+        self._num_envs, self._device = num_envs, device
+
+    def act(self, observations: Mapping[str, torch.Tensor] | TensorDict) -> torch.Tensor:
+        """Return the mean actions [B, A]."""
+        import torch
+        from tensordict import TensorDict
+
+        if not isinstance(observations, TensorDict):
+            first = next(iter(observations.values()))
+            observations = TensorDict(dict(observations), batch_size=[first.shape[0]])  # type: ignore[arg-type]
+        with torch.inference_mode():
+            return self.actor(observations)
+
+    __call__ = act
+
+    def reset(self, dones: torch.Tensor | None = None) -> None:
+        """Forget the past of environments [B] that are done; a no-op for this network."""
+        self.actor.reset(dones)  # type: ignore[operator]
+
+
+class Trainer:
+    """PPO on one environment batch; :meth:`iterate` is one iteration.
+
+    Args:
+        env: the environments.
+        settings: of the optimisation; those of the task by default.
+        seed: of weights and actions.
+
+    Raises:
+        MissingDependencyError: rsl-rl-lib is not installed.
+    """
+
+    def __init__(self, env: Env, settings: TeacherSettings | None = None, *, seed: int = 0) -> None:
+        import torch
+
+        try:
+            from rsl_rl.algorithms import PPO
+        except ImportError as error:
+            raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
+        self.env, self.settings = RslRlEnv(env), settings or env.task.teacher
+        torch.manual_seed(seed)
+        self.config = self.settings.config({name: tuple(groups) for name, groups in env.task.groups.items()})
+        observations = self.env.get_observations()
+        # rsl_rl prints its networks; what a command prints is its own business.
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            self.algorithm = PPO.construct_algorithm(
+                observations,
+                self.env,  # type: ignore[arg-type]
+                json.loads(json.dumps(self.config)),
+                str(env.device),
+            )
+        _LOG.info("%s", said.getvalue())
+        self.iteration = 0
+        self._observations = observations
+        self._spread_episodes()
+        self.algorithm.train_mode()
+
+    def _spread_episodes(self) -> None:
+        """Let first episodes end at different times, so that no batch holds only beginnings."""
+        import torch
+
+        self.env.episode_length_buf = torch.randint_like(
+            self.env.episode_length_buf, high=int(self.env.max_episode_length)
+        )
+
+    def iterate(self) -> dict[str, float]:
+        """Collect steps, learn from them, and return losses, episode means and seconds spent."""
+        import torch
+
+        env, algorithm = self.env, self.algorithm
+        start = _now(env.device)
+        reward = torch.zeros((), device=env.device)
+        curiosity = torch.zeros((), device=env.device)
+        with torch.inference_mode():
+            for _ in range(self.config["num_steps_per_env"]):
+                actions = algorithm.act(self._observations)
+                self._observations, rewards, dones, extras = env.step(actions)
+                algorithm.process_env_step(self._observations, rewards, dones, extras)
+                reward += rewards.mean()
+                if algorithm.rnd:
+                    curiosity += algorithm.intrinsic_rewards.mean()
+            algorithm.compute_returns(self._observations)
+        collected = _now(env.device)
+        losses = algorithm.update()
+        self.iteration += 1
+        steps = self.config["num_steps_per_env"]
+        row: dict[str, float] = {"iteration": self.iteration, "steps": self.iteration * steps * env.num_envs}
+        row |= {
+            "reward": float(reward) / steps,
+            "collect_s": collected - start,
+            "learn_s": _now(env.device) - collected,
+        }
+        row |= {f"loss/{name}": float(value) for name, value in losses.items()}
+        row |= {
+            "learning_rate": float(algorithm.learning_rate),
+            "std": float(algorithm.get_policy().output_std.detach().mean()),
+        }
+        if algorithm.rnd:
+            row["curiosity"] = float(curiosity) / steps
+        if self._curriculum:
+            row["threshold"] = float(env.unwrapped.goals.threshold)
+        row |= {f"episode/{name}": value for name, value in env.unwrapped.statistics().items()}
+        return row
+
+    def policy(self) -> Policy:
+        """Return the present actor."""
+        return Policy(self.algorithm.get_policy(), self.env.num_envs, self.env.device)
+
+    @property
+    def _curriculum(self) -> dict[str, torch.Tensor]:
+        return self.env.unwrapped.goals.curriculum()
+
+    def begin_from(self, path: Path, *, std: float | None = None) -> None:
+        """Take up actor and critic of another run, with what they know of their inputs; learning begins anew.
+
+        Args:
+            path: as :func:`load_teacher` takes it.
+            std: standard deviation of actions to begin with; None takes that of the other run.
+
+        Raises:
+            DataError: there is no model, or it has other inputs, outputs or layers.
+        """
+        file = model_file(path)
+        found, own = state_tree.load(file), self.algorithm.save()
+        for name in ("actor", "critic"):
+            theirs, mine = (
+                {k: tuple(v.shape) for k, v in tree.items()} for tree in (found[name], own[f"{name}_state_dict"])
+            )
+            if theirs != mine:
+                odd = next(key for key in {**mine, **theirs} if mine.get(key) != theirs.get(key))
+                raise DataError(
+                    f"The {name} of {str(file)!r} does not fit: {odd!r} has the shape {theirs.get(odd)}, here "
+                    f"{mine.get(odd)}. Take a run of a task with the same observations, actions and layers."
+                )
+            own[f"{name}_state_dict"] = found[name]
+        parts = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
+        self.algorithm.load(own, parts, strict=True)
+        if std is not None:
+            spread: Any = self.algorithm.get_policy().distribution
+            log = spread.std_type == "log"
+            (spread.log_std_param if log else spread.std_param).data.fill_(math.log(std) if log else std)
+
+    def state(self) -> dict[str, Any]:
+        """Return all that the next iteration depends on, random numbers included."""
+        import torch
+
+        state = {"algorithm": self.algorithm.save(), "env": self.env.unwrapped.state_dict()}
+        state |= {name: value.clone() for name, value in _named(self._curriculum).items()}
+        state |= {"iteration": self.iteration, "torch_rng": torch.get_rng_state()}
+        if self.env.device.type == "cuda":
+            state["cuda_rng"] = torch.cuda.get_rng_state(self.env.device)
+        if self.algorithm.rnd:
+            normaliser = self.algorithm.rnd.reward_normalizer
+            # rsl_rl keeps these two outside its state_dict.
+            state["rnd_average"] = getattr(getattr(normaliser, "disc_avg", None), "avg", None)
+            state["rnd_updates"] = self.algorithm.rnd.update_counter
+        return state
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from what :meth:`state` returned."""
+        import torch
+
+        self.env.unwrapped.load_state_dict(state["env"])
+        self.algorithm.load(dict(state["algorithm"]), None, strict=True)
+        for name, value in _named(self._curriculum).items():
+            # A run that was begun without a curriculum begins it now.
+            value.copy_(state.get(name, value))
+        self.iteration = int(state["iteration"])
+        if self.algorithm.rnd:
+            self.algorithm.rnd.update_counter = int(state["rnd_updates"])
+            average = state["rnd_average"]
+            if average is not None:
+                self.algorithm.rnd.reward_normalizer.disc_avg.avg = average.to(self.env.device)  # type: ignore[union-attr]
+        self._observations = self.env.get_observations()
+        torch.set_rng_state(state["torch_rng"].cpu())
+        if "cuda_rng" in state:
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.env.device)
+
+
+def train(
+    env: Env,
+    run: Path,
+    *,
+    iterations: int | None = None,
+    minutes: float | None = None,
+    settings: TeacherSettings | None = None,
+    seed: int = 0,
+    save_every: int = 50,
+    keep_env: bool = True,
+    start: Path | None = None,
+    start_std: float | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> TeacherResult:
+    """Train a teacher in a folder, or go on with the run that the folder holds.
+
+    Args:
+        env: the environments; on resuming, of the same task, hand and number.
+        run: folder.
+        iterations: total; the settings' by default.
+        minutes: stop after this time and save.
+        settings: of the optimisation; those of the task by default.
+        seed: of weights and actions.
+        save_every: iterations between checkpoints.
+        keep_env: keep the environments' state too, which makes resuming exact; large batches may save without and
+            go on with new episodes.
+        start: another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with.
+        start_std: standard deviation of actions that it begins with; by default that of the other run.
+        progress: called with iteration, total and a word.
+
+    Raises:
+        UsageError: the folder holds a run of other settings.
+        DataError: the start does not fit.
+    """
+    settings = settings or env.task.teacher
+    total = iterations or settings.iterations
+    trainer = Trainer(env, settings, seed=seed)
+    env.goals.practise()
+    origin = None
+    if start_std is not None and (start is None or not start_std > 0):
+        raise UsageError(f"start_std is a positive number and goes with a run to start from; received {start_std!r}.")
+    if start is not None and not (run / RESUME).is_file():
+        trainer.begin_from(start, std=start_std)
+        origin = {"file": str(model_file(start)), "hash": file_hash(model_file(start))}
+    run.mkdir(parents=True, exist_ok=True)
+    facts = {
+        "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
+        "num_envs": env.num_envs, "seed": seed, "settings": asdict(settings), "rsl_rl": trainer.config,
+        "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
+        "action_names": list(env.action_names), "start": origin,
+    }  # fmt: skip
+    _resume(trainer, run, facts)
+    writer = _writer(run)
+    began, rows = time.monotonic(), []
+    saved = trainer.iteration
+    while trainer.iteration < total:
+        row = trainer.iterate()
+        rows.append(row)
+        with (run / "log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        for name, value in row.items():
+            writer.add_scalar(name, value, trainer.iteration)
+        if progress:
+            progress(trainer.iteration, total, "training")
+        over = minutes is not None and time.monotonic() - began > 60 * minutes
+        if over or trainer.iteration % save_every == 0 or trainer.iteration == total:
+            _save(trainer, run, keep_env=keep_env)
+            saved = trainer.iteration
+        if over:
+            break
+    if saved != trainer.iteration:
+        _save(trainer, run, keep_env=keep_env)
+    writer.close()
+    steps = trainer.iteration * settings.steps_per_env * env.num_envs
+    return TeacherResult(run, trainer.iteration, steps, time.monotonic() - began, tuple(rows))
+
+
+def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
+    config = run / "config.json"
+    if not config.is_file():
+        write_json(config, facts | {"provenance": provenance()})
+        return
+    known = read_json(config)
+    # Settings that came later than the run had their defaults in it.
+    known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
+    for name in ("task", "hand", "num_envs", "seed", "settings"):
+        if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
+            raise UsageError(
+                f"The run in {str(run)!r} has {name} = {known.get(name)!r}; this one {facts[name]!r}. "
+                "Choose another folder."
+            )
+    if not (run / RESUME).is_file():
+        return
+    state = state_tree.load(run / RESUME)
+    if "env" not in state:
+        _LOG.warning("The run was saved without its environments: it goes on with new episodes.")
+        state["env"] = trainer.env.unwrapped.state_dict()
+    trainer.load(state)
+    log = run / "log.jsonl"
+    if log.is_file():
+        # Iterations after the last checkpoint are done again.
+        lines = [line for line in log.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+        kept = [line for line in lines if json.loads(line)["iteration"] <= trainer.iteration]
+        log.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+
+def _save(trainer: Trainer, run: Path, *, keep_env: bool) -> None:
+    models = {name: trainer.algorithm.save()[f"{name}_state_dict"] for name in ("actor", "critic")}
+    state_tree.save(run / f"model_{trainer.iteration}.safetensors", models)
+    state = trainer.state()
+    if not keep_env:
+        del state["env"]
+    state_tree.save(run / RESUME, state)
+
+
+def _writer(run: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise missing_dependency("tensorboard", extra="policies", purpose="The log of a training run") from error
+    return SummaryWriter(str(run))
+
+
+def newest(run: Path) -> Path:
+    """Return the last ``model_<iteration>.safetensors`` of a run.
+
+    Raises:
+        DataFileNotFoundError: the folder holds no model.
+    """
+    found = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
+    if not found:
+        raise DataFileNotFoundError(f"{str(run)!r} holds no trained policy (model_<iteration>.safetensors).")
+    return found[-1]
+
+
+def model_file(path: Path) -> Path:
+    """Return the last model of a run, given its folder or the name of a shipped one, or the model itself.
+
+    Raises:
+        UsageError: there is no such file, folder or name.
+        DataError: the folder holds no model.
+    """
+    found = teacher_path(path)
+    return newest(found) if found.is_dir() else found
+
+
+def load_teacher(run: str | Path, env: Env) -> Policy:
+    """Return the trained actor of a run for an environment.
+
+    Args:
+        run: folder of a run, one of its ``model_<iteration>.safetensors``, or a name of
+            :func:`~robotics_bridge.policies.shipped.list_teachers`.
+        env: environments with the same observation groups and actions.
+
+    Raises:
+        UsageError: there is no such file, folder or name.
+        DataError: there is no model, or it was trained on other observations.
+    """
+    import torch
+
+    path = Path(run)
+    file = model_file(path)
+    facts = read_json(file.parent / "config.json")
+    settings = replace(env.task.teacher, **_plain(facts["settings"]))
+    # To learn, a trainer seeds random numbers and spreads the first episodes; who only acts finds all as it was.
+    ages = env.episode_length_buf.clone()
+    with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+        trainer = Trainer(env, settings)
+    env.episode_length_buf.copy_(ages)
+    try:
+        trainer.algorithm.get_policy().load_state_dict(state_tree.load(file)["actor"])
+    except RuntimeError as error:
+        raise DataError(
+            f"The policy of {str(path)!r} was trained on {facts['task']!r} with hand {facts['hand']!r} and does not "
+            f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
+        ) from error
+    return Policy(trainer.algorithm.get_policy().to(env.device), env.num_envs, env.device)
+
+
+def _named(curriculum: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {f"curriculum_{name}": value for name, value in curriculum.items()}
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        import torch
+
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

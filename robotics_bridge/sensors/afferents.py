@@ -1,0 +1,144 @@
+"""Touch as the afferents of the hand pass it on: bands of SA-I, FA-I and FA-II (thesis, table 2.1).
+
+Slowly adapting type I (Merkel) follows static indentation and slow change; fast adapting type I (Meissner) skin
+motion of 5 to 50 Hz; fast adapting type II (Pacini) vibration of 40 to 400 Hz. Filters are causal and run update by
+update on the device of the signal. Letters: B environment, … anything else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError, unknown_name
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True)
+class Band:
+    """A pass band.
+
+    Raises:
+        UsageError: the edges are not in order.
+    """
+
+    low: float
+    """Lower edge [Hz]; 0 passes static signals."""
+    high: float
+    """Upper edge [Hz]."""
+    order: int = 2
+    """Of the Butterworth filter at each edge."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.low < self.high and math.isfinite(self.high)):
+            raise UsageError(f"A band runs from a lower to a higher frequency (Hz); received {self.low}, {self.high}.")
+        if not 1 <= self.order <= 8:
+            raise UsageError(f"The order of a band filter is 1 to 8; received {self.order}.")
+
+    def sections(self, rate: float) -> np.ndarray:
+        """Return the second-order sections [n, 6] at a sample rate (Hz).
+
+        Raises:
+            UsageError: the band does not fit below half the rate.
+        """
+        from scipy.signal import butter
+
+        if self.high >= rate / 2:
+            raise UsageError(
+                f"A band up to {self.high:g} Hz needs more than {2 * self.high:g} readings per second; "
+                f"received {rate:g}. Read the sensor at every sub-step, or leave the band out."
+            )
+        if self.low == 0:
+            return np.asarray(butter(self.order, self.high, "lowpass", fs=rate, output="sos"))
+        return np.asarray(butter(self.order, (self.low, self.high), "bandpass", fs=rate, output="sos"))
+
+
+AFFERENTS: dict[str, Band] = {"SA-I": Band(0.0, 5.0), "FA-I": Band(5.0, 50.0), "FA-II": Band(40.0, 400.0)}
+"""Bands of table 2.1."""
+
+
+class AfferentFilter:
+    """Splits a signal into bands, one update at a time.
+
+    Args:
+        rate: Updates per second [Hz].
+        bands: Names of :data:`AFFERENTS`, or name → band.
+        rectify: Whether fast bands give magnitudes, as firing rates do.
+
+    Raises:
+        UsageError: a band is unknown or does not fit below half the rate.
+
+    Example::
+
+        afferents = AfferentFilter(1000.0)
+        bands = afferents.step(suite.read("tip"))  # {"SA-I": [B, N], "FA-I": …}
+    """
+
+    def __init__(
+        self,
+        rate: float,
+        bands: Sequence[str] | Mapping[str, Band] = ("SA-I", "FA-I", "FA-II"),
+        *,
+        rectify: bool = False,
+    ) -> None:
+        if not isinstance(bands, Mapping):
+            for name in bands:
+                if name not in AFFERENTS:
+                    raise unknown_name("afferent", name, AFFERENTS)
+            bands = {name: AFFERENTS[name] for name in bands}
+        self.rate, self.bands, self.rectify = rate, dict(bands), rectify
+        self._sections = {name: band.sections(rate) for name, band in self.bands.items()}
+        self._state: dict[str, list[list[torch.Tensor]]] = {}
+
+    def step(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return name → filtered signal, in the shape of ``x`` [B, …].
+
+        The first signal counts as having lasted for ever, so that contact before it rings in no band.
+        """
+        if not self._state:
+            self._state = {name: self._rest(name, x) for name in self.bands}
+        filtered = {}
+        for name, sections in self._sections.items():
+            y = x
+            for row, (first, second) in zip(sections, self._state[name], strict=True):
+                b0, b1, b2, _a0, a1, a2 = (float(value) for value in row)
+                out = b0 * y + first
+                first.copy_(b1 * y - a1 * out + second)
+                second.copy_(b2 * y - a2 * out)
+                y = out
+            filtered[name] = y.abs() if self.rectify and self.bands[name].low > 0 else y
+        return filtered
+
+    def reset(self, env_ids: torch.Tensor | Sequence[int] | None = None, x: torch.Tensor | None = None) -> None:
+        """Forget the past of some environments (all by default).
+
+        Args:
+            env_ids: Environments.
+            x: [B, …] signal that counts as having lasted for ever there; zero if not given.
+        """
+        if env_ids is None and x is None:
+            self._state = {}
+            return
+        for name, state in self._state.items():
+            rest = self._rest(name, x if x is not None else state[0][0] * 0)
+            for pair, fresh in zip(state, rest, strict=True):
+                for kept, value in zip(pair, fresh, strict=True):
+                    where = slice(None) if env_ids is None else env_ids
+                    kept[where] = value[where]
+
+    def _rest(self, name: str, x: torch.Tensor) -> list[list[torch.Tensor]]:
+        """Return the memories at which a constant signal stays as it is."""
+        states, level = [], x.double()
+        for row in self._sections[name]:
+            b0, b1, b2, _a0, a1, a2 = (float(value) for value in row)
+            out = level * (b0 + b1 + b2) / (1 + a1 + a2)
+            second = b2 * level - a2 * out
+            states.append([(b1 * level - a1 * out + second).to(x.dtype), second.to(x.dtype)])
+            level = out
+        return states

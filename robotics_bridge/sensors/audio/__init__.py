@@ -1,0 +1,1 @@
+"""Sound of contacts and drives."""

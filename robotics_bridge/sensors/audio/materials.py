@@ -1,0 +1,129 @@
+"""Elastic materials and the modes of struck solids: frequency, decay and gain of each (thesis 4.33)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from brainbench.core.errors import UsageError, unknown_name
+
+
+@dataclass(frozen=True)
+class ElasticMaterial:
+    """An isotropic solid with Rayleigh damping C = α M + β K.
+
+    Raises:
+        UsageError: a number lies outside its range.
+    """
+
+    young_modulus: float
+    """E [Pa]."""
+    poisson_ratio: float
+    density: float
+    """[kg/m³]."""
+    alpha: float
+    """Damping of the mass [1/s]."""
+    beta: float
+    """Damping of the stiffness [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("young_modulus", "density"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise UsageError(f"The {name} of a material is positive; received {getattr(self, name)!r}.")
+        if not -1 < self.poisson_ratio < 0.49:
+            raise UsageError(f"A Poisson ratio lies between -1 and 0.49 here; received {self.poisson_ratio!r}.")
+        if not (self.alpha >= 0 and self.beta >= 0):
+            raise UsageError(f"Damping is zero or positive; received α {self.alpha!r}, β {self.beta!r}.")
+
+    def decay(self, frequency: float) -> float:
+        """Return the decay rate d = (α + β ω²) / 2 [1/s] of a mode [Hz]."""
+        return (self.alpha + self.beta * (2 * math.pi * frequency) ** 2) / 2
+
+
+ELASTIC_MATERIALS: dict[str, ElasticMaterial] = {
+    "wood": ElasticMaterial(1.1e10, 0.25, 750.0, 60.0, 2e-6),
+    "steel": ElasticMaterial(2.0e11, 0.29, 7850.0, 5.0, 3e-8),
+    "iron": ElasticMaterial(2.1e11, 0.28, 8000.0, 5.0, 1e-7),
+    "aluminium": ElasticMaterial(6.9e10, 0.33, 2700.0, 4.0, 5e-8),
+    "glass": ElasticMaterial(6.2e10, 0.20, 2600.0, 1.0, 1e-7),
+    "ceramic": ElasticMaterial(7.2e10, 0.19, 2700.0, 6.0, 1e-7),
+    "plastic": ElasticMaterial(1.4e9, 0.35, 1070.0, 30.0, 1e-6),
+    "polycarbonate": ElasticMaterial(2.4e9, 0.37, 1190.0, 0.5, 4e-7),
+}
+"""Values in use for modal sound (Wang & James, KleinPAT, 2019; aluminium: handbook, damping of its class)."""
+
+
+def elastic_material(name: str | ElasticMaterial) -> ElasticMaterial:
+    """Return a material by name of :data:`ELASTIC_MATERIALS` (``metal`` is steel); a material passes through.
+
+    Raises:
+        UsageError: there is no material of that name.
+    """
+    if isinstance(name, ElasticMaterial):
+        return name
+    chosen = "steel" if name == "metal" else name
+    if chosen not in ELASTIC_MATERIALS:
+        raise unknown_name("elastic material", name, ELASTIC_MATERIALS)
+    return ELASTIC_MATERIALS[chosen]
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Damped modes of a solid.
+
+    Raises:
+        UsageError: the numbers of frequencies, decays and gains differ, or one is not positive.
+    """
+
+    frequency: tuple[float, ...]
+    """[Hz]."""
+    decay: tuple[float, ...]
+    """Amplitude decay rate [1/s]."""
+    gain: tuple[float, ...]
+    """Velocity of the surface per impulse [1/kg]: the mode's normal components where it is struck and heard."""
+
+    def __post_init__(self) -> None:
+        if not len(self.frequency) == len(self.decay) == len(self.gain) or not self.frequency:
+            raise UsageError(
+                f"Modes need as many frequencies as decays and gains; received {len(self.frequency)}, "
+                f"{len(self.decay)} and {len(self.gain)}."
+            )
+        if not all(f > 0 and d >= 0 and math.isfinite(g) for f, d, g in self.rows()):
+            raise UsageError("A mode has a positive frequency, a decay that is not negative and a finite gain.")
+
+    def rows(self) -> Sequence[tuple[float, float, float]]:
+        """Return (frequency, decay, gain) of each mode."""
+        return list(zip(self.frequency, self.decay, self.gain, strict=True))
+
+    def strongest(self, count: int) -> Modes:
+        """Return the modes with the largest gains, by frequency."""
+        rows = sorted(sorted(self.rows(), key=lambda row: -abs(row[2]))[:count])
+        return Modes(*(tuple(column) for column in zip(*rows, strict=True)))
+
+    def scaled(self, size: float) -> Modes:
+        """Return the modes of a body ``size`` times as large of the same material (decays unchanged)."""
+        if not size > 0:
+            raise UsageError(f"A body is scaled by a positive factor; received {size!r}.")
+        gain = tuple(value / size**3 for value in self.gain)
+        return replace(self, frequency=tuple(value / size for value in self.frequency), gain=gain)
+
+
+def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16) -> Modes:
+    """Return hand-made modes for a body of a material that is known by ear only.
+
+    The frequencies are those of a free bar, (2n + 1)² / 9 times the lowest one, up to 20 kHz; decays follow the
+    material's damping, gains fall with 1/n and are 1/kg at first.
+
+    Raises:
+        UsageError: the lowest frequency lies outside the audible range, or the count is not positive.
+    """
+    chosen = elastic_material(material)
+    if not 20 <= lowest < 20_000 or count < 1:
+        raise UsageError(
+            f"A body rings between 20 and 20000 Hz in at least one mode; received {lowest!r} Hz, {count!r} modes."
+        )
+    every = [(n, lowest * (2 * n + 1) ** 2 / 9) for n in range(1, count + 1)]
+    heard = [(n, frequency) for n, frequency in every if frequency <= 20_000]
+    frequency = tuple(value for _n, value in heard)
+    return Modes(frequency, tuple(chosen.decay(value) for value in frequency), tuple(1 / n for n, _value in heard))

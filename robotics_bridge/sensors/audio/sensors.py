@@ -1,0 +1,163 @@
+"""Sound of contacts and drives, a block of samples per update (thesis 4.32–4.34). SI: metres, seconds, newtons.
+
+A source is a bank of damped resonators excited by the engine's contacts; it emits the velocity of the struck
+surface (m/s) when its modes come from :func:`robotics_bridge.sensors.audio.modes.find_modes`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Self
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.sensors.audio.materials import Modes
+from robotics_bridge.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.sensors.audio.runtime import ContactAudioRuntime, DriveAudioRuntime
+    from robotics_bridge.sensors.sensor import Context
+    from robotics_bridge.sensors.suite import SensorSuite
+
+
+@dataclass(frozen=True, kw_only=True)
+class AudioSensor(Sensor):
+    """A sensor that reads a block of samples [N, K] per update.
+
+    Raises:
+        UsageError: a block without a sample, or a knob of the sensor is out of range.
+    """
+
+    samples: int = 160
+    """K: the sample rate is K over the time step."""
+
+    units: ClassVar[str] = "m/s"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.samples < 1:
+            raise UsageError(f"A block holds at least one sample; received {self.samples}.")
+
+    @property
+    def channels(self) -> int:  # type: ignore[override]
+        """Samples per reading."""
+        return self.samples
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactAudio(AudioSensor):
+    """What a link sounds like when it is struck and rubbed: [1, K] samples.
+
+    A rise of the summed normal force by more than ``threshold`` within one update is an impact of the impulse
+    ΔF·Δt; sliding is noise of the strength F·v. Engines that give no contact forces are silent.
+
+    Raises:
+        UsageError: a threshold, strength or contact time is negative or no number.
+    """
+
+    modes: Modes
+    """Of the link, from ``find_modes`` or by hand."""
+    threshold: float = 0.1
+    """Smallest rise of force that is an impact [N]."""
+    impact: float = 1.0
+    """Factor on impulses."""
+    scrape: float = 0.05
+    """Density of the force noise of sliding [N·√s per N·m/s]."""
+    contact_time: float = 0.0
+    """Duration of an impact's pulse [s]: longer ones excite high modes less. At most the time step; 0 is one sample."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("threshold", "impact", "scrape", "contact_time"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
+
+    def layout(self) -> tuple[int, ...]:
+        """One emitter."""
+        return (1,)
+
+    def group(self) -> Hashable:
+        """Sensors of equal block and number of modes share one runtime."""
+        return (self.samples, (len(self.modes.frequency) + 3) // 4)
+
+    @classmethod
+    def build(cls, sensors: Mapping[str, Self], context: Context) -> ContactAudioRuntime:
+        """Return the runtime that serves these sensors together."""
+        from robotics_bridge.sensors.audio.runtime import ContactAudioRuntime
+
+        return ContactAudioRuntime(sensors, context)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuationAudio(AudioSensor):
+    """What the drives of a hand sound like: [J, K] samples, one emitter per joint.
+
+    Loudness is β_load |τ| + β_pow |τ ω|, the whine a bank of partials on κ |ω|. Write torque and speed of the joints
+    to the views of :func:`joint_drive` before each update.
+
+    Raises:
+        UsageError: there is no joint, or a strength, pitch or frequency is negative or no number.
+    """
+
+    joints: int
+    """J."""
+    load: float = 1e-3
+    """β_load [1/(N·m)], in units of the output."""
+    power: float = 1e-3
+    """β_pow [1/W]."""
+    pitch: float = 80.0
+    """κ: frequency of the fundamental per speed [Hz per rad/s], i.e. the teeth that mesh per radian."""
+    partials: int = 4
+    rolloff: float = 0.5
+    """Amplitude of a partial relative to the one below."""
+    friction: float = 1e-4
+    """Noise per speed [1/(rad/s)]."""
+    hum: float = 0.0
+    """Amplitude of the idle hum."""
+    hum_frequency: float = 100.0
+    """[Hz]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.joints < 1 or self.partials < 0:
+            raise UsageError(f"Drives need joints ≥ 1 and partials ≥ 0; received {self.joints} and {self.partials}.")
+        for name in ("load", "power", "pitch", "rolloff", "friction", "hum", "hum_frequency"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
+
+    def layout(self) -> tuple[int, ...]:
+        """One emitter per joint."""
+        return (self.joints,)
+
+    def group(self) -> Hashable:
+        """Sensors of equal block share one runtime."""
+        return self.samples
+
+    @classmethod
+    def build(cls, sensors: Mapping[str, Self], context: Context) -> DriveAudioRuntime:
+        """Return the runtime that serves these sensors together."""
+        from robotics_bridge.sensors.audio.runtime import DriveAudioRuntime
+
+        return DriveAudioRuntime(sensors, context)
+
+
+def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the views [B, J] for torque (N·m) and speed (rad/s) of the joints of an ActuationAudio.
+
+    Raises:
+        UsageError: the suite has no such sensor.
+    """
+    from brainbench.core.devices import warp
+    from brainbench.core.errors import unknown_name
+    from robotics_bridge.sensors.audio.runtime import DriveAudioRuntime
+
+    served = [runtime for runtime in suite.runtimes if isinstance(runtime, DriveAudioRuntime)]
+    runtime = next((item for item in served if name in item.places), None)
+    if runtime is None:
+        raise unknown_name("actuation sound", name, [key for item in served for key in item.places])
+    place, wp = runtime.places[name], warp()
+    window = slice(place.start, place.start + place.count)
+    return wp.to_torch(runtime.effort)[:, window], wp.to_torch(runtime.speed)[:, window]

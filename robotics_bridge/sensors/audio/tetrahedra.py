@@ -1,0 +1,125 @@
+"""Tetrahedral meshes for modal analysis: boxes, balls, cylinders, and any closed surface by voxels."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError, missing_dependency
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.geometry import Mesh
+
+SMALLEST = 0.05
+"""A tetrahedron may shrink to this share of its volume when its corners are moved to a surface."""
+
+
+def skfem() -> Any:
+    """Return the module ``skfem``."""
+    try:
+        return import_module("skfem")
+    except ImportError as error:
+        raise missing_dependency("scikit-fem", extra="tactile", purpose="Modal analysis") from error
+
+
+def box(half: tuple[float, float, float], cells: int) -> Any:
+    """Return a box of half edges (m) with ``cells`` along its longest edge and at least one along each."""
+    size = 2 * np.array(half, dtype=float)
+    counts = np.maximum(np.round(cells * size / size.max()), 1).astype(int)
+    axes = [np.linspace(-s / 2, s / 2, n + 1) for s, n in zip(size, counts, strict=True)]
+    return skfem().MeshTet.init_tensor(*axes)
+
+
+def ball(half: tuple[float, float, float], cells: int) -> Any:
+    """Return an ellipsoid of half axes (m), from a cube whose shells are pushed out to spheres."""
+    mesh = box((1.0, 1.0, 1.0), cells)
+    p = mesh.p
+    longest, radius = np.abs(p).max(axis=0), np.linalg.norm(p, axis=0)
+    # Near the middle the cube stays a cube, at the skin it is a sphere.
+    round_ = np.where(radius > 0, longest / np.maximum(radius, 1e-12), 1.0)
+    share = longest**2
+    return _moved(mesh, p * (share * round_ + (1 - share) * 0.8) * np.array(half)[:, None])
+
+
+def cylinder(radius: float, half_length: float, cells: int) -> Any:
+    """Return a cylinder along z."""
+    mesh = box((radius, radius, half_length), cells)
+    p = mesh.p.copy()
+    flat = p[:2] / radius
+    longest, far = np.abs(flat).max(axis=0), np.linalg.norm(flat, axis=0)
+    round_ = np.where(far > 0, longest / np.maximum(far, 1e-12), 1.0)
+    share = longest**2
+    p[0:2] = flat * (share * round_ + (1 - share) * 0.85) * radius
+    return _moved(mesh, p)
+
+
+def voxels(surface: Mesh, cells: int) -> Any:
+    """Return a closed surface filled with voxels of six tetrahedra each, whose skin is moved onto the surface.
+
+    Raises:
+        UsageError: no voxel lies inside; the body is too thin for so few cells.
+    """
+    from scipy.spatial import KDTree
+
+    from brainbench.geometry import winding_number
+
+    vertices = np.asarray(surface.vertices, dtype=float)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    edge = float((high - low).max()) / cells
+    counts = np.maximum(np.ceil((high - low) / edge - 1e-9), 1).astype(int)
+    middle = (low + high) / 2
+    axes = [middle[a] + edge * (np.arange(n + 1) - n / 2) for a, n in enumerate(counts)]
+    grid = skfem().MeshTet.init_tensor(*axes)
+    centers = grid.p[:, grid.t].mean(axis=1).T
+    cell = np.floor((centers - [axis[0] for axis in axes]) / edge).astype(int)
+    place = np.array([axis[0] for axis in axes]) + (cell + 0.5) * edge
+    unique, inverse = np.unique(place.round(12), axis=0, return_inverse=True)
+    inside = winding_number(surface, unique) > 0.5
+    keep = inside[inverse.ravel()]
+    if not keep.any():
+        raise UsageError(f"No voxel lies inside the body with {cells} cells along it; use more, or a primitive shape.")
+    mesh = grid.restrict(np.flatnonzero(keep))
+    samples = _scattered(surface, 40_000)
+    skin = np.unique(mesh.facets[:, mesh.boundary_facets()])
+    distance, nearest = (np.asarray(item) for item in KDTree(samples).query(mesh.p[:, skin].T))
+    p = mesh.p.copy()
+    near = distance < 1.2 * edge
+    p[:, skin[near]] = samples[nearest[near]].T
+    return _moved(mesh, _untangled(mesh, p))
+
+
+def _scattered(surface: Mesh, count: int) -> NDArray[np.float64]:
+    """Return points [count, 3] spread over a surface by area."""
+    a, b, c = np.asarray(surface.vertices, dtype=float)[surface.faces].transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    rng = np.random.default_rng(0)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    u, v = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
+    return a[face] * (1 - u) + b[face] * (u * (1 - v)) + c[face] * (u * v)
+
+
+def _untangled(mesh: Any, target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Move back, step by step, the corners of tetrahedra that would be turned over."""
+    start, moved = mesh.p, target.copy()
+    rest = volumes(start, mesh.t)
+    for _ in range(20):
+        bad = volumes(moved, mesh.t) * np.sign(rest) < SMALLEST * np.abs(rest)
+        if not bad.any():
+            return moved
+        corners = np.unique(mesh.t[:, bad])
+        moved[:, corners] = 0.5 * (moved[:, corners] + start[:, corners])
+    return start
+
+
+def volumes(p: NDArray[np.float64], t: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the signed volumes [n] of tetrahedra t [4, n] of points p [3, m]."""
+    a, b, c, d = (p[:, t[i]] for i in range(4))
+    return np.einsum("in,in->n", np.cross(b - a, c - a, axis=0), d - a) / 6
+
+
+def _moved(mesh: Any, p: NDArray[np.float64]) -> Any:
+    return type(mesh)(p, mesh.t)

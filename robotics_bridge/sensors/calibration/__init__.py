@@ -1,0 +1,1 @@
+"""Noise settings from recordings of a real sensor."""

@@ -1,0 +1,1 @@
+"""Marker displacement of a soft pad."""

@@ -1,0 +1,161 @@
+"""Anchors of surface points that sink into an elastomer, and how hard each point drags the gel (before thesis 4.20).
+
+Vectors are in the frame of the sensor link. Letters: B environment, P surface point, S sensor of the group.
+"""
+
+from functools import cache
+from typing import Any
+
+from robotics_bridge.sensors.elastomer.kernels.dilation import elastomer_structs
+from robotics_bridge.sensors.kernels.readout import io_structs
+from robotics_bridge.sensors.queries.kernels.distance import FAR, distance_function, query_structs, shape_functions
+from robotics_bridge.sensors.queries.kernels.pairs import pair_structs
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
+
+
+@cache
+def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hoisted: bool = False) -> Any:
+    """Return the kernel that follows surface points inside the elastomer (before 4.20).
+
+    A point sets its anchor where it sinks below −enter and loses it above +leave, or when its geometry no longer
+    touches. Anchors are [P, 3, B] (x NaN: none). Blocks of points that lie off the pad are passed over: ``held`` counts
+    the anchors of each. Of points that moved since, ``drive`` [P, B] lists s_s h without gaps, ``order`` their numbers
+    in the block, and ``moved`` how many they are plus 64 times one more than the block's place in the pair list.
+
+    Args:
+        kinds: of the pad's geometries.
+        raycast: ask triangles.
+        side_by_side: environments are neighbouring threads, dim [S · blocks, B]; otherwise dim [B, S · blocks].
+        hoisted: what a pad of one geometry asks for each point is worked out once per block (costs registers).
+    """
+    import warp as wp
+
+    structs, pairs_type, solids_type = cloud_structs(), pair_structs().Pairs, query_structs().Solids
+    io_type, gel_type, cloud_type = io_structs().Io, elastomer_structs().Gel, structs.Cloud
+    distance, functions = distance_function(kinds, raycast), shape_functions(kinds, raycast)
+    shape_of, distance_to, shape_type = functions.shape_of, functions.distance_to, query_structs().Shape
+
+    @wp.func
+    def height_over(solids: solids_type, own: wp.array(dtype=wp.int32), gel: gel_type, row: int, z: wp.vec3f) -> float:
+        """Signed distance of a point to the pad's surface, negative inside."""
+        if gel.own_last == gel.own_first:
+            return wp.dot(z - gel.center, gel.normal)
+        phi = float(wp.static(FAR))
+        for o in range(gel.own_first, gel.own_last):
+            local = wp.transform_point(wp.transform_inverse(solids.frame[row, own[o]]), z)
+            limit = 2.0 * solids.bound[row, own[o]][3]
+            phi = wp.min(phi, distance(solids, row, own[o], local, limit)[3])
+        return phi
+
+    @wp.kernel(module="unique")
+    def anchors(
+        gels: wp.array(dtype=gel_type),
+        own: wp.array(dtype=wp.int32),
+        tracked: wp.array(dtype=wp.int32),
+        solids: solids_type,
+        pairs: pairs_type,
+        cloud: cloud_type,
+        io: io_type,
+        blocks: int,
+        anchor: wp.array3d(dtype=wp.float32),
+        held: wp.array2d(dtype=wp.int32),
+        moved: wp.array2d(dtype=wp.int32),
+        dragged: wp.array2d(dtype=wp.int32),
+        drive: wp.array2d(dtype=wp.float32),
+        order: wp.array2d(dtype=wp.uint8),
+    ):
+        i, j = wp.tid()
+        env = i
+        store = j
+        if wp.static(side_by_side):
+            env = j
+            store = i
+        part = store // blocks
+        gel = gels[part]
+        had = held[store, env]
+        if io.age[env] == 0:
+            had = 0
+        moved[store, env] = 0
+        count = pairs.count[env, gel.slot]
+        row = env % cloud.first.shape[0]
+        # Which geometry the block belongs to, counted through those that are tracked.
+        block = store - part * blocks
+        geometry = int(-1)
+        for member in range(tracked.shape[0]):
+            if geometry < 0:
+                if block < cloud.blocks[row, tracked[member]]:
+                    geometry = tracked[member]
+                else:
+                    block -= cloud.blocks[row, tracked[member]]
+        at = int(-1)
+        if geometry >= 0:
+            for k in range(count):
+                if pairs.geometry[env, pairs.first[gel.slot] + k] == geometry:
+                    at = pairs.first[gel.slot] + k
+        if at < 0 or (io.status[env] & 1) != 0:
+            held[store, env] = 0
+            return
+        rotation = wp.transpose(pairs.rotation[env, at])
+        offset = pairs.offset[env, at]
+        first = cloud.first[row, geometry] + block
+        sphere = cloud.sphere[first]
+        solid_row = env % solids.kind.shape[0]
+        middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
+        if height_over(solids, own, gel, solid_row, middle) - sphere[3] > gel.leave:
+            held[store, env] = 0
+            return
+        found = int(0)
+        holds = int(0)
+        shape = shape_type()
+        turn = wp.mat33f()
+        shift = wp.vec3f()
+        limit = float(0.0)
+        alone = False
+        if wp.static(hoisted):
+            alone = gel.own_last - gel.own_first == 1
+            if alone:
+                pad = own[gel.own_first]
+                frame = wp.transform_inverse(solids.frame[solid_row, pad])
+                turn = wp.quat_to_matrix(wp.transform_get_rotation(frame)) @ rotation
+                shift = wp.transform_get_translation(frame) - turn @ offset
+                shape = shape_of(solids, solid_row, pad)
+                limit = 2.0 * solids.bound[solid_row, pad][3]
+        for n in range(wp.static(BLOCK)):
+            p = cloud.point[first * wp.static(BLOCK) + n]
+            index = store * wp.static(BLOCK) + n
+            strength = float(0.0)
+            if not wp.isnan(p[0]):
+                kept = wp.static(float("nan"))
+                if had > 0:
+                    kept = anchor[index, 0, env]
+                z = rotation @ (p - offset)
+                phi = float(0.0)
+                if wp.static(not hoisted):
+                    phi = height_over(solids, own, gel, solid_row, z)
+                elif alone:
+                    phi = distance_to(solids.values, shape, turn @ p + shift, limit)[3]
+                else:
+                    phi = height_over(solids, own, gel, solid_row, z)
+                if wp.isnan(kept):
+                    if phi < -gel.enter:
+                        kept = z[0]
+                        anchor[index, 1, env] = z[1]
+                        anchor[index, 2, env] = z[2]
+                elif phi > gel.leave:
+                    kept = wp.static(float("nan"))
+                anchor[index, 0, env] = kept
+                if not wp.isnan(kept):
+                    way = z - wp.vec3f(kept, anchor[index, 1, env], anchor[index, 2, env])
+                    if wp.length_sq(way) > 0.0:
+                        strength = gel.shear * wp.max(-phi, 0.0)
+                    holds += 1
+            if strength > 0.0:
+                drive[store * wp.static(BLOCK) + found, env] = strength
+                order[store * wp.static(BLOCK) + found, env] = wp.uint8(n)
+                found += 1
+        held[store, env] = holds
+        if found > 0:
+            moved[store, env] = 64 * (at + 1) + found
+            dragged[env, part] = io.age[env] * 1024 + io.episode[env]
+
+    return anchors

@@ -1,0 +1,499 @@
+"""Kernels of the elastomer: indentation, spreading over the grid, and the sum.
+
+Thesis 4.17–4.21, and the layer terms derived in docs/tactile.md. Vectors are in the frame of the sensor link.
+Letters: B environment, N marker, P surface point, S sensor of the group.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from robotics_bridge.sensors.kernels.readout import io_functions, io_structs
+from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+from robotics_bridge.sensors.probes.kernels.probe import deepest_function
+from robotics_bridge.sensors.queries.kernels.distance import query_structs
+from robotics_bridge.sensors.queries.kernels.pairs import pair_structs
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
+
+NEGLIGIBLE = 17.0
+"""Exponent of a Gaussian from which it is left out: 4e-8 of its middle."""
+
+
+@cache
+def elastomer_structs() -> SimpleNamespace:
+    """Return the structure ``Gel``: material and grid of one sensor."""
+    import warp as wp
+
+    @wp.struct
+    class Gel:
+        dilate: wp.float32
+        shear: wp.float32
+        spread: wp.float32
+        """λ_d of 4.19 [1/m²]."""
+        smear: wp.float32
+        """λ_s of 4.20 [1/m²]."""
+        exponent: wp.float32
+        enter: wp.float32
+        leave: wp.float32
+        layered: wp.int32
+        poisson: wp.float32
+        softening: wp.float32
+        thickness: wp.float32
+        recoil: wp.float32
+        expansion_x: wp.float32
+        expansion_y: wp.float32
+        frame_x: wp.float32
+        frame_y: wp.float32
+        center: wp.vec3f
+        along: wp.vec3f
+        across: wp.vec3f
+        normal: wp.vec3f
+        start: wp.int32
+        rows: wp.int32
+        columns: wp.int32
+        step_x: wp.float32
+        step_y: wp.float32
+        link: wp.int32
+        slot: wp.int32
+        own_first: wp.int32
+        own_last: wp.int32
+
+    return SimpleNamespace(Gel=Gel)
+
+
+@cache
+def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bool = False) -> Any:
+    """Return the kernel of the indentation h (4.18), and with ``planes`` 2 of the one with radius noise.
+
+    Dim [B, N], or [B, 1] if ``in_turn``: a thread serves all markers of an environment.
+    """
+    import warp as wp
+
+    deepest = deepest_function(kinds, raycast)
+    types, pairs_type, solids_type = io_structs(), pair_structs().Pairs, query_structs().Solids
+    probes_type, io_type = types.ProbeSet, types.Io
+    noise = noise_functions()
+    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
+
+    @wp.func
+    def indent_one(
+        probes: probes_type,
+        solids: solids_type,
+        pairs: pairs_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        stamp: wp.array2d(dtype=wp.int32),
+        exponent: wp.array(dtype=wp.float32),
+        height: wp.array3d(dtype=wp.float32),
+        env: int,
+        n: int,
+    ):
+        """Ask how deep one marker lies."""
+        part = probes.part[n]
+        h = float(0.0)
+        noisy = float(0.0)
+        if probes.radius[n] > 0.0 and pairs.count[env, probes.slot[n]] > 0:
+            best, _normal, _place = deepest(probes, solids, pairs, env, n, 0.0)
+            h = wp.max(-best, 0.0)
+            if wp.static(planes == 2):
+                error = radius_noise(knobs[part], env + io.env_offset, probes.probe[n], io.age[env], io.episode[env])
+                noisy = wp.max(error - best, 0.0)
+            if h > 0.0 or noisy > 0.0:
+                stamp[env, part] = io.age[env] * 1024 + io.episode[env]
+        height[0, env, n] = h
+        if wp.static(planes == 2):
+            height[1, env, n] = noisy
+        # The bulge h^α is asked for by many markers, so it is raised once.
+        for plane in range(wp.static(planes)):
+            value = h
+            if plane == 1:
+                value = noisy
+            raised = float(0.0)
+            if value > 0.0:
+                raised = wp.pow(value, exponent[part])
+            height[wp.static(planes) + plane, env, n] = raised
+
+    @wp.kernel(module="unique")
+    def indent(
+        probes: probes_type,
+        solids: solids_type,
+        pairs: pairs_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        stamp: wp.array2d(dtype=wp.int32),
+        exponent: wp.array(dtype=wp.float32),
+        height: wp.array3d(dtype=wp.float32),
+    ):
+        env, n = wp.tid()
+        if wp.static(in_turn):
+            for m in range(probes.radius.shape[0]):
+                indent_one(probes, solids, pairs, io, knobs, stamp, exponent, height, env, m)
+        else:
+            indent_one(probes, solids, pairs, io, knobs, stamp, exponent, height, env, n)
+
+    return indent
+
+
+@cache
+def spread_kernel(planes: int, in_turn: bool = False) -> Any:
+    """Return the kernel that spreads h along the columns of planar grids: 3 sums per plane.
+
+    Dim [B, N], or [B, 1] if ``in_turn``: a thread serves all markers of an environment.
+
+    With one-dimensional weights w(k) = exp(−λ (k·pitch)²): Σ h w, Σ h k·pitch·w and Σ h^α w.
+    """
+    import warp as wp
+
+    probes_type, io_type, gel_type = io_structs().ProbeSet, io_structs().Io, elastomer_structs().Gel
+
+    @wp.func
+    def spread_one(
+        probes: probes_type,
+        io: io_type,
+        gels: wp.array(dtype=gel_type),
+        weights: wp.array3d(dtype=wp.float32),
+        reach: wp.array2d(dtype=wp.int32),
+        stamp: wp.array2d(dtype=wp.int32),
+        height: wp.array3d(dtype=wp.float32),
+        out: wp.array3d(dtype=wp.float32),
+        env: int,
+        n: int,
+    ):
+        """Sum over the columns around one marker."""
+        part = probes.part[n]
+        if stamp[env, part] == io.age[env] * 1024 + io.episode[env]:
+            gel = gels[part]
+            place = probes.probe[n] % gel.columns
+            row = n - place
+            for plane in range(wp.static(planes)):
+                plain = float(0.0)
+                tilted = float(0.0)
+                raised = float(0.0)
+                low = wp.max(place - reach[part, 0], 0)
+                high = wp.min(place + reach[part, 0] + 1, gel.columns)
+                for source in range(low, high):
+                    h = height[plane, env, row + source]
+                    if h > 0.0:
+                        away = place - source
+                        w = weights[part, 0, wp.abs(away)]
+                        plain += h * w
+                        tilted += h * w * float(away) * gel.step_x
+                        raised += height[wp.static(planes) + plane, env, row + source] * w
+                out[3 * plane, env, n] = plain
+                out[3 * plane + 1, env, n] = tilted
+                out[3 * plane + 2, env, n] = raised
+
+    @wp.kernel(module="unique")
+    def spread(
+        probes: probes_type,
+        io: io_type,
+        gels: wp.array(dtype=gel_type),
+        weights: wp.array3d(dtype=wp.float32),
+        reach: wp.array2d(dtype=wp.int32),
+        stamp: wp.array2d(dtype=wp.int32),
+        height: wp.array3d(dtype=wp.float32),
+        out: wp.array3d(dtype=wp.float32),
+    ):
+        env, n = wp.tid()
+        if wp.static(in_turn):
+            for m in range(probes.radius.shape[0]):
+                spread_one(probes, io, gels, weights, reach, stamp, height, out, env, m)
+        else:
+            spread_one(probes, io, gels, weights, reach, stamp, height, out, env, n)
+
+    return spread
+
+
+@cache
+def block_function() -> Any:
+    """Return ``block_of(cloud, tracked, row, geometry, block)``."""
+    import warp as wp
+
+    cloud_type = cloud_structs().Cloud
+
+    @wp.func
+    def block_of(cloud: cloud_type, tracked: wp.array(dtype=wp.int32), row: int, geometry: int, block: int) -> int:
+        """Number in the cloud of a block that was counted through all tracked geometries."""
+        before = int(0)
+        for member in range(tracked.shape[0]):
+            if tracked[member] == geometry:
+                return cloud.first[row, geometry] + block - before
+            before += cloud.blocks[row, tracked[member]]
+        return 0
+
+    return block_of
+
+
+@cache
+def marker_kernel(
+    way: int,
+    layered: bool,
+    planes: int,
+    mode: int,
+    hysteresis: bool,
+    walk: bool,
+    in_turn: bool = False,
+    apart: bool = False,
+) -> Any:
+    """Return the kernel that sums dilation and shear at every marker (4.19–4.21). Dim [B, N], or [B, 1] if ``in_turn``.
+
+    Args:
+        way: 0 sums sources directly; 1: h was spread along the columns of planar grids; 2: h was convolved in full.
+        layered: some sensor uses the layer terms.
+        planes: 2 when the measured branch has its own h.
+        mode: of the noise.
+        hysteresis: whether the group stores hysteresis.
+        walk: whether the group stores a drift.
+        in_turn: a thread serves all markers of an environment.
+        apart: the shear of sensors without a layer was summed before, in ``drag``.
+    """
+    import warp as wp
+
+    block_of = block_function()
+    io = io_functions(mode, hysteresis, walk, 3)
+    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
+    types, gel_type = io_structs(), elastomer_structs().Gel
+    pairs_type, cloud_type = pair_structs().Pairs, cloud_structs().Cloud
+    probes_type, io_type = types.ProbeSet, types.Io
+    noise = noise_functions()
+    params_type = noise.NoiseParams
+
+    @wp.func
+    def across_plane(v: wp.vec3f, n: wp.vec3f) -> wp.vec3f:
+        return v - wp.dot(v, n) * n
+
+    @wp.func
+    def traction(gel: gel_type, away: wp.vec3f, slip: wp.vec3f) -> wp.vec3f:
+        """Cerruti's surface displacement, softened over the contact, minus its image below the bonded base."""
+        square = wp.dot(away, away) + gel.softening * gel.softening
+        inverse = 1.0 / wp.sqrt(square)
+        u = inverse * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * inverse * inverse) * away)
+        if gel.thickness > 0.0:
+            deep = 1.0 / wp.sqrt(square + 4.0 * gel.thickness * gel.thickness)
+            u -= deep * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * deep * deep) * away)
+        return u
+
+    @wp.func
+    def read_one(
+        probes: probes_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        gels: wp.array(dtype=gel_type),
+        weights: wp.array3d(dtype=wp.float32),
+        reach: wp.array2d(dtype=wp.int32),
+        stamp: wp.array2d(dtype=wp.int32),
+        height: wp.array3d(dtype=wp.float32),
+        spread: wp.array3d(dtype=wp.float32),
+        blocks: int,
+        tracked: wp.array(dtype=wp.int32),
+        pairs: pairs_type,
+        cloud: cloud_type,
+        moved: wp.array2d(dtype=wp.int32),
+        dragged: wp.array2d(dtype=wp.int32),
+        anchor: wp.array3d(dtype=wp.float32),
+        drive: wp.array2d(dtype=wp.float32),
+        order: wp.array2d(dtype=wp.uint8),
+        drag: wp.array2d(dtype=wp.vec2f),
+        env: int,
+        n: int,
+    ):
+        """Read one marker."""
+        if probes.radius[n] <= 0.0:
+            idle(io, 3, env, n)
+        elif (io.status[env] & 1) != 0:
+            lost(io, 3, env, n)
+        else:
+            part = probes.part[n]
+            probe = probes.probe[n]
+            gel = gels[part]
+            x = probes.position[n]
+            normal = probes.normal[n]
+            truth = wp.vec3f(0.0)
+            signal = wp.vec3f(0.0)
+            if stamp[env, part] == io.age[env] * 1024 + io.episode[env]:
+                for plane in range(wp.static(planes)):
+                    u = wp.vec3f(0.0)
+                    total = float(0.0)
+                    if wp.static(way == 2):
+                        u = gel.dilate * (
+                            spread[3 * plane, env, n] * gel.along
+                            + spread[3 * plane + 1, env, n] * gel.across
+                            + spread[3 * plane + 2, env, n] * normal
+                        )
+                    elif wp.static(way == 1):
+                        place = probe // gel.columns
+                        along = float(0.0)
+                        across = float(0.0)
+                        raised = float(0.0)
+                        low = wp.max(place - reach[part, 1], 0)
+                        high = wp.min(place + reach[part, 1] + 1, gel.rows)
+                        for source in range(low, high):
+                            at = n + (source - place) * gel.columns
+                            w = weights[part, 1, wp.abs(place - source)]
+                            along += w * spread[3 * plane + 1, env, at]
+                            across += w * float(place - source) * gel.step_y * spread[3 * plane, env, at]
+                            raised += w * spread[3 * plane + 2, env, at]
+                        u = gel.dilate * (along * gel.along + across * gel.across + raised * normal)
+                    else:
+                        for source in range(gel.rows * gel.columns):
+                            h = height[plane, env, gel.start + source]
+                            if h > 0.0:
+                                away = across_plane(x - probes.position[gel.start + source], normal)
+                                square = gel.spread * wp.dot(away, away)
+                                w = wp.exp(-square)
+                                if wp.static(layered):
+                                    away = (1.0 - gel.recoil * square) * away
+                                bulge = height[wp.static(planes) + plane, env, gel.start + source]
+                                u += gel.dilate * w * (h * away + bulge * normal)
+                    if wp.static(layered):
+                        if gel.expansion_x != 0.0 or gel.expansion_y != 0.0:
+                            for source in range(gel.rows * gel.columns):
+                                total += height[plane, env, gel.start + source]
+                            local = x - gel.center
+                            bx = wp.dot(local, gel.along)
+                            by = wp.dot(local, gel.across)
+                            scale = total / float(gel.rows * gel.columns)
+                            ux = bx
+                            uy = by
+                            if gel.frame_x > 0.0:
+                                # Displacement of a layer whose edges are clamped: the first mode that vanishes there.
+                                ux = gel.frame_x / wp.pi * wp.sin(wp.pi * wp.clamp(bx / gel.frame_x, -1.0, 1.0))
+                                uy = gel.frame_y / wp.pi * wp.sin(wp.pi * wp.clamp(by / gel.frame_y, -1.0, 1.0))
+                            u += scale * (gel.expansion_x * ux * gel.along + gel.expansion_y * uy * gel.across)
+                    if plane == 0:
+                        truth = u
+                    else:
+                        signal = u
+            slide = wp.vec3f(0.0)
+            if dragged[env, part] == io.age[env] * 1024 + io.episode[env]:
+                row = env % cloud.first.shape[0]
+                last = part * blocks + blocks
+                if wp.static(apart):
+                    if gel.layered == 0:
+                        slide = drag[env, n][0] * gel.along + drag[env, n][1] * gel.across
+                        last = 0
+                for block in range(part * blocks, last):
+                    packed = moved[block, env]
+                    if packed > 0:
+                        at = packed // 64 - 1
+                        rotation = wp.transpose(pairs.rotation[env, at])
+                        offset = pairs.offset[env, at]
+                        first = block_of(cloud, tracked, row, pairs.geometry[env, at], block - part * blocks)
+                        # Σ w (z − anchor) with z = rotation (p − offset): the pose of the block is applied once.
+                        here = wp.transpose(rotation) @ x + offset
+                        up = wp.transpose(rotation) @ normal
+                        mass = float(0.0)
+                        carried = wp.vec3f(0.0)
+                        left = wp.vec3f(0.0)
+                        for k in range(packed % 64):
+                            own = int(order[block * wp.static(BLOCK) + k, env])
+                            index = block * wp.static(BLOCK) + own
+                            p = cloud.point[first * wp.static(BLOCK) + own]
+                            strength = drive[block * wp.static(BLOCK) + k, env]
+                            kept = wp.vec3f(anchor[index, 0, env], anchor[index, 1, env], anchor[index, 2, env])
+                            if wp.static(layered):
+                                if gel.layered == 1:
+                                    z = rotation @ (p - offset)
+                                    slip = across_plane(strength * (z - kept), normal)
+                                    slide += traction(gel, across_plane(x - z, normal), slip)
+                                    strength = 0.0
+                            away = p - here
+                            rise = wp.dot(away, up)
+                            far = gel.smear * (wp.dot(away, away) - rise * rise)
+                            if far < wp.static(NEGLIGIBLE):
+                                w = strength * wp.exp(-far)
+                                mass += w
+                                carried += w * (p - offset)
+                                left += w * kept
+                        if mass > 0.0:
+                            slide += rotation @ carried - left
+                if gel.layered == 0:
+                    slide = across_plane(slide, normal)
+            if wp.static(planes == 1):
+                signal = truth
+            truth += slide
+            age = io.age[env]
+            episode = io.episode[env]
+            fixed = wp.vec3f(1.0, 0.0, 0.0)
+            if wp.static(mode > 0):
+                fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
+            signal = fixed[0] * (signal + slide)
+            all_truth = wp.spatial_vectorf(truth[0], truth[1], truth[2], 0.0, 0.0, 0.0)
+            all_signal = wp.spatial_vectorf(signal[0], signal[1], signal[2], 0.0, 0.0, 0.0)
+            lag, drift = recall_six(io, env, n, age)
+            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
+
+    @wp.kernel(module="unique")
+    def markers(
+        probes: probes_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        gels: wp.array(dtype=gel_type),
+        weights: wp.array3d(dtype=wp.float32),
+        reach: wp.array2d(dtype=wp.int32),
+        stamp: wp.array2d(dtype=wp.int32),
+        height: wp.array3d(dtype=wp.float32),
+        spread: wp.array3d(dtype=wp.float32),
+        blocks: int,
+        tracked: wp.array(dtype=wp.int32),
+        pairs: pairs_type,
+        cloud: cloud_type,
+        moved: wp.array2d(dtype=wp.int32),
+        dragged: wp.array2d(dtype=wp.int32),
+        anchor: wp.array3d(dtype=wp.float32),
+        drive: wp.array2d(dtype=wp.float32),
+        order: wp.array2d(dtype=wp.uint8),
+        drag: wp.array2d(dtype=wp.vec2f),
+    ):
+        env, n = wp.tid()
+        if wp.static(in_turn):
+            for m in range(probes.radius.shape[0]):
+                read_one(
+                    probes,
+                    io,
+                    knobs,
+                    gels,
+                    weights,
+                    reach,
+                    stamp,
+                    height,
+                    spread,
+                    blocks,
+                    tracked,
+                    pairs,
+                    cloud,
+                    moved,
+                    dragged,
+                    anchor,
+                    drive,
+                    order,
+                    drag,
+                    env,
+                    m,
+                )
+        else:
+            read_one(
+                probes,
+                io,
+                knobs,
+                gels,
+                weights,
+                reach,
+                stamp,
+                height,
+                spread,
+                blocks,
+                tracked,
+                pairs,
+                cloud,
+                moved,
+                dragged,
+                anchor,
+                drive,
+                order,
+                drag,
+                env,
+                n,
+            )
+
+    return markers

@@ -1,0 +1,1 @@
+"""The noise model of readings."""

@@ -1,0 +1,282 @@
+"""What a real sensor does to the signal: the noise model of the thesis (equations 4.22–4.28, tables 4.2 and 4.12).
+
+Order of the measured branch: radius noise and gain → crosstalk → hysteresis → random walk → white noise → bias →
+quantisation → dead probes → threshold → delay. The ground truth is never touched. Values are drawn by counter
+(:mod:`robotics_bridge.sensors.noise.kernels.noise`): they depend on seed, sensor name, environment, episode, update,
+probe and channel, and on nothing else. Letters: B environment, N probe, C channel; arrays are planar [C, B, N].
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.files import read_json, to_plain, write_json
+
+if TYPE_CHECKING:
+    import os
+
+    from numpy.typing import ArrayLike, NDArray
+
+BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
+"""Knobs of every sensor (table 4.2)."""
+PROBE_KNOBS = BASE_KNOBS | {"radius"}
+"""Knobs of probe sensors."""
+TAXEL_KNOBS = PROBE_KNOBS | {"gain", "dead_probability", "dead_range", "hysteresis", "hysteresis_tau"}
+"""Knobs of tactile probe sensors."""
+GRID_KNOBS = TAXEL_KNOBS | {"crosstalk", "crosstalk_sigma"}
+"""Knobs of sensors whose taxels may lie on a grid and share a soft layer."""
+_FORMAT = "brainbench-noise-1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Imperfections of one sensor; every knob is off by default.
+
+    Raises:
+        UsageError: a knob lies outside its range.
+    """
+
+    read_delay: float = 0.0
+    """Age of what is read [s]; a zero-order hold between updates."""
+    jitter: float = 0.0
+    """Half width of the uniform variation of the delay [s], at most the delay."""
+    white: float = 0.0
+    """Standard deviation of Gaussian noise, new in every update [unit of the sensor]."""
+    bias: float = 0.0
+    """Constant offset [unit of the sensor]."""
+    walk: float = 0.0
+    """Standard deviation of the step that a drift makes in every update [unit of the sensor]."""
+    quantum: float = 0.0
+    """Step of the analogue-to-digital converter [unit of the sensor]; 0 does not round."""
+    radius: float = 0.0
+    """Half width of the uniform error of the sensing radius, new in every update [m] (4.23)."""
+    gain: tuple[float, float] = (1.0, 1.0)
+    """Range of each probe's calibration factor, drawn at every reset (4.24). It multiplies the depth."""
+    dead_probability: float = 0.0
+    """Probability that a probe is stuck for an episode (4.25)."""
+    dead_range: tuple[float, float] = (0.0, 0.0)
+    """Range of the stuck value; one value fills all channels of the probe [unit of the sensor]."""
+    hysteresis: float = 0.0
+    """Strength β of the viscoelastic overshoot (4.26, 4.27)."""
+    hysteresis_tau: float = 0.05
+    """Its time constant τ [s]."""
+    crosstalk: float = 0.0
+    """Share χ of the signal that spreads over neighbours of a planar grid (4.28)."""
+    crosstalk_sigma: float = 1.0
+    """Standard deviation of that spread [taxels]."""
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "dead_range"):
+            value = getattr(self, name)
+            if len(value) != 2 or not (math.isfinite(value[0]) and math.isfinite(value[1]) and value[0] <= value[1]):
+                raise UsageError(f"{name} is a range (low, high) with low ≤ high; received {value!r}.")
+            object.__setattr__(self, name, (float(value[0]), float(value[1])))
+        for name in ("read_delay", "jitter", "white", "walk", "quantum", "radius", "hysteresis_tau", "crosstalk_sigma"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
+        for name in ("dead_probability", "crosstalk"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"{name} lies between 0 and 1; received {getattr(self, name)!r}.")
+        if not (math.isfinite(self.bias) and math.isfinite(self.hysteresis)):
+            raise UsageError(f"bias and hysteresis must be finite; received {self.bias!r} and {self.hysteresis!r}.")
+        if self.jitter > self.read_delay:
+            raise UsageError(
+                f"jitter ({self.jitter:g} s) must not exceed read_delay ({self.read_delay:g} s): "
+                "a reading from the future is none."
+            )
+        if self.hysteresis and not self.hysteresis_tau:
+            raise UsageError("hysteresis needs a positive hysteresis_tau (s); received 0.")
+        if self.crosstalk and not self.crosstalk_sigma:
+            raise UsageError("crosstalk needs a positive crosstalk_sigma (taxels); received 0.")
+
+    @property
+    def set_knobs(self) -> tuple[str, ...]:
+        """Names of the knobs that do something."""
+        off = Noise.__dataclass_fields__
+        names = [field.name for field in fields(self) if getattr(self, field.name) != off[field.name].default]
+        with_switch = {
+            "dead_range": self.dead_probability,
+            "hysteresis_tau": self.hysteresis,
+            "crosstalk_sigma": self.crosstalk,
+        }
+        return tuple(name for name in names if with_switch.get(name, 1.0))
+
+    @property
+    def active(self) -> bool:
+        """Whether the measured reading can differ from the truth."""
+        return bool(self.set_knobs)
+
+    @property
+    def stores_hysteresis(self) -> bool:
+        """Whether one number per channel is kept for the hysteresis."""
+        return self.hysteresis != 0
+
+    @property
+    def stores_walk(self) -> bool:
+        """Whether one number per channel is kept for the drift."""
+        return self.walk > 0
+
+    @property
+    def delays(self) -> bool:
+        """Whether readings are late."""
+        return self.read_delay > 0
+
+    @property
+    def crosstalks(self) -> bool:
+        """Whether neighbours mix."""
+        return self.crosstalk > 0
+
+    def check(self, knobs: frozenset[str], sensor: str) -> None:
+        """Refuse knobs that a sensor does not have (table 4.2).
+
+        Raises:
+            UsageError: a knob outside ``knobs`` is set.
+        """
+        if extra := [name for name in self.set_knobs if name not in knobs]:
+            raise UsageError(
+                f"{sensor} has no noise knob {', '.join(map(repr, extra))}; it has: {', '.join(sorted(knobs))}."
+            )
+
+    def params(self, seed: int) -> Any:
+        """Return the Warp structure ``NoiseParams`` for a 64-bit ``seed`` (see :func:`stream_seed`)."""
+        from brainbench.core.devices import warp
+        from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+
+        wp = warp()
+        params = noise_functions().NoiseParams()
+        params.key_low, params.key_high = wp.uint32(seed & 0xFFFFFFFF), wp.uint32((seed >> 32) & 0xFFFFFFFF)
+        params.gain_low, params.gain_high = self.gain
+        params.dead_low, params.dead_high = self.dead_range
+        params.tau = self.hysteresis_tau
+        params.levels = 1.0 / self.quantum if self.quantum else 0.0
+        for name in ("radius", "dead_probability", "hysteresis", "walk", "white", "bias", "quantum"):
+            setattr(params, name, getattr(self, name))
+        return params
+
+    def save(self, path: str | os.PathLike[str], **about: Any) -> None:
+        """Write the knobs as a preset (JSON), with what else is worth telling about it."""
+        write_json(path, {"format": _FORMAT, "noise": to_plain(self), "about": about})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Noise:
+        """Read a preset that :meth:`save` or ``brainbench tactile calibrate`` wrote.
+
+        Raises:
+            DataError: the file is missing or is no preset.
+        """
+        document = read_json(path)
+        knobs = document.get("noise") if isinstance(document, dict) else None
+        if not isinstance(knobs, dict) or document.get("format") != _FORMAT:
+            raise DataError(f"{str(path)!r} is no noise preset (format {_FORMAT!r}).")
+        names = {field.name for field in fields(cls)}
+        if unknown := [name for name in knobs if name not in names]:
+            raise DataError(f"{str(path)!r} holds unknown noise knobs: {', '.join(map(repr, unknown))}.")
+        values: dict[str, Any] = {name: tuple(item) if isinstance(item, list) else item for name, item in knobs.items()}
+        return cls(**values)
+
+    @classmethod
+    def preset(cls, name: str) -> Noise:
+        """Return a named preset; :data:`PRESETS` lists them.
+
+        Raises:
+            UsageError: there is no preset of this name.
+        """
+        if name not in PRESETS:
+            raise unknown_name("noise preset", name, PRESETS)
+        return PRESETS[name]
+
+
+def _published(**knobs: Any) -> Noise:
+    scatter = {"gain": (0.85, 1.15), "hysteresis": 0.5, "hysteresis_tau": 0.05}
+    return Noise(dead_probability=0.05, **scatter, **knobs)
+
+
+PRESETS: dict[str, Noise] = {
+    "none": Noise(),
+    "published-bool": Noise(dead_probability=0.05),
+    "published-depth": _published(white=2e-4, quantum=1e-4, radius=3e-4),
+    "published-force": _published(white=5e-3, walk=1e-4, quantum=1e-2, radius=3e-4),
+    "published-proximity": _published(white=1e-2, walk=1e-3, quantum=1e-2, radius=6e-4),
+    "published-elastomer": _published(white=1e-4, walk=1e-5, quantum=1e-4, radius=3e-4),
+}
+"""The noisy condition of the thesis (table 4.12), by group of observation types. The release threshold of
+``bool`` (2·10⁻⁴ m) belongs to the ContactProbe."""
+for _alias, _name in {"agg_bool": "bool", "agg_force": "depth", "force_torque": "force"}.items():
+    PRESETS[f"published-{_alias}"] = PRESETS[f"published-{_name}"]
+
+
+def stream_seed(seed: int, name: str) -> int:
+    """Return the 64-bit seed of one sensor: a stable hash of the experiment's seed and the sensor's name."""
+    return int.from_bytes(hashlib.sha256(f"{seed}:{name}".encode()).digest()[:8], "little")
+
+
+@dataclass
+class _Clock:
+    age: Any
+    episode: Any
+    env_offset: int
+
+
+@dataclass
+class _Context:
+    clock: _Clock
+    device: Any
+    seed: int
+
+
+def simulate(
+    noise: Noise,
+    clean: ArrayLike,
+    *,
+    dt: float,
+    seed: int = 0,
+    layout: tuple[int, ...] | None = None,
+    name: str = "sensor",
+    device: str = "cpu",
+    env_offset: int = 0,
+) -> NDArray[np.float32]:
+    """Return what a sensor with this noise measures of a recorded clean signal.
+
+    The error of the sensing radius needs the geometry and is left out.
+
+    Args:
+        noise: Knobs.
+        clean: [T, B, N, C] signal [unit of the sensor].
+        dt: Time step [s].
+        seed: Seed of the experiment.
+        layout: (ny, nx) where crosstalk is wanted.
+        name: Name of the sensor.
+        device: ``cpu`` or ``cuda``.
+        env_offset: Number of the first environment in the whole experiment.
+
+    Raises:
+        UsageError: the signal has not four axes.
+    """
+    from brainbench.core.devices import pick_device, warp
+    from robotics_bridge.sensors.noise.stages import DelayLine, NoisePart, NoiseStage
+
+    signal = np.asarray(clean, dtype=np.float32)
+    if signal.ndim != 4:
+        raise UsageError(f"A recorded signal has axes [time, environment, probe, channel]; received {signal.shape}.")
+    wp, where = warp(), pick_device(device)
+    _steps, envs, probes, channels = signal.shape
+    clock = _Clock(*(wp.zeros(envs, dtype=wp.int32, device=where) for _ in range(2)), env_offset=env_offset)
+    context = _Context(clock, where, seed)
+    parts = [NoisePart(name, replace(noise, radius=0.0), 0, layout or (probes,))]
+    stage = NoiseStage(parts, channels, envs, context, gained=False)
+    line = DelayLine(parts, channels, envs, context) if noise.delays else None
+    measured = wp.zeros((channels, envs, probes), dtype=wp.float32, device=where)
+    out = np.empty_like(signal)
+    for step, frame in enumerate(signal):
+        clock.age.fill_(step)
+        stage.launch(wp.array(np.ascontiguousarray(frame.transpose(2, 0, 1)), device=where), measured, dt)
+        if line:
+            line.launch(measured, dt)
+        out[step] = (line.out if line else measured).numpy().transpose(1, 2, 0)
+    return out

@@ -1,0 +1,1 @@
+"""Probes of distance, depth and contact, and where they sit."""

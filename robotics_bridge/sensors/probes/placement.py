@@ -1,0 +1,195 @@
+"""Where the probes of a sensor sit: planar grids, explicit lists, patches of a mesh. Metres, link frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from brainbench.geometry import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """Positions, outward normals and sensing radii of probes. A radius of 0 marks a filler that always reads 0.
+
+    Raises:
+        UsageError: shapes do not match, numbers are not finite, a radius is negative or a normal has no length.
+    """
+
+    position: NDArray[np.float64]
+    """[N, 3] (m)."""
+    normal: NDArray[np.float64]
+    """[N, 3], out of the sensing surface; made unit length."""
+    radius: NDArray[np.float64]
+    """[N] (m); one number serves all."""
+    shape: tuple[int, ...] = ()
+    """(N,) or (rows, columns) in the order of the probes; empty means (N,)."""
+    pitch: tuple[float, float] | None = None
+    """Distance of neighbouring rows and columns of a regular planar grid (m); None for any other placement."""
+
+    def __post_init__(self) -> None:
+        position = np.array(self.position, dtype=float).reshape(-1, 3)
+        normal = np.array(self.normal, dtype=float).reshape(-1, 3)
+        count = len(position)
+        try:
+            radius = np.array(np.broadcast_to(np.asarray(self.radius, dtype=float), (count,)))
+        except ValueError:
+            raise UsageError(f"{count} probes need one radius or {count}; received {np.shape(self.radius)}.") from None
+        shape = tuple(self.shape) or (count,)
+        if not count:
+            raise UsageError("A sensor needs at least one probe; received none.")
+        if len(normal) != count or math.prod(shape) != count or len(shape) > 2:
+            raise UsageError(f"{count} positions do not go with {len(normal)} normals in the shape {shape}.")
+        if not (np.isfinite(position).all() and np.isfinite(normal).all() and np.isfinite(radius).all()):
+            raise UsageError("Positions, normals and radii of probes must be finite numbers.")
+        if (radius < 0).any():
+            raise UsageError(f"The radius of a probe is positive, or 0 for a filler; received {radius.min():g} m.")
+        length = np.linalg.norm(normal, axis=1)
+        if (length[radius > 0] < 1e-9).any():
+            raise UsageError("The normal of a probe needs a length; received a zero vector.")
+        normal = np.where(length[:, None] > 0, normal / np.maximum(length, 1e-12)[:, None], [0.0, 0.0, 1.0])
+        for name, value in (("position", position), ("normal", normal), ("radius", radius)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "shape", shape)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @property
+    def active(self) -> NDArray[np.bool_]:
+        """Which probes [N] are none of the fillers."""
+        return self.radius > 0
+
+    @classmethod
+    def grid(
+        cls,
+        rows: int,
+        columns: int,
+        *,
+        size: tuple[float, float],
+        center: ArrayLike = (0.0, 0.0, 0.0),
+        normal: ArrayLike = (0.0, 0.0, 1.0),
+        along: ArrayLike = (1.0, 0.0, 0.0),
+        radius: float = 0.004,
+    ) -> Probes:
+        """Return a regular planar grid [rows, columns].
+
+        Args:
+            rows: number across ``along``.
+            columns: number along ``along``.
+            size: extent (along the rows' direction, along the columns' direction) between the outermost probes (m).
+            center: middle of the grid.
+            normal: out of the plane.
+            along: direction in which the column number grows; its part along the normal is removed.
+            radius: sensing radius (m).
+        """
+        if rows < 1 or columns < 1:
+            raise UsageError(f"A grid needs at least one row and one column; received {rows} × {columns}.")
+        n = np.asarray(normal, dtype=float)
+        n = n / np.linalg.norm(n)
+        u = np.asarray(along, dtype=float)
+        u = u - n * (u @ n)
+        if np.linalg.norm(u) < 1e-9:
+            raise UsageError(f"'along' {tuple(np.asarray(along))} is parallel to the normal; choose another direction.")
+        u = u / np.linalg.norm(u)
+        v = np.cross(n, u)
+        y = np.linspace(-0.5, 0.5, rows) * size[0] if rows > 1 else np.zeros(1)
+        x = np.linspace(-0.5, 0.5, columns) * size[1] if columns > 1 else np.zeros(1)
+        position = np.asarray(center, dtype=float) + y[:, None, None] * v + x[None, :, None] * u
+        count = rows * columns
+        pitch = (size[0] / max(rows - 1, 1), size[1] / max(columns - 1, 1))
+        return cls(position.reshape(-1, 3), np.tile(n, (count, 1)), np.full(count, radius), (rows, columns), pitch)
+
+    @classmethod
+    def on_mesh(
+        cls,
+        mesh: Mesh,
+        count: int,
+        *,
+        radius: float = 0.004,
+        facing: ArrayLike | None = None,
+        within: float = 90.0,
+        box: ArrayLike | None = None,
+        seed: int = 0,
+    ) -> Probes:
+        """Spread probes evenly over a patch of a mesh (in the link's frame), with its normals.
+
+        Args:
+            mesh: the surface.
+            count: number of probes.
+            radius: sensing radius (m).
+            facing: keep triangles whose normal lies within ``within`` degrees of this direction.
+            within: that angle (degrees).
+            box: keep triangles whose centre lies between two corners [2, 3] (m).
+            seed: of the sampling.
+
+        Raises:
+            UsageError: no triangle is left.
+        """
+        corners = mesh.vertices[mesh.faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1) / 2
+        keep = area > 0
+        normal = cross / np.maximum(2 * area, 1e-30)[:, None]
+        if facing is not None:
+            direction = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
+            keep &= normal @ direction >= np.cos(np.radians(within))
+        if box is not None:
+            low, high = np.asarray(box, dtype=float)
+            middle = corners.mean(axis=1)
+            keep &= ((middle >= low) & (middle <= high)).all(axis=1)
+        if not keep.any():
+            raise UsageError("No triangle of the mesh lies in the patch; widen 'within' or 'box', or turn 'facing'.")
+        points, faces = spread_over(corners[keep], area[keep], count, seed)
+        return cls(points, normal[keep][faces], np.full(count, radius))
+
+    def with_radius(self, radius: ArrayLike) -> Probes:
+        """Return the same places with other radii (m); fillers stay fillers."""
+        return Probes(self.position, self.normal, np.where(self.active, radius, 0.0), self.shape, self.pitch)
+
+
+def cover_evenly(corners: NDArray, area: NDArray, count: int) -> NDArray[np.float64]:
+    """Return points [count, 3] on triangles [F, 3, 3] with the same density everywhere, edges included.
+
+    Faces are taken at even steps of their summed area, places within them by the R2 sequence (Roberts 2018), so that
+    sums over the points converge faster than over random ones.
+    """
+    steps = (np.arange(count) + 0.5) / count
+    faces = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), steps), len(corners) - 1)
+    root = 1.32471795724474602596
+    u, v = (np.arange(1, count + 1)[:, None] / [root, root**2] % 1).T
+    # Fold the square onto the triangle.
+    over = u + v > 1
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    a, b, c = corners[faces].swapaxes(0, 1)
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a)
+
+
+def spread_over(corners: NDArray, area: NDArray, count: int, seed: int) -> tuple[NDArray, NDArray]:
+    """Return ``count`` evenly spread points [count, 3] on triangles [F, 3, 3], and their triangles.
+
+    Farthest-point selection among eight times as many area-weighted random points.
+    """
+    rng = np.random.default_rng(seed)
+    many = 8 * count if count <= 4000 else count
+    faces = rng.choice(len(corners), many, p=area / area.sum())
+    u, v = np.sqrt(rng.random(many)), rng.random(many)
+    a, b, c = corners[faces].swapaxes(0, 1)
+    points = a * (1 - u)[:, None] + b * (u * (1 - v))[:, None] + c * (u * v)[:, None]
+    if many == count:
+        return points, faces
+    chosen = np.zeros(count, dtype=int)
+    distance = np.linalg.norm(points - points[0], axis=1)
+    for index in range(1, count):
+        chosen[index] = int(distance.argmax())
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[index]], axis=1))
+    return points[chosen], faces[chosen]

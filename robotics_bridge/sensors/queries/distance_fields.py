@@ -1,0 +1,93 @@
+"""Sampled distance fields of meshes: built when asked for, kept in the user's cache by content. Metres."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from brainbench.core.errors import UsageError
+from brainbench.core.files import atomic_path, cache_dir
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.geometry import Mesh
+
+_log = logging.getLogger(__name__)
+_FORMAT = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """Signed distances on a regular grid around a mesh."""
+
+    values: NDArray[np.float32]
+    """[nx, ny, nz] (m), negative inside."""
+    origin: NDArray[np.float32]
+    """Position [3] of the first sample (m)."""
+    spacing: float
+    """Distance of neighbouring samples (m)."""
+
+
+def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field:
+    """Return the distance field of a closed mesh, from the cache if it was sampled before.
+
+    Args:
+        mesh: its surface; where it has holes, inside is where its winding number exceeds one half.
+        resolution: cells along the longest edge of the bounding box; the grid extends a quarter of that edge beyond the
+            box on every side, further out distances are extrapolated.
+        device: where it is computed.
+
+    Raises:
+        UsageError: the resolution is below 4 or above 512.
+    """
+    if not 4 <= resolution <= 512:
+        raise UsageError(f"The resolution of a distance field lies between 4 and 512 cells; received {resolution}.")
+    low, high = mesh.bounds
+    spacing = float((high - low).max()) / resolution
+    counts = np.ceil((high - low) / spacing).astype(int) + 1 + 2 * max(4, -(-resolution // 4))
+    origin = (0.5 * (low + high) - 0.5 * spacing * (counts - 1)).astype(np.float32)
+    path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npy"
+    if path.is_file():
+        try:
+            values = np.load(path, allow_pickle=False)
+            if values.shape == tuple(counts):
+                return Field(values, origin, spacing)
+        except (OSError, ValueError) as error:
+            _log.warning("The cached distance field %s cannot be read (%s); it is sampled again.", path, error)
+    values = _sample(mesh, origin, spacing, counts, device)
+    with atomic_path(path) as temporary:
+        np.save(temporary, values)
+    return Field(values, origin, spacing)
+
+
+def mesh_tree(mesh: Mesh, device: Any, *, winding: bool = False) -> Any:
+    """Return a ``warp.Mesh``: the triangles with their search tree."""
+    wp = warp()
+    return wp.Mesh(
+        points=wp.array(mesh.vertices.astype(np.float32), dtype=wp.vec3f, device=device),
+        indices=wp.array(mesh.faces.astype(np.int32).ravel(), dtype=wp.int32, device=device),
+        support_winding_number=winding,
+    )
+
+
+def _sample(mesh: Mesh, origin: NDArray, spacing: float, counts: NDArray, device: Any) -> NDArray[np.float32]:
+    wp = warp()
+    tree = mesh_tree(mesh, device, winding=True)
+    values = wp.zeros(tuple(int(n) for n in counts), dtype=wp.float32, device=device)
+    reach = 4 * float(spacing * counts.max())
+    inputs = [tree.id, wp.vec3f(*origin.tolist()), spacing, reach, values]
+    wp.launch(_field_kernel(), dim=values.shape, inputs=inputs, device=device)
+    return values.numpy()
+
+
+@cache
+def _field_kernel() -> Any:
+    from robotics_bridge.sensors.queries.kernels.distance_field import field_kernel
+
+    return field_kernel()

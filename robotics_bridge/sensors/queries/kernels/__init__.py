@@ -1,0 +1,1 @@
+"""Warp functions of distances and contact pairs."""

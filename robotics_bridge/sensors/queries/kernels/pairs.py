@@ -1,0 +1,248 @@
+"""Which geometries a sensor link meets in every environment, and how they lie and move relative to it.
+
+A slot is one sensor link with the geometries it may meet. Its list holds, per environment, those in contact (or all
+that are near), each with the transform from link to geometry frame and the relative velocity, so that taxels need no
+pose arithmetic of their own. Letters: B environment, S slot, P place in the lists of all slots, W word of touch bits.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from robotics_bridge.physics.kernels.state import state_kernels
+from robotics_bridge.sensors.queries.kernels.distance import PLANE, query_structs
+
+
+@cache
+def pair_structs() -> SimpleNamespace:
+    """Return the structures ``Slots`` (the plan) and ``Pairs`` (what was found)."""
+    import warp as wp
+
+    @wp.struct
+    class Slots:
+        link: wp.array(dtype=wp.int32)
+        watched: wp.array(dtype=wp.int32)
+        contact: wp.array(dtype=wp.int32)
+        first: wp.array(dtype=wp.int32)
+        room: wp.array(dtype=wp.int32)
+        members: wp.array(dtype=wp.int32)
+        member_first: wp.array(dtype=wp.int32)
+        place: wp.array2d(dtype=wp.int32)
+        center: wp.array(dtype=wp.vec3f)
+        reach: wp.array(dtype=wp.float32)
+
+    @wp.struct
+    class Pairs:
+        count: wp.array2d(dtype=wp.int32)
+        first: wp.array(dtype=wp.int32)
+        geometry: wp.array2d(dtype=wp.int32)
+        rotation: wp.array2d(dtype=wp.mat33f)
+        offset: wp.array2d(dtype=wp.vec3f)
+        velocity: wp.array2d(dtype=wp.vec3f)
+        spin: wp.array2d(dtype=wp.vec3f)
+
+    return SimpleNamespace(Slots=Slots, Pairs=Pairs)
+
+
+@cache
+def begin_kernel() -> SimpleNamespace:
+    """Return the kernel ``begin`` that counts the update and ``reset`` that starts episodes. Dim [B]."""
+    import warp as wp
+
+    @wp.kernel(module="unique")
+    def begin(age: wp.array(dtype=wp.int32)):
+        env = wp.tid()
+        age[env] = age[env] + 1
+
+    @wp.kernel(module="unique")
+    def reset(mask: wp.array(dtype=wp.bool), age: wp.array(dtype=wp.int32), episode: wp.array(dtype=wp.int32)):
+        env = wp.tid()
+        if mask[env]:
+            age[env] = -1
+            episode[env] = episode[env] + 1
+
+    return SimpleNamespace(begin=begin, reset=reset)
+
+
+CONTACTS = 4
+"""Contacts that one thread looks at, so that it waits for memory once for all of them."""
+
+
+@cache
+def start_kernel(contacts: bool, apart: bool) -> Any:
+    """Return the kernel ``start`` of an update: counts it, checks the state and marks who touches whom.
+
+    One launch for three small tasks, since launches are what small updates cost. Dim [max(B, C / CONTACTS)], or [B]
+    without ``contacts``.
+
+    Args:
+        contacts: whether any slot looks at them.
+        apart: whether :func:`pair_kernel` looks at the numbers of the state, a thread for each link.
+    """
+    import warp as wp
+
+    slots_type, status_of = pair_structs().Slots, state_kernels().status_of
+
+    @wp.func
+    def mark(slots: slots_type, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
+        for slot in range(slots.link.shape[0]):
+            if slots.contact[slot] == 1 and slots.link[slot] == link:
+                place = slots.place[slot, other]
+                if place >= 0:
+                    word = slot * words + place // 32
+                    bit = wp.int32(1) << wp.int32(place % 32)
+                    if (bits[env, word] & bit) == 0:
+                        wp.atomic_or(bits, env, word, bit)
+
+    @wp.kernel(module="unique", grid_stride=False)
+    def start(
+        slots: slots_type,
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+        count: wp.array(dtype=wp.int32),
+        geometry: wp.array(dtype=wp.vec2i),
+        owner: wp.array(dtype=wp.int32),
+        words: int,
+        bits: wp.array2d(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
+        age: wp.array(dtype=wp.int32),
+    ):
+        tid = wp.tid()
+        if tid < pose.shape[0]:
+            age[tid] = age[tid] + 1
+            if wp.static(apart):
+                status[tid] = wp.where(count[0] > owner.shape[0], 2, 0)
+            else:
+                status[tid] = status_of(pose, velocity, tid, count[0], owner.shape[0])
+        if wp.static(contacts):
+            # All is asked for before anything is looked at; neighbouring threads read neighbouring contacts.
+            threads = (owner.shape[0] + wp.static(CONTACTS - 1)) // wp.static(CONTACTS)
+            if tid < threads:
+                one = wp.vec4i(-1)
+                two = wp.vec4i(-1)
+                envs = wp.vec4i(0)
+                for k in range(wp.static(CONTACTS)):
+                    at = tid + k * threads
+                    if at < owner.shape[0]:
+                        pair = geometry[at]
+                        one[k] = pair[0]
+                        two[k] = pair[1]
+                        envs[k] = owner[at]
+                first = wp.vec4i(-1)
+                second = wp.vec4i(-1)
+                # Two bits for each contact: whose contact with what is to be marked.
+                todo = int(0)
+                for k in range(wp.static(CONTACTS)):
+                    if tid + k * threads < count[0] and one[k] >= 0 and two[k] >= 0:
+                        first[k] = slots.watched[one[k]]
+                        second[k] = slots.watched[two[k]]
+                        if first[k] >= 0:
+                            todo = todo | (1 << (2 * k))
+                        if second[k] >= 0:
+                            todo = todo | (2 << (2 * k))
+                # Few are: the threads of a warp take theirs together, whichever of the contacts they are.
+                while todo != 0:
+                    env = int(0)
+                    link = int(-1)
+                    other = int(0)
+                    lowest = todo & (-todo)
+                    todo = todo - lowest
+                    for k in range(wp.static(CONTACTS)):
+                        if lowest == (1 << (2 * k)):
+                            env = envs[k]
+                            link = first[k]
+                            other = two[k]
+                        if lowest == (2 << (2 * k)):
+                            env = envs[k]
+                            link = second[k]
+                            other = one[k]
+                    mark(slots, env, link, other, words, bits)
+
+    return start
+
+
+@cache
+def pair_kernel(apart: bool) -> Any:
+    """Return the kernel ``pairs`` that lists what each slot meets, in the order of geometry numbers.
+
+    Dim [B S], and ``apart`` B L more threads, which look for numbers of the state that are not finite.
+    """
+    import warp as wp
+
+    structs = pair_structs()
+    slots_type, pairs_type, solids_type = structs.Slots, structs.Pairs, query_structs().Solids
+    link_fails = state_kernels().link_fails
+
+    @wp.kernel(module="unique", grid_stride=False)
+    def pairs(
+        slots: slots_type,
+        solids: solids_type,
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+        words: int,
+        bits: wp.array2d(dtype=wp.int32),
+        out: pairs_type,
+        crowded: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
+    ):
+        tid = wp.tid()
+        listed = pose.shape[0] * slots.link.shape[0]
+        if wp.static(apart):
+            if tid >= listed:
+                owner = (tid - listed) // pose.shape[1]
+                if link_fails(pose, velocity, owner, (tid - listed) % pose.shape[1]):
+                    wp.atomic_or(status, owner, 1)
+                return
+        env = tid // slots.link.shape[0]
+        slot = tid % slots.link.shape[0]
+        row = env % solids.kind.shape[0]
+        link = slots.link[slot]
+        here = pose[env, link]
+        origin = wp.transform_get_translation(here)
+        turn = wp.transform_get_rotation(here)
+        twist = velocity[env, link]
+        own_velocity = wp.vec3f(twist[0], twist[1], twist[2])
+        own_spin = wp.vec3f(twist[3], twist[4], twist[5])
+        first = slots.first[slot]
+        room = slots.room[slot]
+        members = slots.member_first[slot]
+        total = slots.member_first[slot + 1] - members
+        found = int(0)
+        word = int(0)
+        for place in range(total):
+            wanted = int(1)
+            if slots.contact[slot] == 1:
+                if place % 32 == 0:
+                    word = bits[env, slot * words + place // 32]
+                    if word != 0:
+                        bits[env, slot * words + place // 32] = 0
+                wanted = (word >> wp.int32(place % 32)) & 1
+            if wanted == 1:
+                geometry = slots.members[members + place]
+                there = pose[env, solids.link[geometry]]
+                frame = wp.transform_multiply(there, solids.frame[row, geometry])
+                relative = wp.transform_multiply(wp.transform_inverse(frame), here)
+                near = True
+                if slots.reach[slot] > 0.0 and solids.kind[row, geometry] != wp.static(PLANE):
+                    bound = solids.bound[row, geometry]
+                    center = wp.transform_point(relative, slots.center[slot])
+                    gap = wp.length(center - wp.vec3f(bound[0], bound[1], bound[2]))
+                    near = gap < bound[3] + slots.reach[slot]
+                if near:
+                    if found < room:
+                        other = velocity[env, solids.link[geometry]]
+                        spin = wp.vec3f(other[3], other[4], other[5])
+                        lever = origin - wp.transform_get_translation(there)
+                        speed = wp.vec3f(other[0], other[1], other[2]) + wp.cross(spin, lever) - own_velocity
+                        at = first + found
+                        out.geometry[env, at] = geometry
+                        out.rotation[env, at] = wp.quat_to_matrix(wp.transform_get_rotation(relative))
+                        out.offset[env, at] = wp.transform_get_translation(relative)
+                        out.velocity[env, at] = wp.quat_rotate_inv(turn, speed)
+                        out.spin[env, at] = wp.quat_rotate_inv(turn, spin - own_spin)
+                    found += 1
+        if found > room:
+            crowded[env] = 1
+        out.count[env, slot] = wp.min(found, room)
+
+    return pairs

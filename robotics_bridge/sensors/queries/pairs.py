@@ -1,0 +1,136 @@
+"""The plan of who may meet whom, and its refresh once per update for all sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, pair_kernel, pair_structs, start_kernel
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from robotics_bridge.physics.state import HandState
+    from robotics_bridge.sensors.queries.solids import Solids
+
+_LISTED = 16
+
+
+class PairTable:
+    """Lists, per environment and slot, the geometries that a sensor link meets.
+
+    Sensors on one link that track the same geometries in the same way share a slot. Arrays are made by
+    :meth:`freeze`, when all sensors have asked.
+    """
+
+    def __init__(self, solids: Solids, num_envs: int, device: Any) -> None:
+        self._solids, self._num_envs, self._device = solids, num_envs, device
+        self._slots: list[dict[str, Any]] = []
+        self.struct: Any = None
+        """The Warp structure ``Pairs``; None before :meth:`freeze`."""
+        self.plan: Any = None
+        """The Warp structure ``Slots``; None before :meth:`freeze`."""
+        self.crowded: Any = None
+        """Warp array [B]: 1 where more geometries met a sensor than its list holds."""
+
+    def slot(
+        self,
+        link: int,
+        members: Sequence[int],
+        *,
+        contact: bool,
+        center: ArrayLike = (0.0, 0.0, 0.0),
+        reach: float = 0.0,
+    ) -> int:
+        """Return the number of the slot for a sensor link.
+
+        Args:
+            link: number of the sensor link.
+            members: geometries it may meet.
+            contact: list those in contact only; otherwise all within reach.
+            center: middle of the probes in the link frame (m).
+            reach: how far beyond it a geometry can matter (m); 0 lists all.
+        """
+        wanted = {"link": link, "members": tuple(members), "contact": contact}
+        for number, slot in enumerate(self._slots):
+            if all(slot[key] == value for key, value in wanted.items()) and (contact or reach == slot["reach"] == 0):
+                return number
+        self._slots.append({**wanted, "center": np.asarray(center, np.float32), "reach": float(reach)})
+        return len(self._slots) - 1
+
+    @property
+    def contacts_needed(self) -> bool:
+        """Whether any slot looks at the contact list."""
+        return any(slot["contact"] for slot in self._slots)
+
+    @property
+    def _apart(self) -> bool:
+        # A processor gains nothing from more threads.
+        return self.contacts_needed and bool(self._device.is_cuda)
+
+    @property
+    def state_bytes(self) -> int:
+        """Memory per environment [bytes]."""
+        return 4 * (sum(self._rooms) * 19 + len(self._slots) * (1 + self._words))
+
+    def freeze(self) -> None:
+        """Make the arrays."""
+        wp, device, slots = warp(), self._device, self._slots
+        # Contacts of one link with many geometries at once are rare; all of a short list always fit.
+        self._rooms = [max(1, min(len(s["members"]), _LISTED) if s["contact"] else len(s["members"])) for s in slots]
+        self._words = max([1, *(-(-len(s["members"]) // 32) for s in slots)])
+        count = len(slots)
+        geometries = self._solids.kinds.shape[1]
+        place = np.full((max(count, 1), geometries), -1, np.int32)
+        for number, slot in enumerate(slots):
+            place[number, list(slot["members"])] = np.arange(len(slot["members"]))
+
+        def ints(values: Any) -> Any:
+            return wp.array(np.asarray(values, dtype=np.int32).reshape(-1), dtype=wp.int32, device=device)
+
+        plan = pair_structs().Slots()
+        plan.link, plan.contact = ints([s["link"] for s in slots]), ints([int(s["contact"]) for s in slots])
+        # The link of every geometry whose contacts matter, to turn the others away at once.
+        links = self._solids.scene.link_of if self._solids.scene.geometries else np.full(1, -1)
+        plan.watched = ints(np.where(np.isin(links, [s["link"] for s in slots if s["contact"]]), links, -1))
+        first = np.cumsum([0, *self._rooms])
+        plan.first, plan.room = ints(first), ints(self._rooms)
+        plan.members = ints([m for s in slots for m in s["members"]] or [0])
+        plan.member_first = ints(np.cumsum([0, *(len(s["members"]) for s in slots)]))
+        plan.place = wp.array(place, dtype=wp.int32, device=device)
+        centers = np.array([s["center"] for s in slots], np.float32).reshape(-1, 3)
+        plan.center = wp.array(centers, dtype=wp.vec3f, device=device)
+        plan.reach = wp.array(np.array([s["reach"] for s in slots], np.float32), dtype=wp.float32, device=device)
+        self.plan = plan
+        shape = (self._num_envs, max(int(first[-1]), 1))
+        found = pair_structs().Pairs()
+        found.first = plan.first
+        found.count = wp.zeros((self._num_envs, max(count, 1)), dtype=wp.int32, device=device)
+        found.geometry = wp.zeros(shape, dtype=wp.int32, device=device)
+        found.rotation = wp.zeros(shape, dtype=wp.mat33f, device=device)
+        for name in ("offset", "velocity", "spin"):
+            setattr(found, name, wp.zeros(shape, dtype=wp.vec3f, device=device))
+        self.struct = found
+        self._bits = wp.zeros((self._num_envs, max(count, 1) * self._words), dtype=wp.int32, device=device)
+        self.crowded = wp.zeros(self._num_envs, dtype=wp.int32, device=device)
+
+    def start(self, state: HandState, age: Any) -> None:
+        """Count an update, refresh the state's status and mark contacts."""
+        wp, contacts = warp(), self.contacts_needed
+        room = state.contact_env.shape[0]
+        inputs = [self.plan, state.pose, state.velocity, state.contact_count]
+        inputs += [state.contact_geom, state.contact_env, self._words, self._bits, state.status, age]
+        dim = max(self._num_envs, -(-room // CONTACTS)) if contacts else self._num_envs
+        wp.launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
+
+    def update(self, state: HandState) -> None:
+        """List what every slot meets now; contacts were marked by :meth:`start`."""
+        if not self._slots:
+            return
+        wp, solids = warp(), self._solids.struct
+        inputs = [self.plan, solids, state.pose, state.velocity, self._words, self._bits, self.struct, self.crowded]
+        dim = self._num_envs * (len(self._slots) + self._apart * state.pose.shape[1])
+        wp.launch(pair_kernel(self._apart), dim=dim, inputs=[*inputs, state.status], device=self._device)

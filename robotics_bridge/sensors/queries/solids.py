@@ -1,0 +1,182 @@
+"""The geometries of a scene on a device, with distance fields and triangle trees only where sensors ask for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from brainbench.core.errors import UsageError
+from robotics_bridge.physics.scene import KINDS, Geometry
+from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
+from robotics_bridge.sensors.queries.kernels.distance import OTHER, query_structs
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.geometry import Mesh
+    from robotics_bridge.physics.scene import Scene
+
+_UNBOUNDED = 1.0e6
+
+
+def bounding_sphere(geometry: Geometry) -> NDArray[np.float32]:
+    """Return centre and radius (x, y, z, r) [m] of a sphere around a geometry, in its own frame."""
+    size = (*geometry.size, 0.0, 0.0, 0.0)
+    center, radius = np.zeros(3), _UNBOUNDED
+    if geometry.kind == "sphere":
+        radius = size[0]
+    elif geometry.kind == "capsule":
+        radius = size[0] + size[1]
+    elif geometry.kind == "cylinder":
+        radius = float(np.hypot(size[0], size[1]))
+    elif geometry.kind == "ellipsoid":
+        radius = max(size)
+    elif geometry.kind == "box":
+        radius = float(np.linalg.norm(size[:3]))
+    elif geometry.mesh is not None:
+        center = geometry.mesh.bounds.mean(axis=0)
+        radius = float(np.linalg.norm(geometry.mesh.vertices - center, axis=1).max())
+    return np.array([*center, radius], dtype=np.float32)
+
+
+def tessellate(geometry: Geometry) -> Mesh:
+    """Return the surface of a geometry as triangles; curved ones lie within 0.1 % of their radius."""
+    import trimesh
+
+    from brainbench.geometry import Mesh
+
+    if geometry.mesh is not None:
+        return geometry.mesh
+    size = geometry.size
+    if geometry.kind == "box":
+        solid = trimesh.creation.box(2 * np.asarray(size))
+    elif geometry.kind == "sphere":
+        solid = trimesh.creation.icosphere(4, size[0])
+    elif geometry.kind == "ellipsoid":
+        solid = trimesh.creation.icosphere(4, 1.0)
+        solid.apply_scale(size)
+    elif geometry.kind == "cylinder":
+        solid = trimesh.creation.cylinder(size[0], 2 * size[1], sections=96)
+    elif geometry.kind == "capsule":
+        solid = trimesh.creation.capsule(2 * size[1], size[0], count=[96, 48])
+        solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
+    else:
+        raise UsageError(f"A {geometry.kind} ({geometry.name!r}) has no triangles to query; use query='sdf'.")
+    return Mesh(solid.vertices, solid.faces, geometry.name)
+
+
+class Solids:
+    """Device copy of a scene's geometries.
+
+    Args:
+        scene: what there is.
+        num_envs: B; geometries that differ between environments take one row each.
+        device: where.
+        fields: numbers of geometries whose distance is asked for (meshes among them get a sampled field).
+        trees: numbers of geometries whose triangles are asked for.
+        resolution: of the fields.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int,
+        device: Any,
+        *,
+        fields: Iterable[int] = (),
+        trees: Iterable[int] = (),
+        resolution: int = 64,
+    ) -> None:
+        wp = warp()
+        self.scene, self.device = scene, device
+        self.rows = num_envs if scene.variants else 1
+        self.field_count = 0
+        """Distance fields on the device."""
+        self.tree_count = 0
+        """Triangle trees on the device."""
+        count = max(len(scene.geometries), 1)
+        shape = (self.rows, count)
+        self.kinds = np.full(shape, OTHER, dtype=np.int32)
+        size, bound = np.ones((*shape, 3), np.float32), np.zeros((*shape, 4), np.float32)
+        frame = np.zeros((*shape, 7), np.float32)
+        frame[..., 6] = 1
+        field, mesh = np.full(shape, -1, np.int32), np.zeros(shape, np.uint64)
+        wanted, treed = set(fields), set(trees)
+        found: dict[str, int] = {}
+        self._fields: list[Field] = []
+        self._trees: dict[str, Any] = {}
+        for index in range(len(scene.geometries)):
+            seen: dict[int, tuple] = {}
+            for row in range(self.rows if index in scene.variants else 1):
+                geometry = scene.geometry_in(row, index)
+                if id(geometry) not in seen:
+                    seen[id(geometry)] = self._describe(geometry, index in wanted, index in treed, found, resolution)
+                rows = row if index in scene.variants else slice(None)
+                described = seen[id(geometry)]
+                self.kinds[rows, index], size[rows, index], bound[rows, index] = described[:3]
+                frame[rows, index], field[rows, index], mesh[rows, index] = described[3:]
+        self.field_count, self.tree_count = len(self._fields), len(self._trees)
+        s = query_structs().Solids()
+        s.kind = wp.array(self.kinds, dtype=wp.int32, device=device)
+        s.size = wp.array(size, dtype=wp.vec3f, device=device)
+        s.frame = wp.array(frame, dtype=wp.transformf, device=device)
+        s.bound = wp.array(bound, dtype=wp.vec4f, device=device)
+        links = scene.link_of if scene.geometries else np.zeros(1, np.int32)
+        s.link = wp.array(links, dtype=wp.int32, device=device)
+        s.field = wp.array(field, dtype=wp.int32, device=device)
+        s.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
+        volumes = self._fields or [Field(np.zeros((2, 2, 2), np.float32), np.zeros(3, np.float32), 1.0)]
+        starts = np.cumsum([0, *(v.values.size for v in volumes)])
+        if starts[-1] >= 2**31:
+            raise UsageError("The distance fields hold more than 2³¹ samples together; lower the resolution.")
+        s.first = wp.array(starts[:-1].astype(np.int32), dtype=wp.int32, device=device)
+        s.counts = wp.array(np.array([v.values.shape for v in volumes], np.int32), dtype=wp.vec3i, device=device)
+        s.origin = wp.array(np.array([v.origin for v in volumes], np.float32), dtype=wp.vec3f, device=device)
+        s.spacing = wp.array(np.array([v.spacing for v in volumes], np.float32), dtype=wp.float32, device=device)
+        s.values = wp.array(np.concatenate([v.values.ravel() for v in volumes]), dtype=wp.float32, device=device)
+        self.struct: Any = s
+        """The Warp structure that kernels take."""
+
+    def kinds_of(self, geometries: Iterable[int]) -> frozenset[int]:
+        """Return the kinds (numbers) that some geometries take in any environment.
+
+        Raises:
+            UsageError: one of them is of a kind that no sensor can query.
+        """
+        chosen = list(geometries)
+        kinds = frozenset(self.kinds[:, chosen].ravel().tolist()) if chosen else frozenset()
+        if OTHER in kinds:
+            culprit = next(g for g in chosen if (self.kinds[:, g] == OTHER).any())
+            raise UsageError(
+                f"The geometry {self.scene.geometries[culprit].name!r} is of a kind that no sensor can query (height "
+                "fields and engine-made surfaces); turn it into a mesh or leave it out of what the sensor tracks."
+            )
+        return kinds
+
+    def _describe(self, geometry: Geometry, field: bool, tree: bool, found: dict[str, int], resolution: int) -> tuple:
+        number, mesh = -1, 0
+        if field and geometry.mesh is not None:
+            key = geometry.mesh.content_hash
+            if key not in found:
+                found[key] = len(self._fields)
+                self._fields.append(sample_field(geometry.mesh, resolution, self.device))
+            number = found[key]
+        if tree and geometry.kind not in ("plane", "other"):
+            surface = tessellate(geometry)
+            key = surface.content_hash
+            if key not in self._trees:
+                self._trees[key] = mesh_tree(surface, self.device)
+            mesh = self._trees[key].id
+        w, x, y, z = geometry.quaternion
+        size = np.array([*geometry.size, 0.0, 0.0, 0.0][:3], np.float32)
+        return (
+            KINDS.index(geometry.kind),
+            size,
+            bounding_sphere(geometry),
+            (*geometry.position, x, y, z, w),
+            number,
+            mesh,
+        )

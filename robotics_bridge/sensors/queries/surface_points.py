@@ -1,0 +1,126 @@
+"""Surface points of geometries, in neighbourly blocks that a query can skip as a whole. Geometry frame, metres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.probes.placement import cover_evenly
+from robotics_bridge.sensors.queries.solids import tessellate
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robotics_bridge.physics.scene import Geometry, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points of one sensor's tracked geometries, on a device."""
+
+    struct: Any
+    """Warp structure ``Cloud``."""
+    total: int
+    """Most points that any environment has."""
+    counts: NDArray[np.int64]
+    """Points [R] per variant row."""
+
+
+def surface_points(geometry: Geometry, count: int) -> NDArray[np.float64]:
+    """Return evenly spread points [count, 3] on the surface of a geometry (m, its own frame)."""
+    mesh = tessellate(geometry)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    return cover_evenly(corners, area, count)
+
+
+def sample_cloud(scene: Scene, geometries: Sequence[int], points: int, rows: int, device: Any) -> Cloud:
+    """Spread ``points`` over geometries in proportion to their areas, row by row of variants.
+
+    Planes are left out: they have no end.
+    """
+    wp = warp()
+    sampled: dict[tuple[int, int], NDArray] = {}
+    first, blocks, coordinates, spheres = [], [], [], []
+    counts = np.zeros(rows, np.int64)
+    start = block = total = 0
+    layout: dict[tuple, tuple[int, int]] = {}
+    for row in range(rows):
+        shapes = {g: scene.geometry_in(row, g) for g in geometries}
+        shapes = {g: shape for g, shape in shapes.items() if shape.kind not in ("plane", "other")}
+        areas = {g: surface_area(shape) for g, shape in shapes.items()}
+        whole = sum(areas.values()) or 1.0
+        row_first = np.zeros(len(scene.geometries) or 1, np.int32)
+        row_blocks = np.zeros(len(scene.geometries) or 1, np.int32)
+        place = 0
+        for g, shape in shapes.items():
+            share = max(1, round(points * areas[g] / whole))
+            key = (id(shape), share)
+            if key not in layout:
+                if key not in sampled:
+                    sampled[key] = _in_blocks(surface_points(shape, share))
+                cloud = sampled[key]
+                layout[key] = (block, len(cloud) // BLOCK)
+                coordinates.append(cloud)
+                spheres.append(_spheres(cloud))
+                block += len(cloud) // BLOCK
+            row_first[g], row_blocks[g] = layout[key]
+            counts[row] += share
+            place += len(sampled[key])
+        total = max(total, place)
+        first.append(row_first)
+        blocks.append(row_blocks)
+        start += place
+    s = cloud_structs().Cloud()
+    empty = np.zeros((0, 3), np.float32)
+    s.point = wp.array(np.concatenate([empty, *coordinates]).astype(np.float32), dtype=wp.vec3f, device=device)
+    bounds = np.concatenate([np.zeros((0, 4), np.float32), *spheres]).astype(np.float32)
+    s.sphere = wp.array(bounds, dtype=wp.vec4f, device=device)
+    s.first = wp.array(np.stack(first), dtype=wp.int32, device=device)
+    s.blocks = wp.array(np.stack(blocks), dtype=wp.int32, device=device)
+    return Cloud(s, total, counts)
+
+
+def surface_area(geometry: Geometry) -> float:
+    """Return the surface area of a geometry [m²]."""
+    mesh = tessellate(geometry)
+    corners = mesh.vertices[mesh.faces]
+    return float(
+        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    )
+
+
+def halve(points: NDArray, order: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
+    """Cut points [P, 3], of which ``order`` are taken, across their longest side until no part has over ``most``."""
+    if len(order) <= most:
+        return [order]
+    chosen = points[order]
+    axis = int(np.ptp(chosen, axis=0).argmax())
+    ranked = order[np.argsort(chosen[:, axis], kind="stable")]
+    middle = len(order) // 2
+    return halve(points, ranked[:middle], most) + halve(points, ranked[middle:], most)
+
+
+def _in_blocks(points: NDArray) -> NDArray[np.float32]:
+    """Order points along a space-filling curve and fill the last block up with NaN."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    cells = ((points - low) / np.maximum((high - low).max(), 1e-12) * 1023).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    ordered = points[np.argsort(code, kind="stable")]
+    missing = -len(points) % BLOCK
+    return np.concatenate([ordered, np.full((missing, 3), np.nan)]).astype(np.float32)
+
+
+def _spheres(points: NDArray) -> NDArray[np.float32]:
+    grouped = points.reshape(-1, BLOCK, 3)
+    center = 0.5 * (np.nanmin(grouped, axis=1) + np.nanmax(grouped, axis=1))
+    radius = np.nanmax(np.linalg.norm(grouped - center[:, None], axis=2), axis=1)
+    return np.concatenate([center, radius[:, None]], axis=1).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Taxels: kinematic force and torque, and proximity."""

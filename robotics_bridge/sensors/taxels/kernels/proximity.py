@@ -1,0 +1,249 @@
+"""Surface points in blocks of neighbours, and the proximity taxel that sums over them (thesis 4.11–4.16)."""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from robotics_bridge.sensors.kernels.readout import CLEAN, io_functions, io_structs
+from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+from robotics_bridge.sensors.queries.kernels.pairs import pair_structs
+
+BLOCK = 32
+"""Points of a block."""
+CELL = 16
+"""Neighbouring probes that ask for the points around them together."""
+
+
+@cache
+def cloud_structs() -> SimpleNamespace:
+    """Return the structure ``Cloud``: points, a bounding sphere per block, and the blocks of a geometry per row."""
+    import warp as wp
+
+    @wp.struct
+    class Cloud:
+        point: wp.array(dtype=wp.vec3f)
+        sphere: wp.array(dtype=wp.vec4f)
+        first: wp.array2d(dtype=wp.int32)
+        blocks: wp.array2d(dtype=wp.int32)
+
+    @wp.struct
+    class ProximityParams:
+        stiffness: wp.float32
+        coupling: wp.float32
+
+    return SimpleNamespace(Cloud=Cloud, ProximityParams=ProximityParams)
+
+
+@cache
+def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, gathered: bool = False) -> Any:
+    """Return the kernel of ProximityTaxel. Dim [B, N], or [B] if ``gathered``.
+
+    Args:
+        physical: convention of the forces.
+        mode: of the readout.
+        hysteresis: whether it is stored.
+        walk: whether it is stored.
+        gathered: a thread serves all probes of an environment, and lists the points around each cell of neighbouring
+            probes before these look at them. The terms of a sum, and their order, are the same.
+    """
+    import warp as wp
+
+    io = io_functions(mode, hysteresis, walk)
+    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
+    types, pairs_type, structs = io_structs(), pair_structs().Pairs, cloud_structs()
+    probes_type, io_type = types.ProbeSet, types.Io
+    cloud_type, law_type = structs.Cloud, structs.ProximityParams
+    noise = noise_functions()
+    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
+
+    @wp.func
+    def wrench(
+        law: law_type, density: float, x: wp.vec3f, normal: wp.vec3f, mass: float, moment: wp.vec3f, slip: wp.vec3f
+    ) -> wp.spatial_vectorf:
+        """Force and torque of the summed overlaps: ``mass`` ΣP, ``moment`` ΣP (p − x), ``slip`` ΣP v."""
+        push = law.stiffness * density * mass
+        drag = law.coupling * density * (slip - wp.dot(slip, normal) * normal)
+        turn = law.stiffness * density * wp.cross(moment, normal)
+        f = push * normal + drag
+        if wp.static(physical):
+            f = drag - push * normal
+            turn = wp.cross(x, f) - turn
+        return wp.spatial_vectorf(f[0], f[1], f[2], turn[0], turn[1], turn[2])
+
+    @wp.func
+    def overlap(far: float, radius: float, noisy: float) -> wp.vec2f:
+        """Overlap of a point with the sensing sphere, and with that of the measured branch."""
+        if wp.static(mode == CLEAN):
+            return wp.vec2f(wp.max(radius - far, 0.0), 0.0)
+        return wp.vec2f(wp.max(radius - far, 0.0), wp.max(noisy - far, 0.0))
+
+    @wp.func
+    def feel(
+        probes: probes_type,
+        pairs: pairs_type,
+        cloud: cloud_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        laws: wp.array(dtype=law_type),
+        densities: wp.array2d(dtype=wp.float32),
+        links: wp.array(dtype=wp.int32),
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+        near: wp.array2d(dtype=wp.int32),
+        env: int,
+        n: int,
+    ):
+        """Read one probe. ``near`` lists its points by pair, each list ended by −1; only read if gathered."""
+        radius = probes.radius[n]
+        if radius <= 0.0:
+            idle(io, 6, env, n)
+        elif (io.status[env] & 1) != 0:
+            lost(io, 6, env, n)
+        else:
+            row = env % cloud.first.shape[0]
+            slot = probes.slot[n]
+            part = probes.part[n]
+            probe = probes.probe[n]
+            x = probes.position[n]
+            age = io.age[env]
+            episode = io.episode[env]
+            noisy = radius
+            if wp.static(mode != CLEAN):
+                noisy = wp.max(radius + radius_noise(knobs[part], env + io.env_offset, probe, age, episode), 0.0)
+            reach = wp.max(radius, noisy)
+            own = wp.vec3f(0.0)
+            mass = wp.vec2f(0.0)
+            moment = wp.vec3f(0.0)
+            moment_noisy = wp.vec3f(0.0)
+            slip = wp.vec3f(0.0)
+            slip_noisy = wp.vec3f(0.0)
+            cursor = int(0)
+            for k in range(pairs.count[env, slot]):
+                at = pairs.first[slot] + k
+                geometry = pairs.geometry[env, at]
+                rotation = pairs.rotation[env, at]
+                here = rotation @ x + pairs.offset[env, at]
+                own_mass = wp.vec2f(0.0)
+                lever = wp.vec3f(0.0)
+                lever_noisy = wp.vec3f(0.0)
+                if wp.static(gathered):
+                    index = near[env, cursor]
+                    cursor += 1
+                    while index >= 0:
+                        away = cloud.point[index] - here
+                        square = wp.dot(away, away)
+                        if square < reach * reach:
+                            overlaps = overlap(wp.sqrt(square), radius, noisy)
+                            own_mass += overlaps
+                            lever += overlaps[0] * away
+                            if wp.static(mode != CLEAN):
+                                lever_noisy += overlaps[1] * away
+                        index = near[env, cursor]
+                        cursor += 1
+                else:
+                    first = cloud.first[row, geometry]
+                    for block in range(cloud.blocks[row, geometry]):
+                        sphere = cloud.sphere[first + block]
+                        gap = here - wp.vec3f(sphere[0], sphere[1], sphere[2])
+                        limit = reach + sphere[3]
+                        if wp.dot(gap, gap) < limit * limit:
+                            for i in range(wp.static(BLOCK)):
+                                away = cloud.point[(first + block) * wp.static(BLOCK) + i] - here
+                                square = wp.dot(away, away)
+                                # A comparison with NaN, which fills the last block, is false.
+                                if square < reach * reach:
+                                    overlaps = overlap(wp.sqrt(square), radius, noisy)
+                                    own_mass += overlaps
+                                    lever += overlaps[0] * away
+                                    if wp.static(mode != CLEAN):
+                                        lever_noisy += overlaps[1] * away
+                if own_mass[0] > 0.0 or own_mass[1] > 0.0:
+                    link = links[part]
+                    twist = velocity[env, link]
+                    turn = wp.transform_get_rotation(pose[env, link])
+                    own = wp.quat_rotate_inv(turn, wp.vec3f(twist[3], twist[4], twist[5]))
+                    # Points turn with their own link, not with the difference of both.
+                    spin = pairs.spin[env, at] + own
+                    speed = pairs.velocity[env, at] + wp.cross(pairs.spin[env, at], x)
+                    lever = wp.transpose(rotation) @ lever
+                    mass += own_mass
+                    moment += lever
+                    slip += own_mass[0] * speed + wp.cross(spin, lever)
+                    if wp.static(mode != CLEAN):
+                        lever_noisy = wp.transpose(rotation) @ lever_noisy
+                        moment_noisy += lever_noisy
+                        slip_noisy += own_mass[1] * speed + wp.cross(spin, lever_noisy)
+            density = densities[part, row]
+            normal = probes.normal[n]
+            truth = wrench(laws[part], density, x, normal, mass[0], moment, slip)
+            signal = truth
+            fixed = wp.vec3f(1.0, 0.0, 0.0)
+            if wp.static(mode != CLEAN):
+                fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
+                signal = fixed[0] * wrench(laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
+            lag, drift = recall_six(io, env, n, age)
+            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
+
+    @wp.kernel(module="unique")
+    def proximity(
+        probes: probes_type,
+        pairs: pairs_type,
+        cloud: cloud_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        laws: wp.array(dtype=law_type),
+        densities: wp.array2d(dtype=wp.float32),
+        links: wp.array(dtype=wp.int32),
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+        near: wp.array2d(dtype=wp.int32),
+    ):
+        env, n = wp.tid()
+        feel(probes, pairs, cloud, io, knobs, laws, densities, links, pose, velocity, near, env, n)
+
+    @wp.kernel(module="unique")
+    def proximity_gathered(
+        probes: probes_type,
+        pairs: pairs_type,
+        cloud: cloud_type,
+        io: io_type,
+        knobs: wp.array(dtype=params_type),
+        laws: wp.array(dtype=law_type),
+        densities: wp.array2d(dtype=wp.float32),
+        links: wp.array(dtype=wp.int32),
+        pose: wp.array2d(dtype=wp.transformf),
+        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+        near: wp.array2d(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        cells: wp.array(dtype=wp.vec3i),
+        around: wp.array(dtype=wp.vec4f),
+    ):
+        env = wp.tid()
+        row = env % cloud.first.shape[0]
+        for c in range(cells.shape[0]):
+            cell = cells[c]
+            bound = around[c]
+            middle = wp.vec3f(bound[0], bound[1], bound[2])
+            found = int(0)
+            for k in range(pairs.count[env, cell[2]]):
+                at = pairs.first[cell[2]] + k
+                geometry = pairs.geometry[env, at]
+                here = pairs.rotation[env, at] @ middle + pairs.offset[env, at]
+                first = cloud.first[row, geometry]
+                for block in range(cloud.blocks[row, geometry]):
+                    sphere = cloud.sphere[first + block]
+                    gap = here - wp.vec3f(sphere[0], sphere[1], sphere[2])
+                    limit = bound[3] + sphere[3]
+                    if wp.dot(gap, gap) < limit * limit:
+                        for i in range(wp.static(BLOCK)):
+                            index = (first + block) * wp.static(BLOCK) + i
+                            away = cloud.point[index] - here
+                            if wp.dot(away, away) < bound[3] * bound[3]:
+                                near[env, found] = index
+                                found += 1
+                near[env, found] = -1
+                found += 1
+            for m in range(cell[0], cell[1]):
+                feel(probes, pairs, cloud, io, knobs, laws, densities, links, pose, velocity, near, env, members[m])
+
+    return proximity_gathered if gathered else proximity

@@ -1,0 +1,1 @@
+"""Temperature of a link in cells."""

@@ -1,0 +1,193 @@
+"""TemperatureGrid: the temperature field of a link in cells, warmed and cooled by what it touches (thesis 4.35–4.40).
+
+Every part of the heat balance is stepped exponentially or by secants, so that no time step is too long. Against
+the published equations: the mean of an insulated grid is kept (4.35 drains it), surface losses act through the
+exposed area and per cell volume (4.37), contact areas are areas, and the element's lag is exact (4.40).
+Temperatures in °C. Letters: B environment, N cell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.sensors.sensor import Sensor
+from robotics_bridge.sensors.temperature.materials import Body, ThermalMaterial, material
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+    from robotics_bridge.physics.scene import Geometry, Scene
+    from robotics_bridge.sensors.sensor import Context
+    from robotics_bridge.sensors.suite import SensorSuite
+    from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
+
+
+@dataclass(frozen=True, kw_only=True)
+class TemperatureGrid(Sensor):
+    """Temperature [nx, ny, nz] of the cells of a link (°C).
+
+    Raises:
+        UsageError: a number lies outside its range, or a material is unknown.
+    """
+
+    cells: tuple[int, int, int] = (2, 2, 2)
+    """Along the axes of the link."""
+    low: tuple[float, float, float] | None = None
+    """Lower corner of the grid [m, link frame]; None takes the box around the link's geometries."""
+    high: tuple[float, float, float] | None = None
+    """Upper corner [m, link frame]."""
+    material: str | ThermalMaterial = "silicone"
+    """Of the link."""
+    base_temperature: float = 22.0
+    """Of all cells at a reset [°C]."""
+    ambient_temperature: float = 22.0
+    """Of the surroundings [°C]."""
+    convection: float = 10.0
+    """Coefficient h [W/(m²·K)] over the outer faces; 0 for none. Radiation follows the material's emissivity."""
+    radiates: bool = True
+    """Whether outer faces radiate."""
+    source: Any = 0.0
+    """Heat made inside [W/m³]: one number, or an array [nx, ny, nz]."""
+    bodies: Mapping[str, Body] = field(default_factory=dict)
+    """Link → what it is made of, for links that may touch this one; all others are ``other``."""
+    other: Body = field(default_factory=Body)
+    """What every other link is made of."""
+    conduction: Literal["physical", "thesis"] = "physical"
+    """``physical``: the cell (half its depth, and the spreading of a small spot), the interface and the touched body
+    (a half-space that gave heat through the spot since the contact began) in series. ``thesis``: 4.38 and 4.39,
+    harmonic conductivity over the length V / A."""
+    contact_conductance: float = math.inf
+    """Of the bare interface [W/(m²·K)]; infinite is a perfect one."""
+    contact_radius: float = 0.005
+    """Radius R of the surfaces at a contact point [m]: the area of a contact of depth δ is π (2 R δ − δ²)."""
+    depth_weight: float = 1.0
+    """d_w of the published floor of the contact area, π d_w δ R with R supplied by ``contact_radius``."""
+    tau: float = 0.0
+    """Time constant of the sensing element [s]; 0 reads the cell itself."""
+    warm_range: float = math.inf
+    """How far above the base temperature the element reads [K]."""
+    cold_range: float = math.inf
+    """How far below it [K]; skin reads farther down than up."""
+
+    units: ClassVar[str] = "degC"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.cells) != 3 or any(int(n) != n or n < 1 for n in self.cells):
+            raise UsageError(f"A grid has three positive numbers of cells; received {self.cells!r}.")
+        if (self.low is None) != (self.high is None):
+            raise UsageError("Give both corners of the grid, low and high, or neither.")
+        if self.low is not None and self.high is not None and not all(a < b for a, b in zip(self.low, self.high)):  # noqa: B905
+            raise UsageError(f"The corners of the grid must differ along every axis; received {self.low}, {self.high}.")
+        for name in ("convection", "contact_conductance", "tau", "warm_range", "cold_range", "depth_weight"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
+        if not self.contact_radius > 0:
+            raise UsageError(f"contact_radius must be positive (m); received {self.contact_radius!r}.")
+        if not (math.isfinite(self.base_temperature) and math.isfinite(self.ambient_temperature)):
+            raise UsageError("Base and ambient temperature must be finite (°C).")
+        if self.conduction not in ("physical", "thesis"):
+            raise unknown_name("conduction", self.conduction, ("physical", "thesis"))
+        if np.shape(self.source) not in ((), tuple(self.cells)):
+            raise UsageError(f"source is a number or an array {tuple(self.cells)}; received {np.shape(self.source)}.")
+        for body in (*self.bodies.values(), self.other):
+            material(body.material)
+        material(self.material)
+
+    def layout(self) -> tuple[int, ...]:
+        """Shape (nx, ny, nz) of the reading of one environment."""
+        return tuple(int(n) for n in self.cells)
+
+    def group(self) -> Hashable:
+        """Grids that think alike of other links share one runtime."""
+        return (tuple(sorted(self.bodies.items(), key=lambda item: item[0])), self.other)
+
+    @classmethod
+    def build(cls, sensors: Mapping[str, Self], context: Context) -> TemperatureRuntime:
+        """Return the runtime that serves these sensors together."""
+        from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
+
+        return TemperatureRuntime(sensors, context)
+
+    def corners(self, scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the lower and upper corner of the grid [3] (m, link frame)."""
+        if self.low is not None and self.high is not None:
+            return np.array(self.low, float), np.array(self.high, float)
+        boxes = [_bounds(scene.geometries[index]) for index in scene.geometries_of(self.link)]
+        boxes = [box for box in boxes if np.isfinite(box).all()]
+        if not boxes:
+            raise UsageError(f"Link {self.link!r} has no geometry of finite size; give the grid its corners low, high.")
+        return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+
+
+def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
+    """Return the temperatures [B, L] (°C) of the links that a grid may touch, a view to write to.
+
+    Args:
+        suite: The sensors.
+        name: A TemperatureGrid of the suite.
+
+    Raises:
+        UsageError: the suite has no such temperature grid.
+    """
+    return warp().to_torch(_runtime(suite, name).link_temperature)
+
+
+def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
+    """Return how many contacts [B] of the last update a grid had no room for (it looks at 48).
+
+    Raises:
+        UsageError: the suite has no such temperature grid.
+    """
+    from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY
+
+    runtime = _runtime(suite, name)
+    column = list(runtime.places).index(name)
+    return (warp().to_torch(runtime.found_contacts)[:, column] - CAPACITY).clamp(min=0)
+
+
+def _runtime(suite: SensorSuite, name: str) -> TemperatureRuntime:
+    from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
+
+    served = [runtime for runtime in suite.runtimes if isinstance(runtime, TemperatureRuntime)]
+    for runtime in served:
+        if name in runtime.places:
+            return runtime
+    raise unknown_name("temperature grid", name, [key for runtime in served for key in runtime.places])
+
+
+def _bounds(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the box around a geometry in the link's frame (m)."""
+    w, x, y, z = geometry.quaternion
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    place, size = np.array(geometry.position), geometry.size
+    if geometry.kind == "mesh" and geometry.mesh is not None:
+        points = geometry.mesh.vertices @ turn.T + place
+        return points.min(axis=0), points.max(axis=0)
+    if geometry.kind in ("plane", "other"):
+        return np.full(3, -np.inf), np.full(3, np.inf)
+    if geometry.kind == "sphere":
+        half = np.full(3, size[0])
+    elif geometry.kind == "capsule":
+        half = np.abs(turn[:, 2]) * size[1] + size[0]
+    elif geometry.kind == "cylinder":
+        half = np.abs(turn[:, 2]) * size[1] + np.sqrt(np.maximum(1 - turn[:, 2] ** 2, 0)) * size[0]
+    elif geometry.kind == "ellipsoid":
+        half = np.linalg.norm(turn * np.array(size[:3]), axis=1)
+    else:
+        half = np.abs(turn) @ np.array(size[:3])
+    return place - half, place + half

@@ -1,0 +1,79 @@
+"""What bodies are made of, as far as heat is concerned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from brainbench.core.errors import UsageError, unknown_name
+
+
+@dataclass(frozen=True)
+class ThermalMaterial:
+    """How a body conducts, stores and radiates heat.
+
+    Raises:
+        UsageError: a number is not positive, or the emissivity lies outside 0 and 1.
+    """
+
+    conductivity: float
+    """k [W/(m·K)]."""
+    density: float
+    """ρ [kg/m³]."""
+    specific_heat: float
+    """c_p [J/(kg·K)]."""
+    emissivity: float = 0.9
+
+    def __post_init__(self) -> None:
+        for name in ("conductivity", "density", "specific_heat"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise UsageError(f"The {name} of a material is positive; received {getattr(self, name)!r}.")
+        if not 0 <= self.emissivity <= 1:
+            raise UsageError(f"An emissivity lies between 0 and 1; received {self.emissivity!r}.")
+
+    @property
+    def diffusivity(self) -> float:
+        """α = k / (ρ c_p) [m²/s]."""
+        return self.conductivity / (self.density * self.specific_heat)
+
+    @property
+    def effusivity(self) -> float:
+        """√(k ρ c_p) [W·s^½/(m²·K)], which sets the temperature at a contact."""
+        return math.sqrt(self.conductivity * self.density * self.specific_heat)
+
+
+MATERIALS: dict[str, ThermalMaterial] = {
+    "aluminium": ThermalMaterial(237.0, 2700.0, 900.0, 0.1),
+    "steel": ThermalMaterial(15.0, 7900.0, 480.0, 0.5),
+    "copper": ThermalMaterial(401.0, 8960.0, 385.0, 0.1),
+    "glass": ThermalMaterial(1.0, 2500.0, 840.0, 0.92),
+    "wood": ThermalMaterial(0.16, 700.0, 1700.0, 0.9),
+    "rubber": ThermalMaterial(0.16, 1100.0, 1900.0, 0.85),
+    "silicone": ThermalMaterial(0.25, 1100.0, 1300.0, 0.9),
+    "plastic": ThermalMaterial(0.2, 1050.0, 1300.0, 0.9),
+    "skin": ThermalMaterial(0.37, 1109.0, 3391.0, 0.98),
+    "water": ThermalMaterial(0.6, 998.0, 4182.0, 0.96),
+}
+"""Handbook values at room temperature (Incropera & DeWitt; skin: IT'IS tissue data base)."""
+
+
+def material(name: str | ThermalMaterial) -> ThermalMaterial:
+    """Return a material by name of :data:`MATERIALS`; a material passes through.
+
+    Raises:
+        UsageError: there is no material of that name.
+    """
+    if isinstance(name, ThermalMaterial):
+        return name
+    if name not in MATERIALS:
+        raise unknown_name("thermal material", name, MATERIALS)
+    return MATERIALS[name]
+
+
+@dataclass(frozen=True)
+class Body:
+    """What other links are made of and how warm they are."""
+
+    material: str | ThermalMaterial = "plastic"
+    temperature: float = 22.0
+    """At the start [°C]; later through :func:`link_temperature`."""

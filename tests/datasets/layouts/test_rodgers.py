@@ -1,0 +1,259 @@
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import (
+    export,
+    get_recipe,
+    inspect,
+    list_recipes,
+    make_session,
+    open_recordings,
+    write_recordings,
+)
+from tests.factories.recordings import LABELS
+
+ROWS = 14
+
+
+def write_rodgers(path, *, contacts=True, lost=(), subject="231CR", units=None, **columns):
+    """Fourteen trials of 10 s in the layout of Rodgers 2022; contact after 2 s, choice after 3 s."""
+    start = 10.0 * np.arange(ROWS)
+    trials = {
+        "id": np.arange(ROWS) * 2 + 30,
+        "start_time": start,
+        "stop_time": start + 10,
+        "stimulus": np.resize(np.repeat(["convex", "concave"], 3), ROWS),
+        "servo_position": np.resize(np.array(["far", "medium", "close"]), ROWS),
+        "outcome": np.full(ROWS, "correct"),
+        "choice_time": start + 3,
+        "direct_delivery": np.zeros(ROWS, dtype=bool),
+        "stim_is_random": np.ones(ROWS, dtype=bool),
+        "optogenetic": np.zeros(ROWS, dtype=bool),
+        "ignore_trial": np.zeros(ROWS, dtype=bool),
+    } | {name: np.asarray(values) for name, values in columns.items()}
+    tables = {"trials": {name: values for name, values in trials.items() if values.ndim}}
+    if contacts:
+        tables["contacts_by_whisker_C1"] = {"start_time": start + 2.0, "stop_time": start + 2.1}
+        tables["contacts_by_whisker_C2"] = {"start_time": start + 2.5, "stop_time": start + 2.5}
+    tables = {name: table for name, table in tables.items() if name[-2:] not in lost}
+    spikes = [np.arange(0.0, 10.0 * ROWS, 0.1) - 0.01] * (len(units["layer"]) if units else 1)
+    return write_recordings(path, make_session(subject, "1", spikes, tables, unit_columns=units))
+
+
+def one(index, value, other):
+    return [value if row == index else other for row in range(ROWS)]
+
+
+def test_the_recipe_prints_every_rule():
+    text = get_recipe("rodgers").describe()
+    for expected in (
+        "conditions: trials:stimulus,servo_position",
+        f"vocabulary: {', '.join(LABELS)}",
+        "window: first-contact..choice",
+        "window of sessions without contact tables: choice-1..+1",
+        "trials: stimulus!=nothing",
+        "trials: outcome!=spoil",
+        "trials: direct_delivery!=true",
+        "trials: stim_is_random!=false",
+        "trials: optogenetic!=true",
+        "trials: ignore_trial!=true",
+        "starting_time is never subtracted",
+        "doi:10.1038/s41597-022-01728-1",
+    ):
+        assert expected in text
+    assert "rodgers" in list_recipes()
+
+
+def test_the_layout_is_detected_and_said(tmp_path):
+    path = write_rodgers(tmp_path / "a.h5")
+    dataset = open_recordings(path)
+    assert dataset.attrs["recipe"] == "rodgers (detected from the layout)"
+    assert dataset.attrs["vocabulary"] == list(LABELS)
+    assert dataset.attrs["conditions"] == "trials:stimulus,servo_position"
+    np.testing.assert_allclose(dataset["window_start"].values, 10.0 * np.arange(ROWS) + 2)
+    np.testing.assert_allclose(dataset["duration"].values, 1.0)
+    assert np.all(dataset["counts"].values == 10)
+    assert open_recordings(f"rodgers:{path}").attrs["recipe"] == "rodgers"
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "rule"),
+    [
+        ("stimulus", one(4, "nothing", "convex"), "trials: stimulus!=nothing"),
+        ("outcome", one(4, "spoil", "error"), "trials: outcome!=spoil"),
+        ("direct_delivery", one(4, True, False), "trials: direct_delivery!=true"),
+        ("stim_is_random", one(4, False, True), "trials: stim_is_random!=false"),
+        ("optogenetic", one(4, 1, 0), "trials: optogenetic!=true"),
+        ("ignore_trial", one(4, True, False), "trials: ignore_trial!=true"),
+        ("choice_time", one(4, np.nan, 3.0), "trials: no event for the window first-contact..choice"),
+    ],
+)
+def test_each_rule_removes_its_trial_and_counts_it(tmp_path, column, values, rule):
+    if column == "choice_time":
+        values = np.array(values) + 10.0 * np.arange(ROWS)
+    dataset = open_recordings(write_rodgers(tmp_path / "a.h5", **{column: values}))
+    assert {name: number for name, number in dataset.attrs["removed"].items() if number} == {rule: 1}
+    assert "38" not in dataset["trial_id"].values
+    assert dataset.sizes["trial"] == ROWS - 1
+
+
+def test_a_position_outside_the_vocabulary_is_not_a_new_condition(tmp_path):
+    dataset = open_recordings(write_rodgers(tmp_path / "a.h5", servo_position=one(2, "elsewhere", "far")))
+    assert dataset.attrs["removed"]["trials: label outside the vocabulary"] == 1
+    assert dataset.attrs["vocabulary"] == list(LABELS)
+    assert dataset.attrs["missing"] == {"231CR": ["convex-close", "convex-medium", "concave-close", "concave-medium"]}
+
+
+def test_absent_optional_columns_are_tolerated_and_said(tmp_path):
+    nothing = np.array(0)
+    dataset = open_recordings(write_rodgers(tmp_path / "a.h5", optogenetic=nothing, ignore_trial=nothing))
+    assert dataset.sizes["trial"] == ROWS
+    assert "no column 'optogenetic', so the rule optogenetic!=true did not apply" in "".join(dataset.attrs["notes"])
+
+
+def test_a_session_without_contact_tables_is_read_before_the_choice(tmp_path):
+    dataset = open_recordings(write_rodgers(tmp_path / "a.h5", contacts=False))
+    np.testing.assert_allclose(dataset["window_start"].values, 10.0 * np.arange(ROWS) + 2)
+    assert f"window choice-1..+1 for its {ROWS} trials" in "".join(dataset.attrs["notes"])
+
+
+def test_arguments_replace_their_part_of_the_recipe_only(tmp_path):
+    path = write_rodgers(tmp_path / "a.h5", outcome=one(0, "spoil", "error"))
+    shapes = open_recordings(path, conditions="trials:stimulus")
+    assert shapes.attrs["vocabulary"] == ["convex", "concave"]
+    assert shapes.attrs["removed"]["trials: outcome!=spoil"] == 1
+    everything = open_recordings(path, select="none", window="start..stop")
+    assert everything.sizes["trial"] == ROWS - 1
+    assert everything.attrs["removed"]["trials: outside the recorded span"] == 1
+    outcomes = open_recordings(path, conditions="trials:outcome", select="none")
+    assert outcomes.attrs["vocabulary"] == ["error", "spoil"]
+
+
+def test_a_recipe_that_does_not_fit_names_what_is_missing(tmp_path):
+    session = make_session("m", "1", [np.arange(5.0)], {"trials": {"start_time": [0.0, 1.0], "stim": ["a", "b"]}})
+    with pytest.raises(UsageError, match="Unknown column 'stimulus'; did you mean 'stim'"):
+        open_recordings(f"rodgers:{write_recordings(tmp_path / 'a.h5', session)}")
+
+
+def test_files_of_different_layouts_are_not_mixed_silently(tmp_path):
+    write_rodgers(tmp_path / "a.h5")
+    session = make_session("m", "1", [np.arange(5.0)], {"trials": {"start_time": [0.0, 1.0], "stim": ["a", "b"]}})
+    write_recordings(tmp_path / "b.h5", session)
+    with pytest.raises(UsageError, match=r"b\.h5:m-1 has another layout than"):
+        open_recordings(tmp_path)
+
+
+def test_inspection_proposes_the_conditions_of_the_recipe_first(tmp_path):
+    report = inspect(write_rodgers(tmp_path / "a.h5"))
+    assert report.recipe == "rodgers"
+    assert report.proposals[0].conditions == "trials:stimulus,servo_position"
+    assert report.proposals[0].labels == LABELS
+
+
+def detection(**columns):
+    """Every seventh trial without a shape: its position means nothing."""
+    stimulus = np.resize(np.array([*["convex"] * 3, *["concave"] * 3, "nothing"]), ROWS)
+    return {"stimulus": stimulus, "servo_position": np.resize(np.array(["far", "medium", "close"]), ROWS), **columns}
+
+
+def test_the_two_tasks_can_be_read_apart(tmp_path):
+    write_rodgers(tmp_path / "a.h5")
+    write_rodgers(tmp_path / "b.h5", subject="233CR", **detection())
+    both = open_recordings(tmp_path)
+    assert set(both["subject"].values) == {"231CR", "233CR"}
+    assert both.attrs["removed"]["trials: stimulus!=nothing"] == 2
+    one = open_recordings(f"rodgers-discrimination:{tmp_path}")
+    assert (set(one["subject"].values), set(one["unit_subject"].values)) == ({"231CR"}, {"231CR"})
+    assert one.attrs["removed"]["trials: task=discrimination"] == ROWS
+    assert "b.h5:233CR-1: no trial is left, so its 1 units are left out" in "".join(one.attrs["notes"])
+    assert [item["trials"] for item in one.attrs["sessions"]] == [ROWS, 0]
+    other = open_recordings(f"rodgers-detection:{tmp_path}")
+    assert set(other["subject"].values) == {"233CR"}
+    assert open_recordings(tmp_path, select="task=detection; stimulus!=nothing").sizes["trial"] == ROWS - 2
+
+
+def test_in_detection_nothing_is_a_stimulus_wherever_the_shape_would_have_been(tmp_path):
+    dataset = open_recordings(f"rodgers-detection:{write_rodgers(tmp_path / 'a.h5', **detection())}")
+    assert dataset.attrs["vocabulary"] == [*LABELS, "nothing"]
+    assert np.sum(dataset["stimulus"].values == "nothing") == 2
+    # Nothing is touched on those trials, so the window is the second before the choice for all.
+    np.testing.assert_allclose(dataset["window_start"].values, 10.0 * np.arange(ROWS) + 2)
+    assert dataset.attrs["window"] == "choice-1..+1"
+
+
+def test_choices_do_not_label_stimuli_in_either_task(tmp_path):
+    """In discrimination the shape tells the rewarded side, in detection its presence does."""
+    for name, columns in (("a", {}), ("b", detection())):
+        stimulus = columns.get("stimulus", np.resize(np.repeat(["convex", "concave"], 3), ROWS))
+        side = np.where(stimulus == ("convex" if name == "a" else "nothing"), "left", "right")
+        path = write_rodgers(tmp_path / f"{name}.h5", rewarded_side=side, choice=side, **columns)
+        by_side = open_recordings(path, conditions="trials:rewarded_side", select="none")
+        assert by_side.attrs["vocabulary"] == ["left", "right"]
+        rights = by_side["stimulus"].values == "right"
+        np.testing.assert_array_equal(rights, side == "right")
+
+
+def test_a_lost_whisker_is_not_needed_for_the_first_contact_but_is_said(tmp_path):
+    dataset = open_recordings(write_rodgers(tmp_path / "a.h5", lost=("C2",)))
+    np.testing.assert_allclose(dataset["window_start"].values, 10.0 * np.arange(ROWS) + 2)
+    assert "no contact table of 'C0', 'C2', 'C3'" in "".join(dataset.attrs["notes"])
+    with pytest.raises(DataError, match=r"first-contact\.\.choice removed 14"):
+        # All contacts of C2 are of zero duration, so they are no first contact.
+        open_recordings(write_rodgers(tmp_path / "b.h5", lost=("C1",)))
+
+
+@pytest.mark.parametrize("bin", [0.001, 0.0333, 0.25, 1.0, 7.0])
+def test_any_bin_width_counts_every_spike_once(tmp_path, bin):
+    path = write_rodgers(tmp_path / "a.h5")
+    whole, binned = open_recordings(path), open_recordings(path, bin=bin)
+    np.testing.assert_array_equal(np.nansum(binned["counts"].values, axis=1), whole["counts"].values[:, 0])
+    np.testing.assert_allclose(binned["duration"].values.sum(axis=1), whole["duration"].values[:, 0])
+    assert binned.sizes["time"] == int(np.ceil(1.0 / bin - 1e-6))
+
+
+def test_units_are_chosen_by_layer_depth_and_type(tmp_path):
+    columns = {"layer": ["2/3", "4", "5b", "5b"], "depth": [200.0, 500, 700, 900], "inhibitory": [True, False] * 2}
+    path = write_rodgers(tmp_path / "a.h5", units=columns)
+    for select, kept in (
+        ("units.layer=4|5b", [500.0, 700, 900]),
+        ("units.depth=..700", [200.0, 500, 700]),
+        ("units.inhibitory=false; units.layer=5b", [900.0]),
+    ):
+        dataset = open_recordings(path, select=select)
+        assert dataset["depth"].values.tolist() == kept
+        assert sum(number for rule, number in dataset.attrs["removed"].items() if "units:" in rule) == 4 - len(kept)
+
+
+def test_twenty_gigabytes_of_voltage_cost_no_reading(tmp_path):
+    """The bytes that were read are counted by the kernel; 20 GB are a hole in the file."""
+    counter = Path("/proc/self/io")
+    if not counter.exists():
+        pytest.skip("no /proc/self/io on this system")
+    path = write_rodgers(tmp_path / "a.h5")
+    nwb = export(path, tmp_path / "a.nwb")[0]
+    before = open_recordings(nwb)
+    with h5py.File(nwb, "a") as file:
+        series = file["acquisition"].create_group("extracellular array recording")
+        series.attrs["neurodata_type"] = "ElectricalSeries"
+        series.create_dataset("starting_time", data=3.5).attrs["rate"] = 30000.0
+        plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plist.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+        plist.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+        space = h5py.h5s.create_simple((160_000_000, 64))
+        h5py.h5d.create(series.id, b"data", h5py.h5t.NATIVE_INT16, space, plist)
+    assert nwb.stat().st_size > 20e9
+
+    def read() -> int:
+        return int(counter.read_text().split("rchar: ")[1].split()[0])
+
+    start = read()
+    dataset = open_recordings(nwb)
+    inspect(nwb)
+    assert read() - start < 2_000_000
+    # Nor is the voltage's starting_time subtracted: there is one clock.
+    xr.testing.assert_identical(dataset.drop_attrs(), before.drop_attrs())

@@ -1,0 +1,258 @@
+import json
+import multiprocessing
+import os
+import shutil
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import file_hash
+from brainbench.datasets import blocks, inspect, open_recordings
+from brainbench.datasets.synthetic import demo
+from tests.factories.recordings import LABELS, make_stimuli
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    demo.make_demo(folder, make_stimuli())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def dataset(folder):
+    return open_recordings(folder)
+
+
+def correlation(first, second):
+    return np.corrcoef(first, second)[0, 1]
+
+
+def mean_rdm(sessions):
+    """RDM of condition means over all units of a subject, as nothing in the package computes it."""
+    means = [
+        np.stack([np.nanmean(responses[labels == index, 0], axis=0) for index in range(6)])
+        for responses, labels, _ in sessions
+    ]
+    return 1 - np.corrcoef(np.concatenate(means, axis=1))[np.triu_indices(6, 1)]
+
+
+def half_rdms(sessions, seed):
+    halves: tuple[list, list] = ([], [])
+    random = np.random.default_rng(seed)
+    for responses, labels, keys in sessions:
+        chosen = np.zeros(len(labels), dtype=bool)
+        for index in range(6):
+            rows = random.permutation(np.flatnonzero(labels == index))
+            chosen[rows[: len(rows) // 2]] = True
+        for half, part in zip(halves, (chosen, ~chosen), strict=True):
+            half.append((responses[part], labels[part], keys))
+    return [mean_rdm(half) for half in halves]
+
+
+def test_four_animals_in_the_rodgers_layout_labelled_synthetic(folder, dataset):
+    assert dataset.attrs["recipe"] == "rodgers (detected from the layout)"
+    assert dataset.attrs["vocabulary"] == list(LABELS)
+    assert dataset.attrs["missing"] == {}
+    assert dataset.attrs["synthetic"] is True
+    assert all(session["synthetic"] for session in dataset.attrs["sessions"])
+    found = blocks(dataset)
+    assert list(found) == ["demo01", "demo02", "demo03", "demo04"]
+    for sessions in found.values():
+        assert 150 <= sum(len(block.labels) for block in sessions) <= 250
+        assert 40 <= sum(block.responses.shape[2] for block in sessions) <= 80
+    for path in folder.glob("*.nwb"):
+        with h5py.File(path) as file:
+            for name in ("session_description", "general/subject/description"):
+                assert file[name][()].decode().startswith("SYNTHETIC")
+
+
+def test_the_quirks_of_the_real_files_are_there(folder, dataset):
+    for rule in ("stimulus!=nothing", "outcome!=spoil", "direct_delivery!=true", "stim_is_random!=false"):
+        assert dataset.attrs["removed"][f"trials: {rule}"] > 0
+    for rule in ("optogenetic!=true", "ignore_trial!=true", "outside the recorded span"):
+        assert dataset.attrs["removed"][f"trials: {rule}"] > 0
+    assert dataset["unit_layer" if "unit_layer" in dataset else "layer"].values.tolist().count("") == 0
+    ids = dataset["trial_id"].values[dataset["session"].values == "01"].astype(int)
+    assert set(np.diff(np.unique(ids))) - {1}
+    with h5py.File(folder / "sub-demo02_ses-01_behavior+ecephys.nwb") as file:
+        behaviour = file["processing/behavior"]
+        assert "contacts_by_whisker_C0" not in behaviour
+        contacts = behaviour["contacts_by_whisker_C1"]
+        assert np.any(contacts["start_time"][:] == contacts["stop_time"][:])
+        assert np.any(np.diff(file["units/id"][:]) > 1)
+        assert len(behaviour["licks/timestamps"]) > 100
+    with h5py.File(folder / "sub-demo03_ses-01_behavior+ecephys.nwb") as file:
+        assert len(np.unique(file["units/obs_intervals"][:, 1])) == 2
+
+
+def test_firing_peaks_about_15_ms_after_the_first_contact(folder):
+    """The clock check of the real data: contacts and spikes are on one clock."""
+    early = open_recordings(folder, window="first-contact-0.06..+0.12", bin=0.005)
+    rates = early["counts"].values / early["duration"].values[..., None]
+    profile = np.nanmean(rates, axis=(0, 2))
+    assert profile[12:18].max() > 1.25 * profile[:12].mean()
+    assert 0.005 <= 0.005 * (np.argmax(profile[12:18]) + 0.5) <= 0.030
+
+
+def test_counts_are_over_dispersed(dataset):
+    factors = []
+    for sessions in blocks(dataset).values():
+        for responses, labels, _ in sessions:
+            for index in range(6):
+                counts = responses[labels == index, 0] * 0.8
+                mean, spread = np.nanmean(counts, axis=0), np.nanvar(counts, axis=0, ddof=1)
+                factors.append(np.sum(spread) / np.sum(mean))
+    assert 1.25 < np.mean(factors) < 2.0
+
+
+def test_measured_geometry_tends_to_the_stored_truth(folder, dataset):
+    truth = demo.read_truth(folder)
+    assert truth["labels"] == list(LABELS)
+    measured = {name: mean_rdm(sessions) for name, sessions in blocks(dataset).items()}
+    own = {name: correlation(rdm, truth["subjects"][name]) for name, rdm in measured.items()}
+    assert min(own[name] for name in ("demo01", "demo02")) > 0.85
+    assert correlation(np.mean(list(measured.values()), axis=0), truth["shared"]) > 0.8
+
+
+def test_animals_are_reliable_except_the_one_made_hard_to_read(dataset):
+    reliability = {}
+    for name, sessions in blocks(dataset).items():
+        r = np.mean([correlation(*half_rdms(sessions, seed)) for seed in range(20)])
+        reliability[name] = 2 * r / (1 + r)
+    assert reliability["demo01"] > 0.6
+    assert reliability["demo02"] > 0.6
+    assert reliability["demo04"] < max(reliability.values()) - 0.05
+
+
+def test_the_same_stimuli_give_the_same_files(folder, tmp_path):
+    for path in demo.make_demo(tmp_path, make_stimuli()):
+        assert file_hash(path) == file_hash(folder / path.name)
+    other = demo.make_demo(tmp_path / "other", make_stimuli(), seed=1, animals=1)
+    assert file_hash(other[0]) != file_hash(folder / other[0].name)
+
+
+def test_the_order_of_the_stimuli_does_not_matter(folder, tmp_path):
+    turned = make_stimuli().isel(stimulus=[3, 1, 5, 0, 4, 2])
+    for path in demo.make_demo(tmp_path, turned, animals=1):
+        assert file_hash(path) == file_hash(folder / path.name)
+
+
+def test_it_is_quick_and_small(tmp_path):
+    calls = []
+    began = time.process_time()
+    paths = demo.make_demo(tmp_path, make_stimuli(), progress=lambda *state: calls.append(state))
+    assert time.process_time() - began < 10
+    assert sum(path.stat().st_size for path in paths) < 15e6
+    assert calls[-1][:2] == (len(paths), len(paths))
+
+
+def test_inspection_says_that_it_is_synthetic(folder):
+    report = inspect(folder)
+    assert report.recipe == "rodgers"
+    assert "SYNTHETIC" in str(report)
+    assert report.proposals[0].labels == LABELS
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_files_are_valid_for_pynwb_and_free_of_critical_findings(folder):
+    pynwb = pytest.importorskip("pynwb")
+    nwbinspector = pytest.importorskip("nwbinspector")
+    allowed = {"BEST_PRACTICE_VIOLATION", "BEST_PRACTICE_SUGGESTION"}
+    for path in sorted(folder.glob("*.nwb")):
+        assert list(pynwb.validate(path=str(path))) == []
+        messages = list(nwbinspector.inspect_nwbfile(nwbfile_path=path, config=nwbinspector.load_config("dandi")))
+        assert [message.message for message in messages if message.importance.name not in allowed] == []
+        with pynwb.NWBHDF5IO(path, "r") as io:
+            units = io.read().units.to_dataframe()
+        assert units["spike_times"].map(len).min() > 0
+
+
+def test_the_cache_makes_them_once(monkeypatch, tmp_path):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    stimuli = make_stimuli()
+    made = demo.ensure_demo(stimuli, animals=1)
+    stamp = made.stat().st_mtime_ns
+    assert made == demo.demo_folder("fake-0-30", animals=1)
+    assert demo.ensure_demo(lambda: pytest.fail("not needed"), key="fake-0-30", animals=1) == made
+    assert made.stat().st_mtime_ns == stamp
+    assert [item.name for item in made.parent.iterdir()] == [made.name]
+
+
+def test_a_damaged_cache_is_made_again(monkeypatch, tmp_path, caplog):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    made = demo.ensure_demo(make_stimuli(), animals=1)
+    file = next(made.glob("*.nwb"))
+    before = file_hash(file)
+    file.write_bytes(b"")
+    demo.ensure_demo(make_stimuli(), animals=1)
+    assert file_hash(file) == before
+    assert "damaged" in caplog.text
+    (made / demo.TRUTH).unlink()
+    demo.ensure_demo(make_stimuli(), animals=1)
+    assert json.loads((made / demo.TRUTH).read_text())["synthetic"] is True
+
+
+def test_what_a_killed_process_left_is_removed_when_old(monkeypatch, tmp_path):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    root = demo.demo_folder("x").parent
+    old, young = root / ".demo-old", root / ".demo-young"
+    old.mkdir()
+    young.mkdir()
+    os.utime(old, (0, 0))
+    demo.ensure_demo(make_stimuli(), animals=1)
+    assert not old.exists()
+    assert young.exists()
+
+
+def _ensure(queue):
+    queue.put(str(demo.ensure_demo(make_stimuli(), animals=1)))
+
+
+def test_two_processes_may_make_them_at_once(monkeypatch, tmp_path):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    workers = [context.Process(target=_ensure, args=(queue,)) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    paths = {queue.get(timeout=60) for _ in workers}
+    for worker in workers:
+        worker.join()
+        assert worker.exitcode == 0
+    assert len(paths) == 1
+    assert open_recordings(paths.pop()).attrs["synthetic"] is True
+    assert not list((tmp_path / "recordings").glob(".demo-*"))
+
+
+def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    stimuli = make_stimuli()
+    with pytest.raises(DataError, match="need the stimuli 'convex-close'"):
+        demo.make_demo("unused", stimuli.isel(stimulus=slice(5)))
+    with pytest.raises(DataError, match="these have none"):
+        demo.make_demo("unused", stimuli.drop_vars("contact"))
+    with pytest.raises(DataError, match="none of the tracked whiskers 'C0', 'C1', 'C2', 'C3'"):
+        demo.make_demo("unused", stimuli.isel(whisker=slice(10)))
+    with pytest.raises(DataError, match="no finite wrench for 'A3'"):
+        demo.make_demo("unused", stimuli.assign(wrench=stimuli["wrench"].where(stimuli["whisker"] != "A3")))
+    with pytest.raises(DataError, match="exert no force"):
+        demo.make_demo("unused", stimuli.assign(wrench=stimuli["wrench"] * 0))
+    with pytest.raises(DataError, match="stimulus 'concave-far' touches none of 'C0', 'C1', 'C2', 'C3' in time"):
+        demo.make_demo("unused", stimuli.assign(contact=stimuli["contact"] & (stimuli["stimulus"] != "concave-far")))
+    with pytest.raises(UsageError, match="at least one animal"):
+        demo.make_demo("unused", stimuli, animals=0)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(UsageError, match="needs a key"):
+        demo.ensure_demo(make_stimuli)
+
+
+def test_no_folder_is_left_after_a_failure(monkeypatch, tmp_path):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    with pytest.raises(DataError):
+        demo.ensure_demo(make_stimuli().drop_vars("contact"))
+    assert list((tmp_path / "recordings").iterdir()) == []
+    shutil.rmtree(tmp_path)

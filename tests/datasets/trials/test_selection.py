@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import Rule, Selection
+from brainbench.datasets.sessions import Table
+from brainbench.datasets.trials.selection import Tally
+
+
+def make_table(**columns):
+    return Table("trials", {name: np.array(values) for name, values in columns.items()}, "f.nwb")
+
+
+def test_each_row_is_counted_under_the_first_rule_that_removes_it():
+    table = make_table(outcome=["spoil", "correct", "spoil", "error"], laser=[True, True, False, False])
+    tally = Tally()
+    rules = (Rule("outcome", refuse=("spoil",)), Rule("laser", refuse=("true",)))
+    assert tally.select(table, rules, "trials").tolist() == [False, False, False, True]
+    assert tally.removed == {"trials: outcome!=spoil": 2, "trials: laser!=true": 1}
+
+
+@pytest.mark.parametrize("values", [[True, False], [1, 0], [1.0, 0.0], ["True", "False"], ["1", "0"]])
+def test_truth_is_recognised_however_the_file_spells_it(values):
+    assert Rule("flag", refuse=("true",)).keep(make_table(flag=values)).tolist() == [False, True]
+
+
+def test_a_missing_value_fails_what_is_asked_for_and_passes_what_is_refused():
+    table = make_table(depth=[100.0, np.nan, 900.0])
+    assert Rule("depth", low=50, high=500).keep(table).tolist() == [True, False, False]
+    assert Rule("depth", allow=("100",)).keep(table).tolist() == [True, False, False]
+    assert Rule("depth", refuse=("100",)).keep(table).tolist() == [False, True, True]
+
+
+def test_an_optional_rule_without_its_column_says_so():
+    tally = Tally()
+    assert tally.select(make_table(a=[1, 2]), (Rule("b", refuse=("x",), required=False),), "trials").all()
+    assert "no column 'b', so the rule b!=x did not apply" in tally.notes[0]
+    assert tally.removed == {}
+
+
+def test_a_required_rule_without_its_column_suggests_the_nearest():
+    with pytest.raises(UsageError, match="did you mean 'outcome'"):
+        Rule("outcom", allow=("correct",)).keep(make_table(outcome=["correct"]))
+
+
+def test_a_range_over_text_is_refused():
+    with pytest.raises(DataError, match="holds text"):
+        Rule("layer", low=1, high=4).keep(make_table(layer=["2/3", "4"]))
+
+
+def test_rules_are_read_from_text():
+    selection = Selection.parse(
+        "outcome=correct|error; stimulus!=nothing; units.depth=100..; units.layer=4; min_spikes=9"
+    )
+    assert selection.trials == (Rule("outcome", allow=("correct", "error")), Rule("stimulus", refuse=("nothing",)))
+    assert selection.units == (Rule("depth", low=100.0), Rule("layer", allow=("4",)))
+    assert selection.min_spikes == 9
+    assert Selection.parse("subjects=a|b").subjects == ("a", "b")
+    assert next(iter(selection.lines())) == "trials: outcome=correct|error"
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [("outcome", "cannot be read"), ("depth!=1..2", "range cannot be refused"), ("min_spikes=few", "whole number")],
+)
+def test_unreadable_rules_show_the_form(source, message):
+    with pytest.raises(UsageError, match=message):
+        Selection.parse(source)

@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import Window, make_session
+
+
+def make_contacts(**tables):
+    trials = {"start_time": [0.0, 10.0, 20.0], "stop_time": [9.0, 19.0, 29.0], "choice_time": [5.0, 15.0, np.nan]}
+    contacts = {
+        f"contacts_by_whisker_{name}": {"start_time": [row[0] for row in rows], "stop_time": [row[1] for row in rows]}
+        for name, rows in tables.items()
+    }
+    return make_session("m", "1", [np.zeros(1)], {"trials": trials, **contacts})
+
+
+def edges(window, session):
+    notes: list[str] = []
+    return window.edges(session, session.tables["trials"], notes), notes
+
+
+@pytest.mark.parametrize(
+    "source", ["first-contact..choice", "start+0.2..stop-0.1", "cue_time-0.5..+1.5", "choice-1..choice"]
+)
+def test_windows_are_read_from_text_and_written_back(source):
+    assert str(Window.parse(source)) == source
+
+
+@pytest.mark.parametrize("source", ["start", "..stop", "start..", "5"])
+def test_unreadable_windows_show_the_form(source):
+    with pytest.raises(UsageError, match=r"FROM\.\.TO or FROM\.\.\+SECONDS"):
+        Window.parse(source)
+
+
+def test_a_window_needs_an_end_and_a_positive_length():
+    with pytest.raises(UsageError, match="has no end"):
+        Window("start")
+    with pytest.raises(UsageError, match="positive"):
+        Window("start", length=0.0)
+
+
+def test_the_first_contact_is_the_earliest_of_all_whiskers_inside_the_trial():
+    session = make_contacts(C0=[(2.0, 2.1), (12.0, 12.1)], C1=[(1.5, 1.6), (9.5, 9.6), (13.0, 13.2)])
+    found, _ = edges(Window("first-contact", stop="choice"), session)
+    np.testing.assert_allclose(found[:2], [[1.5, 5.0], [12.0, 15.0]])
+    assert np.isnan(found[2]).any()
+
+
+def test_a_contact_of_zero_duration_is_no_contact_unless_asked_for():
+    session = make_contacts(C0=[(1.0, 1.0), (2.0, 2.1)])
+    found, notes = edges(Window("first-contact", stop="choice"), session)
+    assert found[0, 0] == 2.0
+    assert "1 of 2 contacts too brief to be the first" in notes[0]
+    found, _ = edges(Window("first-contact", stop="choice", shortest_contact=-1.0), session)
+    assert found[0, 0] == 1.0
+
+
+def test_a_contact_after_the_choice_is_not_the_first():
+    found, _ = edges(Window("first-contact", stop="choice"), make_contacts(C0=[(6.0, 6.1)]))
+    assert np.isnan(found[0, 0])
+
+
+def test_a_session_without_contact_tables_takes_the_fallback_and_says_so():
+    window = Window("first-contact", stop="choice", fallback=Window("choice", offset=-1.0, length=1.0))
+    found, notes = edges(window, make_contacts())
+    np.testing.assert_allclose(found[0], [4.0, 5.0])
+    assert "no contact tables; window choice-1..+1 for its 3 trials" in notes[0]
+    with pytest.raises(DataError, match="no tables contacts_by_whisker_"):
+        edges(Window("first-contact", stop="choice"), make_contacts())
+
+
+def test_with_stop_and_length_whichever_comes_first_ends_the_window():
+    found, _ = edges(Window("start", stop="choice", length=7.0), make_contacts())
+    np.testing.assert_allclose(found[:2, 1], [5.0, 15.0])
+    found, _ = edges(Window("start", stop="choice", length=3.0), make_contacts())
+    np.testing.assert_allclose(found[:2, 1], [3.0, 13.0])
+
+
+def test_an_unknown_anchor_suggests_the_nearest_column():
+    with pytest.raises(UsageError, match="did you mean 'choice_time'"):
+        edges(Window("choice_tim", length=1.0), make_contacts())

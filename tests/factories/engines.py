@@ -1,0 +1,53 @@
+"""A physics double: its forces are readable functions of the job, so that the plumbing can be checked exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brainbench.stimuli.engines.protocol import Trace, base_rotation
+
+
+class FakeBackend:
+    """Force = base position (as N), moment = where the whisker points (as N·m), both in the job's frame.
+
+    A whisker "touches" while its unbent tip lies inside an obstacle's bounding box.
+    """
+
+    name = "fake"
+
+    def __init__(self, unstable: dict[int, str] | None = None) -> None:
+        self.jobs = []
+        self.unstable = unstable or {}
+
+    def run(self, jobs, fidelity, *, progress=None, workers=None, record_shape=False):
+        traces = []
+        for index, job in enumerate(jobs):
+            self.jobs.append(job)
+            traces.append(self._trace(job, self.unstable.get(index)))
+            if progress:
+                progress(index + 1, len(jobs))
+        return traces
+
+    def _trace(self, job, reason):
+        position, euler = job.follicle.pose(job.times)
+        axes = base_rotation(euler)
+        wrench = np.concatenate([position, axes[:, :, 0]], axis=1)
+        x, y = job.whisker.centre_line(job.whisker.arc_length)
+        tip = position + axes @ np.array([x, y, 0.0])
+        contact = np.zeros(len(job.times), bool)
+        for obstacle in job.obstacles:
+            travel = 0.0 if obstacle.motion is None else obstacle.motion(job.times)[0]
+            for part in obstacle.parts:
+                low, high = part.bounds()
+                contact |= ((tip - travel >= low) & (tip - travel <= high)).all(axis=1)
+        if reason is not None:
+            wrench[len(wrench) // 2 :] = np.nan
+        return Trace(
+            wrench=wrench,
+            contact=contact,
+            contact_arc=np.where(contact, job.whisker.arc_length, np.nan),
+            status="ok" if reason is None else "unstable",
+            reason=reason or "",
+            penetration=1e-6 * contact.any(),
+            steps=len(job.times),
+        )

@@ -1,0 +1,169 @@
+"""A warp of a GPU played by Python: 32 threads that meet at every shuffle, running kernel source in double precision.
+
+What groups of threads tell each other on a GPU cannot run elsewhere; here it can, slowly, and a shuffle that not all
+threads of the warp reach together is an error.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import threading
+from contextlib import contextmanager
+from types import FunctionType, ModuleType, SimpleNamespace
+
+import numpy as np
+
+WARP = 32
+_MODULES = (
+    "algebra", "compliance", "contacts", "coulomb", "grasp", "groups", "looks", "memory", "relax", "search", "shapes",
+    "structs", "tracks",
+)  # fmt: skip
+
+
+class Memory:
+    """An array or a thread's memory: reading copies, writing counts."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def __getitem__(self, key: object) -> object:
+        found = self.values[key]
+        return found.copy() if isinstance(found, np.ndarray) else found
+
+    def __setitem__(self, key: object, value: object) -> None:
+        self.values[key] = value
+
+
+class ThreadWarp:
+    """32 threads whose shuffles wait for each other."""
+
+    def __init__(self) -> None:
+        self._own = threading.local()
+        self._meet = threading.Barrier(WARP)
+        self._values: list = [None] * WARP
+        self._places: list = [None] * WARP
+
+    def run(self, work, threads: int = WARP) -> None:
+        """Call ``work(thread)`` in each thread; raise the first error of any."""
+        errors = []
+
+        def go(thread: int) -> None:
+            self._own.index = thread
+            try:
+                work(thread)
+            except threading.BrokenBarrierError:
+                pass
+            except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+                errors.append(error)
+                self._meet.abort()
+
+        together = [threading.Thread(target=go, args=(index,)) for index in range(threads)]
+        for thread in together:
+            thread.start()
+        for thread in together:
+            thread.join()
+        if errors:
+            raise errors[0]
+
+    def _exchange(self, value):
+        index, caller = self._own.index, sys._getframe(2)
+        self._values[index], self._places[index] = value, (caller.f_code, caller.f_lineno)
+        self._meet.wait()
+        values, places = list(self._values), set(self._places)
+        self._meet.wait()
+        if len(places) > 1:
+            raise RuntimeError(f"threads of a warp shuffle at different places: {places}")
+        return values
+
+    def groups(self, _real: type, lanes: int) -> SimpleNamespace:
+        """Stand for :func:`brainbench.stimuli.engines.rod.kernels.thread_groups.groups`."""
+
+        def mine(values):
+            begin = self._own.index // lanes * lanes
+            return values[begin : begin + lanes]
+
+        return SimpleNamespace(
+            give=lambda value, source: mine(self._exchange(value))[source],
+            total=lambda value: sum(mine(self._exchange(value))),
+            greatest=lambda value: max(mine(self._exchange(value))),
+            least=lambda value: min(mine(self._exchange(value))),
+            first=lambda value: min(mine(self._exchange(value))),
+            joined=lambda value: int(np.bitwise_or.reduce([int(bits) for bits in mine(self._exchange(value))])),
+            most=lambda value: max(self._exchange(value)),
+        )
+
+
+def _language() -> ModuleType:
+    """What kernel source asks of the module ``warp``, on numpy."""
+    fake = ModuleType("warp")
+
+    def vector(count, kind):
+        return lambda *values: np.array(values, dtype=float) if values else Memory(np.zeros(count, dtype=kind))
+
+    def bits(value, _kind):
+        return int(np.float32(value).view(np.int32))
+
+    def native(code):
+        # Native code reads memory, or is where the processor's minimum and maximum are other than Warp's.
+        if "extract(memory, index)" in code:
+            return lambda _function: lambda memory, index: memory[index]
+        found = re.search(r"#else\nreturn a ([<>]) b \? a : b;", code)
+        return lambda _function: min if found[1] == "<" else max
+
+    def zeroed(kind):
+        def begin(self):
+            for name, made in kind.__annotations__.items():
+                setattr(self, name, made() if made in (int, np.float64) or isinstance(made, FunctionType) else 0)
+
+        kind.__init__ = begin
+        return kind
+
+    class Reference:
+        def __class_getitem__(cls, _kind):
+            return cls
+
+    made = {
+        "float32": np.float64, "float64": np.float64, "int32": int, "uint64": int,
+        "types": SimpleNamespace(vector=vector, matrix=lambda shape, _kind: lambda *_: Memory(np.zeros(shape))),
+        "static": lambda value: value, "func": lambda function=None, **_: function or (lambda same: same),
+        "ref": Reference, "struct": zeroed, "func_native": native,
+        **dict.fromkeys(["array", "array2d", "array3d", "array4d"], lambda **_: None),
+        "min": min, "max": lambda a, b: max(b, a), "abs": abs, "sqrt": np.sqrt, "sin": np.sin, "cos": np.cos,
+        "clamp": lambda x, low, high: min(max(x, low), high), "where": lambda yes, a, b: a if yes else b,
+        "dot": lambda a, b: np.float64(a @ b), "cross": lambda a, b: np.array(
+            [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]),
+        "length": lambda a: np.sqrt(a @ a), "length_sq": lambda a: np.float64(a @ a),
+        "normalize": lambda a: a / np.sqrt(a @ a), "cast": bits,
+    }  # fmt: skip
+    for name, value in made.items():
+        setattr(fake, name, value)
+    return fake
+
+
+@contextmanager
+def thread_warp():
+    """Give a :class:`ThreadWarp` and the modules of the solver, made anew on it; the real ones come back after."""
+    package = "brainbench.stimuli.engines.rod._"
+    kept = {name: module for name, module in sys.modules.items() if name == "warp" or name.startswith(package)}
+    threads = ThreadWarp()
+    try:
+        for name in kept:
+            del sys.modules[name]
+        sys.modules["warp"] = _language()
+        made = {name: importlib.import_module(package + name) for name in _MODULES}
+        for module in made.values():
+            if hasattr(module, "groups"):
+                module.groups = threads.groups
+        for name in ("compliance", "contacts"):
+            made[name].structs = lambda _real: SimpleNamespace(Grips=object)
+        yield threads, SimpleNamespace(**made)
+    finally:
+        for name in [name for name in sys.modules if name == "warp" or name.startswith(package)]:
+            del sys.modules[name]
+        sys.modules.update(kept)
+        parent = importlib.import_module("brainbench.stimuli.engines.rod")
+        for name, module in kept.items():
+            if name.startswith(package):
+                setattr(parent, name.rsplit(".", 1)[1], module)

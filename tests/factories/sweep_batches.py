@@ -1,0 +1,46 @@
+"""Small grids of quick sweeps, with which the machinery around the physics is tested."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+
+GRID = dataclasses.replace(
+    GRIDS["thesis-low"],
+    speed=(0.060,),
+    height=(-0.002, 0.0),
+    rotation=(0.0, math.pi / 4),
+    distance=(0.005,),
+    start=-0.002,
+    frames=Frames(count=10, interval=0.01),
+    published="",
+)
+"""Four sweeps of .1 s per object, which C2 and C3 feel; from ``start`` = −6 mm some are hit at once."""
+
+
+def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):
+    found = resolve_objects(objects, collision="hull")
+    return SweepScenes(grid, {name: item.load for name, item in found.items()}, whiskers=whiskers)
+
+
+def small_plan(objects=("brick:2", "cone:2"), *, whiskers="C3", grid=GRID, fidelity=None, **settings):
+    found = resolve_objects(objects, collision="hull")
+    # An engine that takes sweeps as any other scenes, and refuses none of these.
+    chosen = Settings(fidelity or Fidelity.preset("fast"), **{"backend": "mujoco", **settings})
+    return GenerationPlan("small", grid, found, chosen, whiskers)
+
+
+def killed_plan():
+    """Sixteen shards, which take about a second: long enough to be killed in between."""
+    return small_plan(("brick:8", "cone:8"), shard_size=2, limit=2)
+
+
+def files_of(folder):
+    """Name → bytes of every file of a folder, hidden ones too."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

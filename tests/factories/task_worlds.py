@@ -1,0 +1,95 @@
+"""A world small enough to know the right answer: touch alone tells where to go."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+
+from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.policies.encoders.arms import EncoderConfig
+
+
+class TouchWorld:
+    """Two joints must follow an aim that a touch on two taxels shows; episodes last 8 steps."""
+
+    def __init__(self, num_envs: int = 16, *, observe: str = "force_torque", seed: int = 0) -> None:
+        self.num_envs, self.num_actions, self.device = num_envs, 2, torch.device("cpu")
+        self.step_dt, self.decimation, self.max_episode_length = 0.025, 5, 8
+        self.joint_names, self.frozen = ("a", "b"), {"c": 0.5}
+        self.action_map = SimpleNamespace(
+            names=("a", "b"), default=np.zeros(2), scale=np.ones(2), low=-np.ones(2), high=np.ones(2)
+        )
+        self.touch = observation_type(observe).sensor is not None
+        student = ("proprio", "goal", "tactile") if self.touch else ("proprio", "goal")
+        self.task = SimpleNamespace(
+            groups={"student": student},
+            decoders=(SimpleNamespace(target="aux_aim", weight=0.5, scale=2.0, hidden=(16,)),),
+            student=SimpleNamespace(
+                iterations=4, learning_rate=1e-3, epochs=2, gradient_length=2, clip=None, max_grad_norm=None, loss="mse"
+            ),
+        )
+        if self.touch:
+            config = EncoderConfig(placement="tips", resolution="low", observe=observe, name="mlp")
+            self.shape = config.build().shape
+            self.tactile: Any = SimpleNamespace(links=tuple(f"tip{i}" for i in range(5)))
+        else:
+            self.tactile = None
+        self.generator = torch.Generator().manual_seed(seed)
+        self.place, self.aim = torch.zeros(num_envs, 2), torch.zeros(num_envs, 2)
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
+        self.observations = self.reset()
+        self.observation_shapes = {name: tuple(value.shape[1:]) for name, value in self.observations.items()}
+
+    def reset(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        chosen = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
+        fresh = torch.randn(self.num_envs, 2, generator=self.generator)
+        self.aim[chosen], self.place[chosen] = fresh[chosen], 0.0
+        self.episode_length_buf[chosen] = 0
+        self.observations = self._observe()
+        return self.observations
+
+    def _observe(self) -> dict[str, torch.Tensor]:
+        found = {"proprio": self.place.clone(), "goal": torch.ones(self.num_envs, 1), "aux_aim": self.aim.clone()}
+        if self.touch:
+            touch = torch.zeros(self.num_envs, *self.shape)
+            touch[:, :, 3, 0], touch[:, :, 20, 0] = 0.2 * self.aim[:, :1], 0.2 * self.aim[:, 1:]
+            found["tactile"] = touch
+        return found
+
+    def step(self, action: torch.Tensor):
+        self.place = self.place + 0.2 * action
+        self.episode_length_buf += 1
+        over = self.episode_length_buf >= self.max_episode_length
+        self.reset(over)
+        reward = -(self.place - self.aim).norm(dim=1)
+        return self.observations, reward, torch.zeros_like(over), over, {"log": {}}
+
+    def statistics(self) -> dict[str, float]:
+        return {"episodes": 1.0, "success": 0.5}
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        own = {
+            "place": self.place,
+            "aim": self.aim,
+            "episode_length_buf": self.episode_length_buf,
+            "generator": self.generator.get_state(),
+        }
+        own |= {f"observations.{name}": value for name, value in self.observations.items()}
+        return {name: value.clone() for name, value in own.items()}
+
+    def load_state_dict(self, values: dict[str, torch.Tensor]) -> None:
+        for name in ("place", "aim", "episode_length_buf"):
+            setattr(self, name, values[name].clone())
+        self.generator.set_state(values["generator"])
+        start = "observations."
+        self.observations = {k.removeprefix(start): v.clone() for k, v in values.items() if k.startswith(start)}
+
+
+class Follower:
+    """The teacher of the world above: it sees the aim."""
+
+    def act(self, obs) -> torch.Tensor:
+        return obs["aux_aim"] - obs["proprio"]

@@ -1,0 +1,184 @@
+"""Figures stand where the numbers say, and say what they lack when the records cannot fill them."""
+
+from __future__ import annotations
+
+import doctest
+import math
+from dataclasses import replace
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from brainbench.core.records import GraphEdge, GraphNode, Interval, ModelGraph
+from leaderboards.entries import entries_of
+from leaderboards.figures import plots, svg
+from leaderboards.figures.architecture import diagram
+from leaderboards.figures.charts import board_figures, layers_of
+from leaderboards.figures.plots import regression
+from leaderboards.figures.svg import STYLE, Drawing, Scale, scale_of, standalone
+from leaderboards.ranking import rank
+
+
+def _figures(*records):
+    (board,) = rank(records)
+    return {figure.key: figure for figure in board_figures(board, entries_of(board))}
+
+
+def _trained(record, objective="supervised", augmentation=None, masking=0.0, top1=0.4, **changes):
+    card = replace(record.card, objective=objective, augmentation=augmentation, top1=top1, twin="net", **changes)
+    return replace(record, card=replace(card, training={"masking": masking}, weights=f"{augmentation}{masking}{top1}"))
+
+
+def _texts(drawing: Drawing) -> list[str]:
+    root = ElementTree.fromstring(drawing.render())
+    return [item.text or "" for item in root.iter() if item.tag.endswith(("text", "title"))]
+
+
+def test_figures_that_the_records_cannot_fill_say_what_they_lack(make_record):
+    figures = _figures(replace(make_record("net"), card=None))
+    assert figures["accuracy"].lacking.startswith("no record states a task accuracy")
+    assert "at least 3 are needed" in figures["accuracy-fit"].lacking
+    assert "more than one augmentation" in figures["augmentation"].lacking
+    assert "more than one share of masked steps" in figures["masking"].lacking
+    assert {key for key, figure in figures.items() if figure.drawing} == {"fit", "layers", "rdms"}
+
+
+def test_every_figure_is_drawn_when_the_records_hold_what_it_needs(make_record):
+    records = [
+        replace(make_record("net", 0.3), card=replace(make_record().card, objective="untrained", seed=0, top1=None))
+    ]
+    for i, augmentation in enumerate(("physical", "image", "none")):
+        records.append(_trained(make_record(f"net.{i}", 0.5 + 0.1 * i), "simclr", augmentation, top1=0.1 + 0.1 * i))
+    records.append(_trained(make_record("net.3", 0.9), "simclr", "physical", 0.75, top1=0.5))
+    figures = _figures(*records)
+    assert [key for key, figure in figures.items() if figure.drawing is None] == []
+    for figure in figures.values():
+        root = ElementTree.fromstring(standalone(figure.drawing))
+        assert root.attrib["aria-label"]
+        places = [float(item.attrib[name]) for item in root.iter() for name in ("x", "x1", "x2") if name in item.attrib]
+        assert all(-1 <= place <= figure.drawing.width + 1 for place in places)
+        assert "nan" not in figure.drawing.render()
+    assert "r = " in figures["accuracy-fit"].caption
+    assert any("untrained twin 0.300" in text for text in _texts(figures["fit"].drawing))
+
+
+def test_the_accuracy_of_a_twin_comes_from_the_trained_record_or_else_from_its_own(make_record):
+    plain = replace(make_record("net", 0.3), card=replace(make_record().card, objective="untrained", seed=0, top1=None))
+    trained = make_record("net.supervised", 0.5)
+    alone = _figures(plain, _trained(trained))["accuracy"]
+    assert "No record states the accuracy of an untrained twin" in alone.caption
+    told = _figures(plain, _trained(trained, twin_top1=0.25))["accuracy"]
+    assert "untrained twin 0.250" in _texts(told.drawing)
+    assert "No record states" not in told.caption
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=4, max_size=20))
+def test_regression_agrees_with_scipy(points):
+    x, y = (np.array(values) for values in zip(*points, strict=True))
+    slope, start, r, interval = regression(list(x), list(y))
+    if np.ptp(x) < 1e-3 or np.ptp(y) < 1e-3:
+        return
+    expected = stats.linregress(x, y)
+    assert slope == pytest.approx(expected.slope, abs=1e-6, rel=1e-6)
+    assert start == pytest.approx(expected.intercept, abs=1e-5, rel=1e-6)
+    assert r == pytest.approx(expected.rvalue, abs=1e-6)
+    if interval is not None and abs(r) < 0.999:
+        known = stats.pearsonr(x, y).confidence_interval(0.95)
+        assert (interval.low, interval.high) == (
+            pytest.approx(known.low, abs=1e-5),
+            pytest.approx(known.high, abs=1e-5),
+        )
+
+
+def test_layers_stand_at_their_scores(make_record):
+    (board,) = rank([make_record("net")])
+    (entry,) = entries_of(board)
+    drawing = layers_of(entry)
+    assert drawing is not None
+    texts = _texts(drawing)
+    assert any(text.startswith("conv4: 0.688") for text in texts)
+
+
+@settings(deadline=None)
+@given(low=st.floats(-3, 2), width=st.floats(0.1, 5), value=st.floats(-10, 10))
+def test_scales_keep_order_and_stay_inside(low, width, value):
+    scale = Scale(low, low + width, 10, 200)
+    assert 10 <= scale.at(value) <= 200
+    assert scale.at(low) == 10
+    assert all(low - 1e-6 <= tick <= low + width + 1e-6 for tick in scale.ticks)
+
+
+def test_logarithmic_ticks_are_round():
+    assert Scale(2e5, 7e7, 0, 1, log=True).ticks == [1e6, 1e7]
+    assert Scale(3e5, 4e6, 0, 1, log=True).ticks == [5e5, 1e6, 2e6]
+    assert math.isclose(scale_of([math.nan, 0.4], 0, 1).low, 0.0)
+
+
+def test_text_in_drawings_is_escaped():
+    drawing = Drawing(10, 10, "<a title='x'>")
+    drawing.text(0, 0, "</text><script>")
+    drawing.rect(0, 0, 1, 1, tip="<b>")
+    root = ElementTree.fromstring(drawing.render(style=STYLE))
+    assert not [item for item in root.iter() if "script" in item.tag]
+
+
+def test_a_diagram_holds_every_part_and_folds_repeated_blocks():
+    blocks = tuple(GraphNode(f"attender.block{i}", "attender", "self-attention") for i in range(1, 9))
+    nodes = (
+        GraphNode("input", "input", "forces", shape=(30, 5, 7)),
+        GraphNode("encoder.a", "encoder", "conv"),
+        GraphNode("encoder.b", "encoder", "conv", "GRU"),
+        GraphNode("encoder.c", "encoder", "linear"),
+        *blocks,
+    )
+    edges = [GraphEdge(a.name, b.name) for a, b in pairwise(nodes)]
+    edges += [GraphEdge("encoder.b", "encoder.a", True), GraphEdge("encoder.a", "encoder.c")]
+    drawing = diagram(ModelGraph(nodes, tuple(edges)), "net")
+    texts = _texts(drawing)
+    for name in ("input", "a", "b", "c", "8 × block"):
+        assert name in texts
+    assert "conv · GRU" in texts
+    assert "1 feedback connections" in drawing.title
+    assert drawing.render().count("feedback") == 2  # the title and one dashed line
+
+
+def test_an_interval_off_the_axis_is_held_at_its_end(make_record):
+    figures = _figures(make_record("far", 7.0, interval=Interval(6.5, 7.5)), make_record("near", 0.4))
+    assert figures["fit"].drawing is not None
+
+
+def test_the_examples_hold():
+    for module in (svg, plots):
+        found = doctest.testmod(module)
+        assert found.attempted
+        assert found.failed == 0
+
+
+def test_an_ablation_changes_one_thing_at_a_time(make_record):
+    records = [
+        _trained(make_record("net.a", 0.9), "simclr", "physical", 0.75),
+        _trained(make_record("net.b", 0.5), "simclr", "physical"),
+        _trained(make_record("net.c", 0.4), "simclr", "image"),
+    ]
+    figures = _figures(*records)
+    shown = [text for text in _texts(figures["augmentation"].drawing) if text.startswith("net.")]
+    assert {text.split(":")[0] for text in shown} == {"net.b, physical", "net.c, image"}
+    shown = [text for text in _texts(figures["masking"].drawing) if text.startswith("net.")]
+    assert {text.split(":")[0] for text in shown} == {"net.a, 75% masked", "net.b, 0% masked"}
+
+
+def test_an_ablation_compares_what_was_tested_on_the_same_sweeps(make_record):
+    records = [
+        _trained(make_record("net.a", 0.9), "simclr", "physical", accuracy_data="old"),
+        _trained(make_record("net.b", 0.5), "simclr", "physical", accuracy_data="new"),
+        _trained(make_record("net.c", 0.4), "simclr", "image", accuracy_data="new"),
+        _trained(make_record("net.d", 0.3), "simclr", "none", accuracy_data="older"),
+    ]
+    shown = [text for text in _texts(_figures(*records)["augmentation"].drawing) if text.startswith("net.")]
+    assert {text.split(":")[0] for text in shown} == {"net.b, physical", "net.c, image"}

@@ -1,0 +1,100 @@
+"""Reports say what the records say, in every format, with their citations."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError
+from leaderboards.report import pdf
+from leaderboards.report.citations import references
+from leaderboards.report.paper import write_paper
+
+
+def _records(make_record):
+    zhuang = "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven"
+    first = make_record("net.simclr", 0.7, metric="RSA: correlation RDM, pearson comparison")
+    first = replace(first, card=replace(first.card, citation=zhuang, objective="simclr"))
+    return [first, make_record("other | one", 0.3, metric="RSA: correlation RDM, pearson comparison")]
+
+
+def test_markdown_holds_methods_tables_figures_and_references(make_record, tmp_path):
+    main, bib, *figures = write_paper(_records(make_record), tmp_path / "report.md", title="A *report*")
+    text = main.read_text()
+    assert text.startswith("# A \\*report\\*\n")
+    assert "2 models (2 records) were compared with demo (2 animals, 6 stimuli)" in text
+    assert "| net.simclr | 1 | 0.700 | \\[0.600, 0.800\\]" in text
+    assert "| other \\| one | 2 | 0.300 |" in text
+    assert "Not drawn:" in text
+    assert "brainbench score net.simclr" in text
+    links = re.findall(r"\]\(([^)]+\.svg)\)", text)
+    assert [tmp_path / link for link in links] == figures
+    assert all(figure.read_text().startswith("<svg") for figure in figures)
+    keys = re.findall(r"@\w+\{(\w+),", bib.read_text())
+    assert keys[0] == "brainbench"
+    assert {"kriegeskorte2008", "nili2014", "zhuang2017", "chen2020"} <= set(keys)
+    assert len(keys) == len(set(keys))
+
+
+def test_html_is_one_file_with_vector_figures(make_record, tmp_path):
+    text = write_paper(_records(make_record), tmp_path / "report.html")[0].read_text()
+    assert text.count("<svg") >= 3
+    assert "<script" not in text
+    assert not re.search(r"(src|href)=", text)
+
+
+def test_hostile_text_stays_text_in_a_report(make_record, tmp_path):
+    record = make_record("<img src=x onerror=alert(1)>[a](javascript:1)")
+    page = write_paper([record], tmp_path / "report.html")[0].read_text()
+    assert "<img" not in page
+    text = write_paper([record], tmp_path / "report.md")[0].read_text()
+    outside = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    assert "<img" not in outside
+    assert not re.search(r"(?<!\\)\]\(javascript", outside)
+
+
+def test_one_record_gives_the_report_of_that_model(make_record, tmp_path):
+    text = write_paper([make_record("net")], tmp_path / "one.md")[0].read_text()
+    assert "The model net was compared with demo" in text
+    assert "mouse-a" in text
+    assert "37,988,821" in text
+    assert "1-layers.svg" in text
+
+
+def test_an_unknown_format_and_no_records_are_errors(make_record, tmp_path):
+    with pytest.raises(UsageError, match="Unknown report format 'docx'"):
+        write_paper([make_record()], tmp_path / "a.docx")
+    with pytest.raises(DataError, match="no usable result records"):
+        write_paper([], tmp_path / "a.md")
+
+
+def test_an_architecture_from_elsewhere_is_cited_in_its_own_words(make_record):
+    record = make_record()
+    record = replace(record, card=replace(record.card, citation="Doe {2020}, A network"))
+    (found,) = [item for item in references([record]) if item.key.startswith("doe")]
+    assert found.bibtex == "@misc{doe2020anetwork,\n  note = {Doe  2020 , A network}\n}"
+
+
+def test_without_browser_and_library_the_error_says_what_to_install(make_record, tmp_path, monkeypatch):
+    monkeypatch.setattr(pdf.shutil, "which", lambda name: None)
+    monkeypatch.setitem(__import__("sys").modules, "weasyprint", None)
+    with pytest.raises(MissingDependencyError, match=r"brainbench\[board\]"):
+        write_paper([make_record()], tmp_path / "a.pdf")
+    assert not (tmp_path / "a.pdf").exists()
+
+
+def test_weasyprint_makes_a_pdf_where_there_is_no_browser(make_record, tmp_path, monkeypatch):
+    pytest.importorskip("weasyprint")
+    monkeypatch.setattr(pdf.shutil, "which", lambda name: None)
+    assert write_paper([make_record()], tmp_path / "a.pdf")[0].read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("chromium"), reason="needs the chromium browser")
+def test_chromium_prints_a_pdf_with_vector_figures(make_record, tmp_path):
+    content = write_paper(_records(make_record), tmp_path / "a.pdf")[0].read_bytes()
+    assert content.startswith(b"%PDF")
+    assert b"/Subtype /Image" not in content

@@ -1,0 +1,217 @@
+"""The site holds every record, keeps boards apart, offers its data, and runs nothing that a record brings along."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from brainbench.core.errors import DataError, UsageError
+from leaderboards import build_leaderboard, read_records, write_record
+from leaderboards.site.table import COLUMNS
+from tests.factories.html_page import HOSTILE, Page, poisoned
+
+CHROMIUM = shutil.which("chromium")
+browser = pytest.mark.skipif(CHROMIUM is None, reason="needs the chromium browser")
+
+
+def build(records: list[Any], folder: Path, **options: Any) -> Path:
+    return build_leaderboard(records, folder / "site", **options).parent
+
+
+def data(site: Path) -> dict[str, Any]:
+    page = Page(site / "index.html")
+    return json.loads(next(text for owner, text in page.texts if owner == "script"))
+
+
+def columns(board: dict[str, Any], *names: str) -> list[tuple[Any, ...]]:
+    return list(zip(*(board["data"][name] for name in names), strict=True))
+
+
+def _seeded(record, seed: int, value: float):
+    card = replace(record.card, seed=seed, objective="untrained", weights=f"w{seed}")
+    shift = value - record.score.value
+    subjects = tuple(replace(item, value=item.value + shift) for item in record.score.subjects)
+    return replace(record, card=card, score=replace(record.score, value=value, subjects=subjects))
+
+
+def test_every_row_says_rank_value_and_interval_and_baselines_follow(make_record, tmp_path):
+    (board,) = data(build([make_record("low", 0.1), make_record("a", 0.8), make_record("b", 0.75)], tmp_path))["boards"]
+    assert columns(board, "name", "first", "last", "score", "low", "high", "kind") == [
+        ("a", 1, 2, 0.8, 0.7, 0.9, "model"),
+        ("b", 1, 2, 0.75, 0.65, 0.85, "model"),
+        ("low", 3, 3, 0.1, 0.0, 0.2, "model"),
+        ("animal-to-animal", None, None, 0.712, 0.612, 0.812, "animals"),
+        ("raw input", None, None, 0.223, 0.123, 0.323, "baseline"),
+        ("random features", None, None, 0.487, 0.387, 0.587, "baseline"),
+    ]
+    assert board["band"] == [pytest.approx(0.612), pytest.approx(0.812)]
+
+
+def test_every_column_has_its_data(make_record, tmp_path):
+    (board,) = data(build([make_record()], tmp_path))["boards"]
+    keys = {column["key"] for column in COLUMNS} - {"rank", "interval"}
+    assert keys <= set(board["data"])
+
+
+def test_seeds_are_folded_into_one_row_with_their_spread(make_record, tmp_path):
+    records = [_seeded(make_record("net"), seed, value) for seed, value in enumerate((0.4, 0.5, 0.6))]
+    site = build([*records, make_record("other", 0.2)], tmp_path)
+    (board,) = data(site)["boards"]
+    rows = {name: row for name, *row in columns(board, "name", "score", "spread", "seeds", "runs")}
+    assert rows["net"][:3] == [0.5, 0.1, 3]
+    assert [run[:2] for run in rows["net"][3]] == [[0, 0.4], [1, 0.5], [2, 0.6]]
+    assert rows["other"][2:] == [1, None]
+    assert len(list((site / "models").iterdir())) == 2
+    assert len(list((site / "records").iterdir())) == 4
+    page = Page(next((site / "models").glob("net--*")))
+    assert "Over 3 seeds" in page.text
+    assert "spread over seeds 0.100" in page.text
+
+
+def test_boards_are_kept_apart_and_the_page_says_so(make_record, tmp_path):
+    site = build([make_record("a"), make_record("b", estimator="thesis")], tmp_path)
+    assert [board["data"]["name"][0] for board in data(site)["boards"]] == ["a", "b"]
+    assert "Scores are comparable only within a board" in Page(site / "index.html").text
+
+
+def test_bad_files_are_listed_and_left_out(make_record, tmp_path):
+    write_record(make_record("good"), tmp_path / "store")
+    edited = write_record(make_record("edited"), tmp_path / "store")
+    edited.write_text(edited.read_text().replace("0.523", "0.993"))
+    page = Page(build(read_records(tmp_path / "store"), tmp_path) / "index.html")
+    assert "1 file is left out" in page.text
+    assert f"{edited.name!r} was edited or renamed" in page.text
+    assert "0.993" not in page.source
+
+
+def test_conflicts_and_stale_records_are_said_in_the_row_and_on_the_page(make_record, tmp_path):
+    site = build([make_record("a", 0.5), make_record("a", 0.6)], tmp_path)
+    (board,) = data(site)["boards"]
+    assert all(any("conflict:" in note for note in notes) for notes in board["data"]["notes"][:2])
+    assert "the same computation gave" in Page(next((site / "models").iterdir())).text
+
+
+def test_downloads_hold_the_records_and_the_table(make_record, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+
+    records = [make_record("=HYPERLINK(1)", 0.3), make_record("b", 0.8), make_record("c", status="undefined")]
+    site = build(records, tmp_path)
+    rows = list(csv.DictReader((site / "data" / "leaderboard.csv").read_text().splitlines()))
+    models = [(row["name"], row["value"], row["rank_first"]) for row in rows if row["row"] == "model"]
+    assert models == [("b", "0.8", "1"), ("'=HYPERLINK(1)", "0.3", "2"), ("c", "", "")]
+    table = parquet.read_table(site / "data" / "leaderboard.parquet").to_pylist()
+    plain = json.loads((site / "data" / "leaderboard.json").read_text())
+    assert table == plain
+    assert [row["value"] for row in table[:3]] == [0.8, 0.3, None]
+    zipfile.ZipFile(site / "data" / "records.zip").extractall(tmp_path / "unpacked")
+    identities = {record.identity for record in records}
+    for folder in (tmp_path / "unpacked", site / "records"):
+        assert {item.record.identity for item in read_records(folder) if item.record} == identities
+    links = {link["href"] for link in Page(site / "index.html").all("a") if "download" in link}
+    assert all((site / link).is_file() for link in links)
+    assert len(links) == 5
+
+
+def test_equal_records_give_equal_sites_in_any_order_and_a_rebuild_leaves_nothing_old(make_record, tmp_path):
+    records = [make_record(name, 0.5) for name in "abcd"]
+    (tmp_path / "x").mkdir()
+    one, other = build(records, tmp_path), build(records[::-1], tmp_path / "x")
+    names = sorted(path.relative_to(one) for path in one.rglob("*.*") if path.suffix != ".parquet")
+    assert names == sorted(path.relative_to(other) for path in other.rglob("*.*") if path.suffix != ".parquet")
+    assert all((one / name).read_bytes() == (other / name).read_bytes() for name in names)
+    build(records[:1], tmp_path)
+    assert len(list((one / "models").iterdir())) == len(list((one / "records").iterdir())) == 1
+
+
+def test_nothing_to_show_and_foreign_folders_are_errors_that_say_what_to_do(make_record, tmp_path):
+    with pytest.raises(DataError, match=r"no result records.*brainbench score MODEL --out FOLDER"):
+        build_leaderboard([], tmp_path / "site")
+    with pytest.raises(UsageError, match="A leaderboard is a folder"):
+        build_leaderboard([make_record()], tmp_path / "board.html")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("precious")
+    with pytest.raises(UsageError, match="holds something else"):
+        build_leaderboard([make_record()], tmp_path / "mine")
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_hostile_text_cannot_leave_the_data_of_the_table(make_record, tmp_path, text):
+    record = poisoned(make_record(), text)
+    bad = tmp_path / "store" / "bad.json"
+    bad.parent.mkdir()
+    bad.write_text(json.dumps({"schema": 2, "score": text}))
+    site = build([*read_records(bad), record], tmp_path, title=text)
+    page = Page(site / "index.html")
+    assert len(page.all("script")) == 2
+    assert data(site)["boards"][0]["data"]["name"][0] == text
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as api:
+        yield api.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+
+
+@pytest.mark.slow
+@browser
+def test_nothing_hostile_runs_in_a_browser_and_our_script_does(make_record, tmp_path, chromium):
+    site = build([poisoned(make_record(value=0.1 * i), text) for i, text in enumerate(HOSTILE)], tmp_path, title="calm")
+    page = chromium.new_page()
+    for path in (site / "index.html", site / "figures.html", *(site / "models").iterdir()):
+        page.goto(path.as_uri())
+        assert page.title() in ("calm", "Figures") or page.title().endswith(": brainbench leaderboard")
+        assert page.evaluate("typeof pwned") == "undefined"
+    page.goto((site / "index.html").as_uri())
+    for place in range(page.locator("#recordings option").count()):
+        page.select_option("#recordings", index=place)
+        assert page.locator("#ranking tbody tr.model").count() == 1
+        assert page.title() == "calm"
+
+
+@pytest.mark.slow
+@browser
+def test_filters_sorting_columns_and_seeds_are_kept_in_the_address(make_record, tmp_path, chromium):
+    def named(name, value, encoder, parameters):
+        record = make_record(name, value)
+        return replace(record, card=replace(record.card, encoder=encoder, parameters=parameters))
+
+    twin = named("twin", 0.5, "zhuang", 2_000_000)
+    records = [named("big", 0.9, "zhuang", 40_000_000), named("small", 0.3, "s4", 300_000)]
+    records += [_seeded(twin, seed, 0.4 + 0.1 * seed) for seed in range(3)]
+    site = build(records, tmp_path)
+    page = chromium.new_page()
+    page.goto((site / "index.html").as_uri())
+
+    def names() -> list[str]:
+        found = page.locator("#ranking tbody tr.model th bdi").all_inner_texts()
+        return found
+
+    assert names() == ["big", "twin", "small"]
+    page.select_option("#encoder", "zhuang")
+    assert names() == ["big", "twin"]
+    page.get_by_label("Fold seeds").uncheck()
+    assert names() == ["big", "twin", "twin", "twin"]
+    page.locator("th button", has_text="score").click()
+    assert names()[-1] == "big"
+    page.locator("summary", has_text="Columns").click()
+    page.get_by_role("checkbox", name="layer").uncheck()
+    assert page.locator("#ranking thead th").all_inner_texts().count("layer") == 0
+    address = page.url
+    again = chromium.new_page()
+    again.goto(address)
+    assert again.locator("#ranking tbody tr.model th bdi").all_inner_texts() == names()
+    assert again.locator("#encoder").input_value() == "zhuang"
+    again.get_by_role("button", name="Clear").click()
+    assert again.locator("#ranking tbody tr.model th bdi").all_inner_texts() == ["big", "twin", "small"]
+    again.select_option("#parameters", "0-1e6")
+    assert "1 of 3 models" in again.locator("#status").inner_text()
+    again.fill("#q", "nothing like this")
+    assert "No model fits" in again.locator("#ranking tbody").inner_text()

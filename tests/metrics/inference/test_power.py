@@ -1,0 +1,92 @@
+"""Power analysis: its simulated truth, its limits, and its agreement with the whole pipeline."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.metrics import score_rdms
+from brainbench.metrics.inference.power import Design, _experiments, needed, power
+from tests.factories.animals import STIMULI, make_subject
+
+
+def test_the_simulated_rdms_have_the_stated_correlations():
+    design = Design(stimuli=40, animals=3, effect=0.5, consistency=0.7, reliability=0.6, layers=2)
+    model, brain = _experiments(np.random.default_rng(0), design, 60)
+
+    def r(a, b):
+        return np.mean([np.corrcoef(x, y)[0, 1] for x, y in zip(a, b, strict=True)])
+
+    assert r(model[:, 0], brain[:, 0]) == pytest.approx(0.5 * np.sqrt(0.6), abs=0.02)
+    assert r(brain[:, 0], brain[:, 1]) == pytest.approx(0.7 * 0.6, abs=0.02)
+    assert r(model[:, 1], brain[:, 0]) == pytest.approx(0, abs=0.02)
+    assert brain.std() == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("layers", [1, 8])
+def test_without_an_effect_the_power_is_the_level(layers):
+    found = power(Design(effect=0.0, animals=4, layers=layers), simulations=600)
+    assert found.interval.low <= 0.05 <= found.interval.high
+
+
+def test_power_grows_with_stimuli_animals_and_effect():
+    base = Design(stimuli=6, animals=4, effect=0.5)
+    values = [
+        power(design, simulations=300).power
+        for design in (Design(6, 4, 0.2), base, Design(6, 4, 0.8), Design(10, 4, 0.5), Design(6, 30, 0.5))
+    ]
+    assert values[0] < values[1] < values[2]
+    assert values[3] > values[1]
+    assert values[4] >= values[1] - 0.05
+
+
+def test_the_search_returns_a_number_that_suffices_and_none_where_nothing_does():
+    design = Design(effect=0.6, animals=6)
+    number = needed(design, "stimuli", simulations=300)
+    assert power(Design(number, 6, 0.6), simulations=300).power >= 0.8
+    # With six stimuli more animals cannot help a weak effect.
+    assert needed(Design(effect=0.2), "animals", simulations=200) is None
+
+
+def test_three_stimuli_find_nothing():
+    found = power(Design(stimuli=3))
+    assert (found.power, found.simulations) == (0.0, 0)
+    assert found.reason == "3 stimuli allow no p below 0.167, whatever is true"
+
+
+@pytest.mark.slow
+def test_power_is_that_of_the_scores_own_test():
+    design = Design(animals=5, effect=0.6, layers=3)
+    rng = np.random.default_rng(1)
+    model, brain = _experiments(rng, design, 400)
+    found = 0
+    for layers, animals in zip(model, brain, strict=True):
+        subjects = [make_subject(f"m{i}", animal, seed=i) for i, animal in enumerate(animals)]
+        score = score_rdms({str(i): layer for i, layer in enumerate(layers)}, subjects, name="x", stimuli=STIMULI)
+        found += score.p <= 0.05
+    expected = power(design, simulations=2000)
+    assert found / 400 == pytest.approx(expected.power, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stimuli": 1}, "at least 2 stimuli"),
+        ({"reliability": 1.2}, "reliability lies between 0 and 1; received 1.2"),
+        ({"alpha": 0}, "alpha lies between"),
+        ({"effect": 0.95, "consistency": 0.5}, "bounds it by √consistency = 0.707"),
+    ],
+)
+def test_impossible_designs_are_refused_in_a_sentence(change, message):
+    with pytest.raises(UsageError, match=message):
+        Design(**change)
+
+
+def test_other_misuse_is_told_in_a_sentence():
+    with pytest.raises(UsageError, match="'stimuli' or 'animals'; received 'trials'"):
+        needed(Design(), "trials")
+    with pytest.raises(UsageError, match="target power"):
+        needed(Design(), target=1.0)
+    with pytest.raises(UsageError, match="at least 1 simulation"):
+        power(Design(), simulations=0)

@@ -1,0 +1,77 @@
+"""Decoding of labels' properties, as a metric."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from brainbench.metrics import TrialBlock, get_metric
+from brainbench.metrics.measures.classifier import decode
+from brainbench.metrics.measures.decoding import label_properties
+
+LABELS = [f"{shape}-{place}" for shape in ("concave", "convex") for place in ("close", "far", "medium")]
+
+
+def _make_axes(rng, units):
+    shape, place = np.repeat(np.eye(2), 3, axis=0), np.tile(np.eye(3), (2, 1))
+    return np.concatenate([shape, place], axis=1) @ rng.normal(size=(5, units))
+
+
+def _make_animals(metric, number=4, noise=0.5, units=30):
+    rng = np.random.default_rng(0)
+    labels = np.repeat(np.arange(6), 8)
+    trials = [_make_axes(rng, units)[labels] + noise * rng.normal(size=(48, units)) for _ in range(number)]
+    return [metric.animal(f"m{i}", [TrialBlock(block, labels)], 6) for i, block in enumerate(trials)]
+
+
+def test_labels_name_their_properties_in_any_number_of_parts():
+    assert list(label_properties(LABELS)) == ["concave/convex", "close/far/medium"]
+    assert label_properties(["a-x", "b-x", "c-x"]) == {}
+    assert label_properties(["a-1", "a-2", "b"]) == {}
+    assert list(label_properties(["go", "go", "nogo", "nogo"])) == ["go/nogo"]
+
+
+def test_a_model_with_axes_is_decoded_and_one_without_is_not():
+    metric = get_metric("decoding")
+    rng = np.random.default_rng(1)
+    animals = _make_animals(metric)
+    layers = {"noise": rng.normal(size=(6, 200)), "axes": _make_axes(rng, 40)}
+    score = metric.score(layers, animals, name="x", stimuli=LABELS)
+    assert (score.status, score.value, score.layer) == ("ok", 1.0, "axes")
+    # Both properties are decoded by chance in few of the 720 orders.
+    assert score.p < 0.02
+    tests = {item["layer"]: item for item in score.provenance["statistics"]["layer_tests"]}
+    assert tests["axes"]["p"] <= tests["axes"]["p_corrected"] == score.p
+    assert tests["noise"]["p_corrected"] > 0.2
+    shape, place = score.provenance["statistics"]["decoding"]
+    assert (shape["chance"], place["chance"]) == (0.5, pytest.approx(1 / 3))
+    assert shape["expected"] < 0.5
+    by_hand = decode(layers["axes"], range(6), [label.split("-")[0] for label in LABELS])
+    assert (shape["accuracy"], shape["p"], shape["expected"]) == (
+        by_hand.accuracy,
+        pytest.approx(by_hand.p),
+        pytest.approx(by_hand.expected),
+    )
+
+
+def test_animals_are_decoded_each_by_itself():
+    metric = get_metric("decoding")
+    score = metric.score_animals(_make_animals(metric), stimuli=LABELS)
+    assert score.value > 0.9
+    assert [subject.subject for subject in score.subjects] == ["m0", "m1", "m2", "m3"]
+    assert score.interval.low > 0.7
+    # Twelve of 720 orders only rename shapes and places.
+    assert score.p == pytest.approx(score.p_smallest) == pytest.approx(12 / 720)
+
+
+def test_labels_without_a_shared_property_are_undefined_in_words():
+    metric = get_metric("decoding")
+    stimuli = list("abcdef")
+    score = metric.score({"l": np.eye(6)}, _make_animals(metric), name="x", stimuli=stimuli)
+    assert (score.status, math.isnan(score.value)) == ("undefined", True)
+    assert "as 'convex-far' and 'convex-close' do: a, b, c, d" in score.reasons[0]
+    assert metric.score_animals(_make_animals(metric), stimuli=stimuli).status == "undefined"
+    broken = metric.score({"l": np.full((6, 2), np.nan)}, _make_animals(metric), name="x", stimuli=LABELS)
+    assert broken.reasons[0] == "activations of every layer are not finite"

@@ -1,0 +1,227 @@
+"""Metrics beyond RSA: their definitions by brute force, the shared machinery, and a metric of one's own."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.linalg import orthogonal_procrustes
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.metrics import (
+    PatternMetric,
+    TrialBlock,
+    compare,
+    find_metric,
+    get_metric,
+    list_metrics,
+    rdm,
+    register_metric,
+)
+from brainbench.metrics.measures.animal_patterns import animal_patterns
+from brainbench.metrics.measures.procrustes import Procrustes, procrustes_distance
+from brainbench.metrics.measures.ridge import PENALTIES, RidgeEncoding
+from tests.factories.animals import STIMULI, make_block, make_latent
+
+OTHERS = [name for name in ("cka", "procrustes", "ridge", "rsa", "rsa-crossnobis")]
+
+
+def _make(metric, count=5, noise=1.0, seed=0):
+    latent = make_latent(seed)
+    blocks = [[make_block(latent, seed=i, units=40, repeats=12, noise=noise)] for i in range(count)]
+    return latent, [metric.animal(f"m{i}", block, 6, stimuli=STIMULI) for i, block in enumerate(blocks)]
+
+
+def _score(metric, features, animals, **options):
+    return metric.score(features, animals, name="model", stimuli=STIMULI, **options)
+
+
+def test_the_registry_lists_what_there_is():
+    assert set(OTHERS) <= set(list_metrics())
+    assert list_metrics()[0] == "rsa"
+    with pytest.raises(UsageError, match=r"did you mean 'ridge'.*Your own: FILE\.py:CLASS"):
+        get_metric("rigde")
+    with pytest.raises(UsageError, match="exists already"):
+        register_metric(get_metric("ridge"))
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_shared_geometry_is_found_and_an_unrelated_model_is_not(name):
+    metric = get_metric(name)
+    latent, animals = _make(metric)
+    rng = np.random.default_rng(1)
+    features = {"luck": rng.normal(size=(6, 30)), "true": latent @ rng.normal(size=(4, 200))}
+    found = _score(metric, features, animals)
+    assert (found.status, found.layer) == ("ok", "true")
+    assert found.p == pytest.approx(1 / 720)
+    luck = _score(metric, {"luck": features["luck"]}, animals)
+    assert luck.value < found.value
+    assert luck.p > 0.05
+    between = metric.score_animals(animals, stimuli=STIMULI)
+    assert between.status == "ok"
+    assert between.p < 0.01
+    assert found.value == pytest.approx(between.value, abs=0.1)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_order_of_stimuli_and_animals_and_the_scale_of_features_are_irrelevant(name):
+    metric = get_metric(name)
+    latent = make_latent(2)
+    rng = np.random.default_rng(3)
+    features = latent @ rng.normal(size=(4, 50)) + rng.normal(size=(6, 50))
+    order = rng.permutation(6)
+    first, second = [], []
+    for index in range(3):
+        block = make_block(latent, seed=index)
+        moved = TrialBlock(block.responses, np.argsort(order)[block.labels], block.keys)
+        first.append(metric.animal(f"m{index}", [block], 6))
+        second.append(metric.animal(f"m{index}", [moved], 6))
+    one = _score(metric, {"a": features}, first)
+    two = _score(metric, {"a": 7.5 * features[order]}, second[::-1])
+    np.testing.assert_allclose([two.value, two.p], [one.value, one.p], atol=1e-10)
+
+
+def test_cka_is_linear_centred_kernel_alignment():
+    rng = np.random.default_rng(4)
+    x, y = rng.normal(size=(8, 20)), rng.normal(size=(8, 35))
+    x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+    expected = np.linalg.norm(x.T @ y) ** 2 / np.linalg.norm(x.T @ x) / np.linalg.norm(y.T @ y)
+    found = compare(rdm(x, method="sqeuclidean"), rdm(y, method="sqeuclidean"), method="whitened-cosine")
+    assert found == pytest.approx(expected)
+
+
+def test_procrustes_is_scipys():
+    rng = np.random.default_rng(5)
+    x, y = rng.normal(size=(8, 20)), rng.normal(size=(8, 20))
+    unit = [(z - z.mean(axis=0)) / np.linalg.norm(z - z.mean(axis=0)) for z in (x, y)]
+    assert Procrustes().similarity(x, y) == pytest.approx(orthogonal_procrustes(*unit)[1])
+    assert procrustes_distance(x, 3 * x @ np.linalg.qr(rng.normal(size=(20, 20)))[0] + 1) == pytest.approx(0, abs=1e-6)
+    one, two, three = (rng.normal(size=(8, 5)) for _ in range(3))
+    assert procrustes_distance(one, three) <= procrustes_distance(one, two) + procrustes_distance(two, three)
+    with pytest.raises(UsageError, match="8 and 7 stimuli"):
+        procrustes_distance(x, y[:7])
+
+
+@pytest.mark.parametrize("count", [6, 13])
+def test_ridge_is_nested_cross_validation_done_by_hand(count):
+    rng = np.random.default_rng(6)
+    x = rng.normal(size=(count, 9))
+    labels = np.repeat(np.arange(count), 5)
+    responses = (x @ rng.normal(size=(9, 7)))[labels] + rng.normal(size=(len(labels), 7))
+    animal = animal_patterns("a", [TrialBlock(responses, labels)], count)
+
+    def predict(train, test, penalty):
+        a, mean = x[train] - x[train].mean(axis=0), animal.patterns[train].mean(axis=0)
+        scale = penalty * (a**2).sum() / len(train)
+        weight = np.linalg.solve(a.T @ a + scale * np.eye(9), a.T @ (animal.patterns[train] - mean))
+        return (x[test] - x[train].mean(axis=0)) @ weight + mean
+
+    folds = np.arange(count) * min(count, 10) // count
+    error = base = 0.0
+    for fold in np.unique(folds):
+        test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
+        inner = [
+            sum(((animal.patterns[[t]] - predict(np.setdiff1d(train, t), [t], penalty)) ** 2).sum() for t in train)
+            for penalty in PENALTIES
+        ]
+        best = PENALTIES[int(np.argmin(inner))]
+        error += ((animal.patterns[test] - predict(train, test, best)) ** 2).sum()
+        base += ((animal.patterns[test] - animal.patterns[train].mean(axis=0)) ** 2).sum()
+    noise = animal.noise.sum()
+    assert RidgeEncoding().compare(x, animal) == pytest.approx(1 - (error - noise) / (base - noise), rel=1e-8)
+
+
+def test_the_noise_of_the_means_is_that_of_trials():
+    rng = np.random.default_rng(7)
+    labels = np.repeat(np.arange(6), 400)
+    block = TrialBlock(rng.normal(size=(2400, 3)) * [1.0, 2.0, 3.0], labels)
+    animal = animal_patterns("a", [block], 6)
+    np.testing.assert_allclose(animal.noise.mean(axis=0), np.array([1, 4, 9]) / 400, rtol=0.1)
+    expected = np.stack([block.responses[labels == k].var(axis=0, ddof=1) / 400 for k in range(6)])
+    np.testing.assert_allclose(animal.noise, expected)
+
+
+def test_a_perfect_encoder_of_noisy_trials_is_worth_one_and_raw_variance_is_not():
+    rng = np.random.default_rng(8)
+    latent = rng.normal(size=(20, 2))
+    labels = np.repeat(np.arange(20), 6)
+    values, raw = [], []
+    for _ in range(8):
+        responses = (latent @ rng.normal(size=(2, 30)))[labels] + 2.5 * rng.normal(size=(120, 30))
+        animal = animal_patterns("a", [TrialBlock(responses, labels)], 20)
+        values.append(RidgeEncoding().compare(latent, animal))
+        raw.append(RidgeEncoding().compare(latent, dataclasses.replace(animal, noise=0 * animal.noise)))
+    assert np.mean(values) == pytest.approx(1, abs=0.15)
+    assert np.mean(raw) < 0.75
+
+
+def test_a_metric_of_ones_own_takes_one_file(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "import numpy as np\nfrom brainbench.metrics import PatternMetric\n\n\n"
+        "class Mine(PatternMetric):\n    name = 'mine'\n    title = 'share of neighbours'\n\n"
+        "    def similarity(self, model, brain):\n"
+        "        d = [((x[:, None] - x) ** 2).sum(-1) + 1e9 * np.eye(len(x)) for x in (model, brain)]\n"
+        "        return float((d[0].argmin(1) == d[1].argmin(1)).mean())\n"
+    )
+    metric = find_metric(f"{path}:Mine")
+    latent, animals = _make(metric)
+    found = _score(metric, {"a": latent, "b": make_latent(77)}, animals)
+    assert found.metric == "mine: share of neighbours"
+    assert found.value > 0.6
+    assert found.p < 0.05
+    assert "not corrected for noise: compare with the animal-to-animal value, not with 1" in found.reasons
+    with pytest.raises(UsageError, match="did you mean 'Mine'"):
+        find_metric(f"{path}:Mina")
+    with pytest.raises(UsageError, match="existing file"):
+        find_metric("nowhere.py:Mine")
+    path.write_text("1 / 0")
+    with pytest.raises(DataError, match="ZeroDivisionError"):
+        find_metric(f"{path}:Mine")
+    path.write_text("class Half:\n    name = 'x'\n")
+    with pytest.raises(UsageError, match="lacks title, animal, score, score_animals"):
+        find_metric(f"{path}:Half")
+
+
+def test_a_metric_without_similarity_says_so():
+    class Nothing(PatternMetric):
+        name = "nothing"
+
+    latent, animals = _make(Nothing())
+    with pytest.raises(UsageError, match="'nothing' does not define similarity"):
+        _score(Nothing(), {"a": latent}, animals)
+
+
+def test_what_cannot_be_scored_is_undefined_or_unreliable_in_words():
+    metric = get_metric("ridge")
+    latent, animals = _make(metric)
+    flat = _score(metric, {"a": np.ones((6, 4)), "b": np.full((6, 4), np.nan)}, animals)
+    assert (flat.status, flat.reasons[0]) == ("undefined", "activations of every layer are constant or not finite")
+    lacking = metric.animal("z", [make_block(latent, gap=(2,))], 6, stimuli=STIMULI)
+    found = _score(metric, {"a": latent, "b": np.ones((6, 4))}, [*animals, lacking])
+    assert "z left out: no trials of 'convex-far'" in found.reasons
+    assert [layer.status for layer in found.layers] == ["ok", "undefined"]
+    alone = _score(metric, {"a": latent}, [lacking])
+    assert alone.reasons[0] == "no animal can be used"
+    labels = np.repeat(np.arange(6), 8)
+    silent = [TrialBlock(np.random.default_rng(i).normal(size=(48, 4)), labels) for i in range(3)]
+    noise = [metric.animal(str(i), [block], 6) for i, block in enumerate(silent)]
+    unreliable = _score(metric, {"a": latent}, noise)
+    assert unreliable.status in ("unreliable", "undefined")
+    with pytest.raises(UsageError, match="has 'default' only"):
+        _score(metric, {"a": latent}, animals, estimator="thesis")
+    with pytest.raises(UsageError, match="have 5 rows; 6 stimuli"):
+        _score(metric, {"a": latent[:5]}, animals)
+    with pytest.raises(UsageError, match="no animals"):
+        _score(metric, {"a": latent}, [])
+
+
+def test_many_stimuli_take_random_orders():
+    rng = np.random.default_rng(9)
+    latent = rng.normal(size=(12, 3))
+    metric = get_metric("ridge")
+    animals = [metric.animal(f"m{i}", [make_block(latent, seed=i)], 12) for i in range(3)]
+    found = metric.score({"a": latent}, animals, name="x", stimuli=[str(k) for k in range(12)])
+    assert found.p == pytest.approx(1 / 1000)
+    assert "999 random orders" in found.p_method

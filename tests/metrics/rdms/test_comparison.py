@@ -1,0 +1,126 @@
+"""Comparisons against scipy and rsatoolbox."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from brainbench.core.errors import UsageError
+from brainbench.metrics import COMPARISONS, compare
+from brainbench.metrics.rdms.comparison import compare_all
+from brainbench.metrics.rdms.pairs import permuted_pairs
+
+THEIRS = {
+    "pearson": "corr",
+    "spearman": "spearman",
+    "rho-a": "rho-a",
+    "tau-a": "tau-a",
+    "tau-b": "tau-b",
+    "cosine": "cosine",
+    "whitened-cosine": "cosine_cov",
+    "whitened-pearson": "corr_cov",
+}
+
+
+def _make_rdms(count, stimuli=6, seed=0, ties=False):
+    rng = np.random.default_rng(seed)
+    rdms = rng.gamma(3.0, 1.0, size=(count, stimuli * (stimuli - 1) // 2))
+    return np.round(rdms) if ties else rdms
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("ties", [False, True])
+@pytest.mark.parametrize("stimuli", [4, 6, 18])
+@pytest.mark.parametrize("method", COMPARISONS)
+def test_comparisons_equal_rsatoolbox(method, stimuli, ties):
+    rsa = pytest.importorskip("rsatoolbox.rdm")
+    a, b = _make_rdms(3, stimuli, 1, ties), _make_rdms(4, stimuli, 2, ties)
+    expected = rsa.compare(rsa.RDMs(a), rsa.RDMs(b), method=THEIRS[method])
+    np.testing.assert_allclose(compare(a[:, None], b[None], method=method), expected, atol=1e-10)
+    np.testing.assert_allclose(compare_all(a, b, method=method), expected, atol=1e-10)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("method", COMPARISONS)
+def test_pairs_missing_in_both_are_left_out_as_in_rsatoolbox(method):
+    rsa = pytest.importorskip("rsatoolbox.rdm")
+    a, b = _make_rdms(1, 6, 1), _make_rdms(1, 6, 2)
+    a[:, [2, 7]] = b[:, [2, 7]] = np.nan
+    expected = rsa.compare(rsa.RDMs(a), rsa.RDMs(b), method=THEIRS[method])[0, 0]
+    # rsatoolbox' closed form for whitening is exact for complete RDMs only; ours inverts the covariance.
+    if method.startswith("whitened"):
+        expected = rsa.compare(rsa.RDMs(a), rsa.RDMs(b), method=THEIRS[method], sigma_k=np.eye(6))[0, 0]
+    np.testing.assert_allclose(
+        compare(a[0], b[0], method=method), expected, atol=2e-6 if "whitened" in method else 1e-10
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "reference"),
+    [("pearson", stats.pearsonr), ("spearman", stats.spearmanr), ("tau-b", stats.kendalltau)],
+)
+def test_a_pair_missing_on_one_side_is_left_out(method, reference):
+    a, b = _make_rdms(1, 6, 3)[0], _make_rdms(2, 6, 4)
+    b[1, 3] = np.nan
+    keep = np.arange(15) != 3
+    expected = [reference(a, b[0])[0], reference(a[keep], b[1][keep])[0]]
+    np.testing.assert_allclose(compare(a, b, method=method), expected, atol=1e-12)
+
+
+def test_layers_permutations_and_animals_broadcast():
+    layers, orders, animals = _make_rdms(3, 6, 5), _make_rdms(4, 6, 6), _make_rdms(5, 6, 7)
+    result = compare((layers[:, None] + orders)[:, :, None], animals)
+    assert result.shape == (3, 4, 5)
+    np.testing.assert_allclose(result[2, 1, 4], stats.pearsonr(layers[2] + orders[1], animals[4])[0], atol=1e-13)
+
+
+@pytest.mark.parametrize("method", COMPARISONS)
+def test_an_rdm_without_differences_has_no_direction(method):
+    flat = np.full(15, 0.1) * (1 + 1e-16)
+    result = float(compare(flat, _make_rdms(1)[0], method=method))
+    if method in ("rho-a", "tau-a"):
+        assert result == 0
+    elif "cosine" in method:
+        assert np.isfinite(result)
+        assert np.isnan(compare(np.zeros(15), _make_rdms(1)[0], method=method))
+    else:
+        assert np.isnan(result)
+
+
+def test_small_differences_on_a_large_offset_are_not_called_constant():
+    a, b = 1e8 + 1e-3 * _make_rdms(1, 6, 1)[0], _make_rdms(1, 6, 2)[0]
+    np.testing.assert_allclose(compare(a, b), stats.pearsonr(a - 1e8, b)[0], atol=1e-6)
+
+
+def test_comparisons_without_any_common_pair_are_nan():
+    a, b = np.full(15, np.nan), _make_rdms(1)[0]
+    assert np.isnan(compare(a, b))
+    assert np.isnan(compare([1.0], [2.0])), "two stimuli have one pair"
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(COMPARISONS), st.integers(3, 8))
+def test_permuting_the_stimuli_of_both_changes_nothing_and_arguments_commute(seed, method, stimuli):
+    rng = np.random.default_rng(seed)
+    a, b = rng.gamma(2.0, size=(2, stimuli * (stimuli - 1) // 2))
+    pairs = permuted_pairs(rng.permutation(stimuli)[None])[0]
+    expected = compare(a, b, method=method)
+    np.testing.assert_allclose(compare(a[pairs], b[pairs], method=method), expected, atol=1e-12)
+    np.testing.assert_allclose(compare(b, a, method=method), expected, atol=1e-12)
+    assert abs(float(expected)) <= 1 + 1e-12
+
+
+def test_misuse_is_told_in_a_sentence():
+    with pytest.raises(UsageError, match="did you mean 'pearson'"):
+        compare(np.ones(3), np.ones(3), method="pearsson")
+    with pytest.raises(UsageError, match="RDMs of 3 and 4 stimuli cannot be compared"):
+        compare(np.ones(3), np.ones(6))
+    with pytest.raises(UsageError, match=r"K\(K−1\)/2 entries"):
+        compare(np.ones(5), np.ones(5))
+    with pytest.raises(UsageError, match="do not broadcast"):
+        compare(np.ones((2, 3)), np.ones((4, 3)))
+    with pytest.raises(UsageError, match="must be RDM vectors"):
+        compare([[1, 2, 3], [1, 2]], np.ones(3))

@@ -1,0 +1,61 @@
+"""RDMs that show themselves."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.metrics import RDM, compare, rdm
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def _draw(shown):
+    return ElementTree.fromstring(shown._repr_html_())
+
+
+def test_a_named_rdm_stands_for_its_values():
+    values = rdm(np.random.default_rng(0).normal(size=(4, 9)))
+    named = RDM(values, ["a", "b", "c", "d"], title="x")
+    assert compare(named, values) == pytest.approx(1.0)
+    np.testing.assert_array_equal(np.asarray(named), values)
+    assert named.between("b", "d") == named.between("d", "b") == values[4]
+    assert named.matrix.shape == (4, 4)
+    assert len(named) == 6
+
+
+def test_the_picture_has_a_cell_with_its_value_for_every_pair():
+    named = RDM([0.0, 0.25, 1.0], ["near", "medium", "far"], title="of <touch>")
+    root = _draw(named)
+    told = [title.text for title in root.iter(f"{SVG}title")]
+    assert len(told) == 6
+    assert "near – far: 0.25" in told
+    fills = {rect[0].text: rect.get("fill") for rect in root.iter(f"{SVG}rect") if len(rect)}
+    assert fills["near – medium: 0"] == "rgb(240,246,245)"
+    assert fills["medium – far: 1"] == "rgb(14,77,84)"
+    assert "<touch>" not in named._repr_html_()
+    assert root.get("aria-label") == "of <touch> of 3 stimuli, from 0 to 1"
+
+
+def test_missing_pairs_and_equal_pairs_can_be_drawn():
+    assert "nan" in _draw(RDM([np.nan, 1.0, 2.0])).find(f"{SVG}rect/{SVG}title").text
+    assert _draw(RDM([2.0, 2.0, 2.0])) is not None
+    assert _draw(RDM([np.nan] * 3)) is not None
+
+
+def test_many_stimuli_are_drawn_without_names_and_very_many_are_told():
+    forty = RDM(np.arange(780.0))
+    assert len(list(_draw(forty).iter(f"{SVG}text"))) == 2
+    assert RDM(np.ones(499_500))._repr_html_() == "<p>RDM: 1000 stimuli, 499,500 pairs</p>"
+
+
+def test_what_is_no_rdm_is_refused():
+    with pytest.raises(UsageError, match="3 stimuli; received 2 names"):
+        RDM([1, 2, 3], ["a", "b"])
+    with pytest.raises(UsageError, match=r"received shape \(2, 3\)"):
+        RDM(np.ones((2, 3)))
+    with pytest.raises(UsageError, match="no stimulus 'z'"):
+        RDM([1, 2, 3]).between("0", "z")

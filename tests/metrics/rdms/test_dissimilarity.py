@@ -1,0 +1,272 @@
+"""RDMs against rsatoolbox, closed forms and exact arithmetic."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.metrics import RDM_METHODS, noise_precision, rdm, rdm_problem
+from brainbench.metrics.rdms.pairs import permuted_pairs, square
+
+METHODS_WITHOUT_FOLDS = [method for method in RDM_METHODS if method != "crossnobis"]
+
+
+def _make_trials(seed=0, stimuli=6, units=23, repeats=10, offset=5.0):
+    rng = np.random.default_rng(seed)
+    labels = np.tile(np.arange(stimuli), repeats)
+    folds = np.repeat(np.arange(repeats) % 5, stimuli)
+    means = rng.gamma(2.0, 2.0, size=(stimuli, units))
+    return means[labels] + rng.gamma(1.0, 1.0, size=(len(labels), units)) + offset, labels, folds
+
+
+def _rsatoolbox_rdm(trials, labels, method, **options):
+    rsa_data = pytest.importorskip("rsatoolbox.data")
+    rsa_rdm = pytest.importorskip("rsatoolbox.rdm")
+    descriptors = {"stimulus": labels}
+    if "folds" in options:
+        descriptors["fold"] = options.pop("folds")
+        options["cv_descriptor"] = "fold"
+    dataset = rsa_data.Dataset(trials, obs_descriptors=descriptors)
+    return rsa_rdm.calc_rdm(dataset, method=method, descriptor="stimulus", **options).dissimilarities[0]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("method", "theirs"), [("correlation", "correlation"), ("sqeuclidean", "euclidean"), ("poisson", "poisson")]
+)
+def test_plain_distances_equal_rsatoolbox(method, theirs):
+    trials, labels, _ = _make_trials()
+    np.testing.assert_allclose(
+        rdm(trials, labels, method=method), _rsatoolbox_rdm(trials, labels, theirs), rtol=1e-10, atol=1e-12
+    )
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_mahalanobis_equals_rsatoolbox():
+    trials, labels, _ = _make_trials()
+    precision = noise_precision(trials, labels)
+    expected = _rsatoolbox_rdm(trials, labels, "mahalanobis", noise=precision)
+    np.testing.assert_allclose(rdm(trials, labels, method="mahalanobis", precision=precision), expected, rtol=1e-10)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("with_precision", [False, True])
+def test_crossnobis_equals_rsatoolbox_on_balanced_folds(with_precision):
+    trials, labels, folds = _make_trials()
+    precision = noise_precision(trials, labels) if with_precision else None
+    expected = _rsatoolbox_rdm(trials, labels, "crossnobis", noise=precision, folds=folds)
+    result = rdm(trials, labels, method="crossnobis", folds=folds, precision=precision)
+    np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("method", ["shrinkage_diag", "shrinkage_eye", "diag", "full"])
+def test_noise_precision_equals_rsatoolbox(method):
+    rsa_data = pytest.importorskip("rsatoolbox.data")
+    from rsatoolbox.data.noise import prec_from_unbalanced
+
+    trials, labels, _ = _make_trials(repeats=20)
+    expected = prec_from_unbalanced(rsa_data.Dataset(trials, obs_descriptors={"s": labels}), "s", method=method)
+    np.testing.assert_allclose(noise_precision(trials, labels, method=method), expected, rtol=1e-8, atol=1e-10)
+
+
+def test_scipy_agrees_on_patterns_without_trials():
+    patterns = np.random.default_rng(1).normal(size=(7, 40))
+    np.testing.assert_allclose(rdm(patterns), pdist(patterns, "correlation"), atol=1e-13)
+    np.testing.assert_allclose(rdm(patterns, method="sqeuclidean"), pdist(patterns, "sqeuclidean") / 40, rtol=1e-12)
+
+
+def test_crossnobis_is_zero_on_average_when_stimuli_do_not_differ():
+    rng = np.random.default_rng(2)
+    labels, folds = np.tile(np.arange(3), 4), np.repeat(np.arange(4), 3)
+    draws = np.stack(
+        [rdm(rng.normal(size=(12, 20)), labels, method="crossnobis", folds=folds) for _ in range(400)]
+    ).ravel()
+    assert abs(draws.mean()) < 4 * draws.std() / math.sqrt(len(draws) / 3)
+    assert (draws < 0).mean() > 0.3
+
+
+def test_crossnobis_leaves_out_fold_pairs_that_lack_a_stimulus():
+    trials, labels, folds = _make_trials(repeats=5)
+    keep = ~((labels == 2) & (folds == 4))
+    complete = rdm(trials[folds != 4], labels[folds != 4], method="crossnobis", folds=folds[folds != 4])
+    result = rdm(trials[keep], labels[keep], method="crossnobis", folds=folds[keep])
+    touches_two = square(np.arange(15.0) + 1)[2]
+    of_two = np.isin(np.arange(15.0) + 1, touches_two)
+    np.testing.assert_allclose(result[of_two], complete[of_two], rtol=1e-12)
+    assert not np.allclose(result[~of_two], complete[~of_two])
+
+
+def test_the_mean_over_trials_skips_missing_entries():
+    trials, labels, _ = _make_trials(stimuli=3, repeats=3, units=4)
+    trials[0, 1] = np.nan
+    means = np.array([[np.nanmean(trials[labels == k, u]) for u in range(4)] for k in range(3)])
+    np.testing.assert_allclose(rdm(trials, labels), pdist(means, "correlation"), atol=1e-12)
+
+
+def test_a_pair_uses_the_units_recorded_in_both_stimuli():
+    rng = np.random.default_rng(3)
+    means = rng.normal(size=(3, 12))
+    means[0, :3] = np.nan
+    both = [(0, 1, slice(3, None)), (0, 2, slice(3, None)), (1, 2, slice(None))]
+    expected = [1 - np.corrcoef(means[i, s], means[j, s])[0, 1] for i, j, s in both]
+    np.testing.assert_allclose(rdm(means, [0, 1, 2]), expected, atol=1e-12)
+    squared = [np.mean((means[i, s] - means[j, s]) ** 2) for i, j, s in both]
+    np.testing.assert_allclose(rdm(means, [0, 1, 2], method="sqeuclidean"), squared, rtol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "mahalanobis", "poisson"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_complete_pattern_with_a_broken_activation_is_broken_not_missing(value, method):
+    patterns = np.random.default_rng(4).gamma(2.0, size=(4, 9))
+    patterns[1, 3] = value
+    precision = np.eye(9) + 0.1 if method == "mahalanobis" else None
+    result = square(rdm(patterns, method=method, precision=precision))
+    assert np.isnan(result[1, [0, 2, 3]]).all()
+    assert np.isfinite(result[np.ix_([0, 2, 3], [0, 2, 3])]).all()
+    assert rdm_problem(patterns) == "activations that are not finite for stimulus '1'"
+
+
+@pytest.mark.parametrize("value", [0.1, 1e8, 0.0])
+def test_a_constant_pattern_has_nan_correlation_distances_and_a_reason(value):
+    patterns = np.random.default_rng(5).normal(size=(3, 1001))
+    patterns[2] = value
+    assert np.isnan(rdm(patterns)).tolist() == [False, True, True]
+    assert np.isfinite(rdm(patterns, method="sqeuclidean")).all()
+    assert rdm_problem(patterns) == "a constant response across units to stimulus '2'"
+    assert rdm_problem(patterns[:2]) is None
+
+
+def test_a_stimulus_without_trials_is_missing_in_its_own_place():
+    trials = np.random.default_rng(6).normal(size=(6, 8))
+    result = square(rdm(trials, [0, 0, 1, 1, 3, 3]))
+    assert result.shape == (4, 4)
+    assert np.isnan(result[2, [0, 1, 3]]).all()
+    assert rdm_problem(trials, [0, 0, 1, 1, 3, 3]) == "no trials of stimulus '2'"
+
+
+def test_infinite_activations_give_nan_pairs():
+    patterns = np.random.default_rng(7).normal(size=(3, 5))
+    patterns[0, 0] = np.inf
+    for method in METHODS_WITHOUT_FOLDS[:3]:
+        assert np.isnan(rdm(patterns, method=method)[:2]).all()
+
+
+def _exact_correlation_distance(x, y):
+    """Arithmetic on the floats' exact values; only the last square root rounds."""
+    a, b = [Fraction(float(v)) for v in x], [Fraction(float(v)) for v in y]
+    a, b = [v - sum(a) / len(a) for v in a], [v - sum(b) / len(b) for v in b]
+    cross = sum(p * q for p, q in zip(a, b, strict=True))
+    size = sum(p * p for p in a) * sum(q * q for q in b)
+    return 1 - float(cross) / math.sqrt(float(size))
+
+
+def test_a_huge_offset_costs_no_digits():
+    patterns = 1e8 + 1e-3 * np.random.default_rng(8).normal(size=(3, 50))
+    exact = [_exact_correlation_distance(patterns[i], patterns[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    np.testing.assert_allclose(rdm(patterns), exact, atol=1e-12)
+    exact_squares = [float(np.mean((patterns[i] - patterns[j]) ** 2)) for i, j in ((0, 1), (0, 2), (1, 2))]
+    np.testing.assert_allclose(rdm(patterns, method="sqeuclidean"), exact_squares, rtol=1e-9)
+    labels = np.repeat([0, 1, 2], 4)
+    trials = np.repeat(patterns, 4, axis=0)
+    np.testing.assert_allclose(rdm(trials, labels), exact, atol=1e-4)
+
+
+def test_float32_input_is_computed_in_float64():
+    patterns = (100 + np.random.default_rng(9).normal(size=(4, 3000))).astype(np.float32)
+    np.testing.assert_array_equal(rdm(patterns), rdm(patterns.astype(np.float64)))
+
+
+def test_patterns_larger_than_one_slice_of_units_agree_with_scipy(monkeypatch):
+    monkeypatch.setattr("brainbench.metrics.rdms.distances._SLICE_ELEMENTS", 64)
+    patterns = np.random.default_rng(10).normal(size=(5, 333))
+    np.testing.assert_allclose(rdm(patterns), pdist(patterns, "correlation"), atol=1e-13)
+    np.testing.assert_allclose(rdm(patterns, method="sqeuclidean"), pdist(patterns, "sqeuclidean") / 333, rtol=1e-12)
+
+
+def test_string_labels_are_sorted_and_integer_labels_are_positions():
+    trials, labels, _ = _make_trials(stimuli=3)
+    names = np.array(["c", "a", "b"])[labels]
+    order = permuted_pairs(np.array([[1, 2, 0]]))[0]
+    np.testing.assert_allclose(rdm(trials, names), rdm(trials, labels)[order], rtol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(RDM_METHODS))
+def test_the_order_of_trials_units_and_stimuli_is_irrelevant(seed, method):
+    trials, labels, folds = _make_trials(seed=seed % 50, stimuli=5, units=9, repeats=6)
+    rng = np.random.default_rng(seed)
+    rows, columns, relabelled = rng.permutation(len(trials)), rng.permutation(9), rng.permutation(5)
+    chosen = folds if method == "crossnobis" else None
+    expected = rdm(trials, labels, method=method, folds=chosen)
+    result = rdm(
+        trials[np.ix_(rows, columns)],
+        np.argsort(relabelled)[labels][rows],
+        method=method,
+        folds=None if chosen is None else chosen[rows],
+    )
+    np.testing.assert_allclose(result, expected[permuted_pairs(relabelled[None])[0]], rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"method": "corelation"}, "did you mean 'correlation'"),
+        ({"folds": [0, 1, 0]}, "folds are for method='crossnobis'"),
+        ({"precision": np.eye(4)}, "method='correlation' does not use it"),
+        ({"method": "crossnobis"}, "needs labels and folds"),
+        ({"method": "mahalanobis", "precision": np.eye(3)}, r"shape \(4, 4\); received \(3, 3\)"),
+        ({"labels": [0, 1]}, "3 trials but 2 labels"),
+        ({"labels": [0.5, 1, 2]}, "Labels must be integers from 0 or strings"),
+        ({"labels": [-1, 0, 1]}, "run from 0"),
+        ({"labels": [0, 0, 0]}, "at least 2 stimuli"),
+    ],
+)
+def test_misuse_is_told_in_a_sentence(arguments, message):
+    with pytest.raises(UsageError, match=message):
+        rdm(np.ones((3, 4)), **arguments)
+
+
+def test_responses_must_be_a_matrix_of_numbers():
+    with pytest.raises(UsageError, match="flatten time and space"):
+        rdm(np.ones((3, 4, 5)))
+    with pytest.raises(UsageError, match="real numbers"):
+        rdm([["a", "b"], ["c", "d"]])
+
+
+def test_negative_rates_are_refused_by_poisson():
+    with pytest.raises(DataError, match="never negative; the smallest is -1"):
+        rdm([[1.0, -1.0], [2.0, 0.0]], method="poisson")
+
+
+def test_infinite_trials_are_refused():
+    with pytest.raises(DataError, match="1 responses are infinite"):
+        rdm([[1.0, np.inf], [2.0, 0.0]], [0, 1])
+
+
+def test_a_covariance_of_too_few_trials_names_the_way_out():
+    trials, labels, _ = _make_trials(repeats=2, units=30)
+    with pytest.raises(DataError, match="use method='shrinkage_diag'"):
+        noise_precision(trials, labels, method="full")
+    assert np.isfinite(noise_precision(trials, labels)).all()
+    trials[:, 3] = 1.0
+    with pytest.raises(DataError, match="1 of 30 units never vary"):
+        noise_precision(trials, labels)
+    with pytest.raises(DataError, match="more complete trials than stimuli"):
+        noise_precision(trials[:6], labels[:6])
+    with pytest.raises(UsageError, match="did you mean 'diag'"):
+        noise_precision(trials, labels, method="diagg")
+
+
+def test_a_single_unit_has_distances_but_no_correlations():
+    responses = np.array([[1.0], [2.0], [4.0]])
+    assert np.isnan(rdm(responses)).all()
+    assert rdm_problem(responses) == "a constant response across units to stimulus '0', '1', '2'"
+    np.testing.assert_array_equal(rdm(responses, method="sqeuclidean"), [1.0, 9.0, 4.0])

@@ -1,0 +1,129 @@
+"""RDMs of an animal by every method: parity with rsatoolbox, and rules for what is missing."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from brainbench.metrics import TrialBlock, noise_precision, rdm, split_half, subject_rdm
+from brainbench.metrics.reliability.halves import Session, half_rdms, pattern_rdms, split_members
+from brainbench.metrics.reliability.trial_hashes import key_hashes
+from tests.factories.animals import make_block, make_latent
+
+
+def _unbalanced(seed=0, units=12):
+    rng = np.random.default_rng(seed)
+    labels = np.repeat(np.arange(6), [5, 9, 12, 6, 4, 10])
+    responses = rng.normal(size=(6, units))[labels] + rng.normal(size=(len(labels), units))
+    return TrialBlock(responses, labels, [f"{seed}/{i}" for i in range(len(labels))])
+
+
+@pytest.mark.parametrize("noise", ["shrinkage_diag", "shrinkage_eye", "diag", "full"])
+def test_mahalanobis_of_one_session_is_that_of_rdm(noise):
+    block = _unbalanced()
+    precision = noise_precision(block.responses, block.labels, method=noise)
+    found = subject_rdm("a", [block], 6, method="mahalanobis", noise=noise, splits=5)
+    expected = rdm(block.responses, block.labels, method="mahalanobis", precision=precision)
+    np.testing.assert_allclose(found.rdm, expected, rtol=1e-10)
+
+
+def test_crossnobis_with_unequal_trials_equals_rsatoolbox():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from rsatoolbox.data import Dataset
+        from rsatoolbox.rdm import calc_rdm_unbalanced
+    block = _unbalanced()
+    data = Dataset(block.responses, obs_descriptors={"stimulus": block.labels, "trial": np.arange(len(block.labels))})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        expected = calc_rdm_unbalanced(
+            data, method="crossnobis", descriptor="stimulus", cv_descriptor="trial"
+        ).dissimilarities[0]
+    found = subject_rdm("a", [block], 6, method="crossnobis", noise="none", splits=5)
+    np.testing.assert_allclose(found.rdm, expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "crossnobis"])
+def test_halves_by_products_and_by_patterns_are_the_same(method):
+    block = make_block(make_latent(), units=60, repeats=8)
+    session = Session(block.responses, block.labels, key_hashes(block.keys))
+    index = np.arange(7)
+    first, second = half_rdms([session], 6, method, index, seed=3)
+    member = split_members(session, 6, index, 3)
+    np.testing.assert_allclose(first, pattern_rdms([session], [member], 6, method), atol=1e-11)
+    np.testing.assert_allclose(second, pattern_rdms([session], [1 - member], 6, method), atol=1e-11)
+
+
+@pytest.mark.parametrize("noise", ["none", "diag", "shrinkage_diag", "full"])
+def test_crossnobis_is_zero_on_average_where_stimuli_are_alike(noise):
+    rng = np.random.default_rng(1)
+    labels = np.repeat(np.arange(6), [4, 5, 6, 7, 8, 9])
+    found = []
+    for _ in range(100):
+        block = TrialBlock(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
+        found.append(subject_rdm("a", [block], 6, method="crossnobis", noise=noise, splits=1).rdm.mean())
+    assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(100)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["none", "diag", "full"])
+def test_crossnobis_is_zero_on_average_in_two_thousand_simulations(noise):
+    rng = np.random.default_rng(2)
+    labels = np.repeat(np.arange(6), [4, 5, 6, 8, 10, 12])
+    found, biased = [], []
+    for _ in range(2000):
+        block = TrialBlock(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
+        found.append(subject_rdm("a", [block], 6, method="crossnobis", noise=noise, splits=1).rdm.mean())
+        biased.append(subject_rdm("a", [block], 6, method="sqeuclidean", splits=1).rdm.mean())
+    assert abs(np.mean(found)) < 3 * np.std(found) / np.sqrt(2000)
+    assert np.mean(biased) > 0.2
+
+
+@pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "poisson"])
+def test_a_noiseless_rdm_does_not_depend_on_the_number_of_trials(method):
+    patterns = np.random.default_rng(2).random(size=(6, 15))
+    few, many = (np.repeat(np.arange(6), counts) for counts in ([4] * 6, [4, 9, 5, 12, 8, 6]))
+    found = [subject_rdm("a", [TrialBlock(patterns[x], x)], 6, method=method, splits=2).rdm for x in (few, many)]
+    np.testing.assert_allclose(*found, atol=1e-12)
+
+
+def test_units_that_were_not_recorded_in_every_trial_leave_the_full_covariance_but_not_the_diagonal():
+    block = _unbalanced(units=8)
+    responses = block.responses.copy()
+    responses[0, 2] = np.nan
+    responses[:, 5] = 3.0
+    gap = TrialBlock(responses, block.labels, block.keys)
+    diagonal = split_half([gap], 6, method="mahalanobis", noise="diag", splits=5)
+    full = split_half([gap], 6, method="mahalanobis", noise="full", splits=5)
+    assert diagonal.units == 7
+    assert full.units == 6
+    assert "1 units or bins left out: without noise or not in every trial" in diagonal.notes
+    assert "2 units or bins left out: without noise or not in every trial" in full.notes
+    crossed = split_half([gap], 6, method="crossnobis", noise="diag", splits=5)
+    assert np.isfinite(crossed.rdm).all()
+
+
+def test_too_few_trials_for_a_covariance_are_a_problem_in_words():
+    rng = np.random.default_rng(3)
+    labels = np.repeat(np.arange(6), 4)
+    wide = TrialBlock(rng.normal(size=(24, 60)), labels)
+    found = subject_rdm("a", [wide], 6, method="mahalanobis", noise="full")
+    assert found.problem.startswith("no session has a noise covariance: The noise covariance of 60 units")
+    still = TrialBlock(np.repeat(rng.normal(size=(6, 5)), 4, axis=0), labels)
+    assert "no unit has noise" in subject_rdm("a", [still], 6, method="crossnobis").problem
+
+
+def test_crossnobis_needs_four_trials_of_each_stimulus():
+    block = make_block(make_latent(), repeats=3)
+    found = subject_rdm("a", [block], 6, method="crossnobis")
+    assert "fewer than 4 trials of 0 (3)" in found.problem
+
+
+def test_draws_of_many_stimuli_are_as_many_as_fit():
+    latent = make_latent(0, stimuli=4)
+    found = subject_rdm("a", [make_block(latent)], 4, splits=2, draws=7)
+    assert found.draws.shape == (7, 6)
+    assert found.draws_r.shape == (7,)
+    assert subject_rdm("a", [make_block(latent)], 4, splits=2).draws.shape == (0, 6)

@@ -1,0 +1,100 @@
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from brainbench.core.errors import UsageError
+from brainbench.models.attenders.gpt import GPTAttender
+
+
+def _attender(**options):
+    return GPTAttender(12, 16, **({"blocks": 2, "heads": 4, "context": 11} | options)).eval()
+
+
+@pytest.mark.parametrize(("width", "parameters"), [(512, 25_778_688), (256, 6_532_608)])
+def test_parameters_equal_the_published_counts(width, parameters):
+    with torch.device("meta"):
+        attender = GPTAttender(512, width)
+    assert sum(parameter.numel() for parameter in attender.parameters()) == parameters
+    assert attender.max_steps == 32
+
+
+def test_a_pass_equals_pytorchs_transformer():
+    attender = _attender()
+    layers = nn.ModuleList(
+        nn.TransformerEncoderLayer(16, 4, 64, 0.0, "gelu", batch_first=True, norm_first=True) for _ in range(2)
+    ).eval()
+    x, steps = torch.randn(3, 5, 12), 5
+    with torch.no_grad():
+        for block, layer in zip(attender.blocks, layers, strict=True):
+            layer.self_attn.in_proj_weight.copy_(block.query_key_value.weight)
+            layer.self_attn.in_proj_bias.copy_(block.query_key_value.bias.normal_())
+            layer.self_attn.out_proj.load_state_dict(block.project.state_dict())
+            layer.linear1.load_state_dict(block.mlp[0].state_dict())
+            layer.linear2.load_state_dict(block.mlp[2].state_dict())
+            layer.norm1.load_state_dict(block.norm_attention.state_dict())
+            layer.norm2.load_state_dict(block.norm_mlp.state_dict())
+        tokens = torch.stack((x, attender.action.expand(3, steps, 12)), 2).reshape(3, 2 * steps, 12)
+        stream = attender.embed(tokens) + attender.positions[: 2 * steps]
+        mask = nn.Transformer.generate_square_subsequent_mask(2 * steps)
+        for layer in layers:
+            stream = layer(stream, src_mask=mask, is_causal=True)
+        stream = functional.layer_norm(stream, (16,), attender.norm.weight, attender.norm.bias)
+        expected = functional.linear(stream[:, 1::2], attender.lm_head.weight)
+        torch.testing.assert_close(attender(x), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_the_future_does_not_show():
+    attender, x = _attender(), torch.randn(2, 5, 12)
+    later = x.clone()
+    later[:, 3:] = 9.0
+    with torch.no_grad():
+        before, after = attender(x), attender(later)
+    torch.testing.assert_close(before[:, :3], after[:, :3], atol=1e-6, rtol=1e-5)
+    assert not torch.allclose(before[:, 3], after[:, 3], atol=1e-3)
+
+
+def test_a_step_equals_the_sweep():
+    attender, x = _attender(), torch.randn(2, 5, 12)
+    with torch.no_grad():
+        expected, state = attender(x), attender.init_state(2)
+        for t in range(5):
+            y, state = attender.step(x[:, t], state)
+            torch.testing.assert_close(y, expected[:, t], atol=1e-6, rtol=1e-5)
+    assert state.tokens == 10
+
+
+def test_a_full_context_is_announced():
+    attender = _attender()
+    with pytest.raises(UsageError, match=r"at most 5 steps \(context 11 tokens, two per step\); received step 6"):
+        attender(torch.zeros(1, 6, 12))
+    state = attender.init_state(1)
+    for _ in range(5):
+        _, state = attender.step(torch.zeros(1, 12), state)
+    with pytest.raises(UsageError, match=r"received step 6\. Shorten the sweep or start again from init_state"):
+        attender.step(torch.zeros(1, 12), state)
+
+
+def test_activations_are_read_at_the_action_tokens():
+    attender, x = _attender(), torch.randn(2, 5, 12)
+    with torch.no_grad():
+        y, activations = attender(x, return_activations=True)
+    assert {name: tuple(value.shape) for name, value in activations.items()} == {
+        "block1": (2, 5, 16),
+        "block2": (2, 5, 16),
+        "lm_head": (2, 5, 16),
+    }
+    assert torch.equal(activations["lm_head"], y)
+    expected = functional.linear(attender.norm(activations["block2"]), attender.lm_head.weight)
+    torch.testing.assert_close(y, expected)
+
+
+def test_dropout_acts_in_training_alone():
+    attender, x = _attender(dropout=0.5), torch.randn(1, 3, 12)
+    assert not torch.equal(attender.train()(x), attender(x))
+    assert torch.equal(attender.eval()(x), attender(x))
+
+
+def test_a_width_that_heads_cannot_share_is_refused():
+    with pytest.raises(UsageError, match="multiple of its 4 heads; received 10"):
+        GPTAttender(12, 10)

@@ -1,0 +1,148 @@
+import copy
+import json
+
+import pytest
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.models.graph.spec import Convolution, Dense, Memory, Pool
+from brainbench.models.graph.temporal_graph import TemporalGraph
+from brainbench.models.graph.tnn_config import read_graph
+
+
+def _node(name, shape_from, **changes):
+    node = {
+        "name": name,
+        "shape_from": shape_from,
+        "harbor_policy": {"name": "ResizeConcat"},
+        "pre_memory": {"name": "Conv2dCell", "out_channels": 4, "ksize": [3, 3], "padding": "same", "bias": 0.0},
+        "recurrent_cell": {"name": "IdentityCell"},
+        "post_memory": {"name": "ActivationLayer", "activation": "ReLU"},
+        "out_channels": 4,
+    }
+    return node | changes
+
+
+def _config(*nodes, edges=(("a", "b"),), **changes):
+    nodes = nodes or (_node("a", None), _node("b", "a"))
+    config = {
+        "nodes": list(nodes),
+        "edges": [{"from": source, "to": target} for source, target in edges],
+        "input_nodes": ["a"],
+        "output_node": nodes[-1]["name"],
+        "input_shape": [3, 5, 7],
+        "num_timesteps": 22,
+    }
+    return copy.deepcopy(config | changes)
+
+
+def test_every_supported_module_is_read():
+    cell = {"name": "LSTMCell", "out_channels": 4, "ksize": 2, "layernorm": True, "forget_bias": 1.0}
+    decay = {"name": "TimeDecayRecurrentCell", "tau": 0.3, "trainable": True}
+    pool = {"name": "MaxPool", "ksize": 2, "stride": 2, "padding": 0, "ceil_mode": True}
+    average = {"name": "AdaptiveAvgPool", "output_size": [1, 1], "flatten": True}
+    dense = {"name": "FullyConnected", "out_channels": 9, "bias": 0.1, "activation": None, "dropout": 0.5}
+    nodes = (
+        _node("a", None, recurrent_cell=cell, post_memory=pool),
+        _node("b", "a", recurrent_cell=decay, post_memory=average, residual=None),
+        _node("c", "b", pre_memory=dense, harbor_policy={"name": "Identity"}, out_channels=9),
+    )
+    spec = read_graph(_config(*nodes, edges=(("a", "b"), ("b", "c"))))
+    a, b, c = spec.nodes
+    assert a.operation == Convolution(4, (3, 3), (1, 1), "same", activation=None)
+    assert a.memory == Memory("lstm", (2, 2), layer_norm=True)
+    assert a.pool == Pool("max", (2, 2), (2, 2), (0, 0), ceil_mode=True)
+    assert b.memory == Memory("time-decay", tau=0.3)
+    assert b.pool == Pool("average", (1, 1), flatten=True)
+    assert c.operation == Dense(9, bias=0.1, dropout=0.5, activation=None)
+    assert not c.resize
+    assert spec.shapes()[1] == {"a": (4, 3, 4), "b": (4,), "c": (9,)}
+
+
+def test_initialisers_are_honoured():
+    pre = {"name": "Conv2dCell", "out_channels": 4, "ksize": 2, "init_dict": {"method": "orthogonal_", "gain": 3.0}}
+    graph = TemporalGraph.from_config(_config(_node("a", None, pre_memory=pre), edges=()))
+    weight = graph.node("a").operation.weight.detach().flatten(1)
+    assert (weight @ weight.T).diagonal().tolist() == pytest.approx([9.0] * 4, rel=1e-4)
+
+
+def test_what_leads_back_in_the_listed_order_is_feedback():
+    spec = read_graph(_config(edges=(("a", "b"), ("b", "a"))))
+    assert {(e.source, e.target): e.feedback for e in spec.edges} == {("a", "b"): False, ("b", "a"): True}
+
+
+def test_without_cycles_nothing_is_feedback_whatever_the_listed_order():
+    nodes = (_node("b", "a"), _node("a", None))
+    spec = read_graph(_config(*nodes, output_node="b"))
+    assert spec.order == ("a", "b")
+    assert not any(edge.feedback for edge in spec.edges)
+
+
+def test_ff_order_decides_what_is_feedback():
+    nodes = (_node("b", "a"), _node("a", None))
+    spec = read_graph(_config(*nodes, edges=(("a", "b"), ("b", "a")), output_node="b", ff_order=["a", "b"]))
+    assert spec.order == ("a", "b")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pre_memory": {"name": "Conv3dCell"}}, "Unknown module in the pre-memory of 'b' 'Conv3dCell'; did you mean"),
+        ({"recurrent_cell": {"name": "UGRNN"}}, "cell in the recurrent cell of 'b' 'UGRNN'; did you mean 'UGRNNCell'"),
+        ({"harbor_policy": {"name": "RGC"}}, "Unknown harbor policy of node 'b' 'RGC'"),
+        ({"post_memory": {"name": "ResidualAdd"}}, "Unknown module in the post-memory of 'b' 'ResidualAdd'"),
+        ({"gain": 2}, "unsupported key 'gain' in node 'b'"),
+        ({"out_channels": 5}, "Node 'b' has out_channels 5, its pre-memory 4"),
+        ({"residual": True}, "has 'residual': True in node 'b'; only None is supported"),
+    ],
+)
+def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
+    with pytest.raises((DataError, UsageError), match=message):
+        read_graph(_config(_node("a", None), _node("b", "a", **change)))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("batchnorm", 4, "'batchnorm': 4 in the pre-memory of 'a'; only None is supported"),
+        ("dilation", 2, "'dilation': 2"),
+        ("ksize", "3", "'ksize' in the pre-memory of 'a' must be a whole number or a pair"),
+        ("padding", "reflect", "Unknown padding in the pre-memory of 'a' 'reflect'"),
+        ("stride", 2, "'same' in the pre-memory of 'a' needs stride 1"),
+        ("init_dict", {"method": "kaiming"}, "Unknown initialiser in the pre-memory of 'a' 'kaiming'"),
+        ("colour", 1, "unsupported key 'colour' in the pre-memory of 'a'"),
+    ],
+)
+def test_an_unsupported_operation_is_refused_in_one_sentence(key, value, message):
+    node = _node("a", None)
+    node["pre_memory"] = node["pre_memory"] | {key: value}
+    with pytest.raises((DataError, UsageError), match=message):
+        read_graph(_config(node, edges=()))
+
+
+@pytest.mark.parametrize("key", ["nodes", "edges", "input_nodes", "output_node", "input_shape"])
+def test_a_missing_key_is_named(key):
+    config = _config()
+    del config[key]
+    with pytest.raises(DataError, match=f"lacks '{key}' in the top level"):
+        read_graph(config)
+
+
+def test_several_outputs_are_refused():
+    with pytest.raises(DataError, match=r"names the output nodes \['a', 'b'\]; exactly one"):
+        read_graph(_config(output_node=["a", "b"]))
+
+
+def test_an_incomplete_order_is_refused():
+    with pytest.raises(DataError, match="must list every node once"):
+        read_graph(_config(ff_order=["a"]))
+
+
+def test_a_file_is_read_and_a_bad_one_named(tmp_path):
+    good, bad = tmp_path / "good.json", tmp_path / "bad.json"
+    good.write_text(json.dumps(_config()))
+    bad.write_text("{")
+    assert read_graph(good) == read_graph(_config())
+    with pytest.raises(DataError, match=r"bad\.json' is not valid JSON"):
+        read_graph(bad)
+    with pytest.raises(DataError, match="There is no file"):
+        read_graph(tmp_path / "none.json")

@@ -1,0 +1,44 @@
+import pytest
+import torch
+
+from brainbench.core.errors import UsageError
+from brainbench.models.heads.decoders import AllStepsDecoder, linear_decoder, make_decoder, mlp_decoder
+
+
+@pytest.mark.parametrize(("make", "parameters"), [(linear_decoder, 60_021), (mlp_decoder, 1_110_133)])
+def test_parameters_equal_the_published_counts(make, parameters):
+    decoder = make(512)
+    assert sum(parameter.numel() for parameter in decoder.parameters()) == parameters
+    assert decoder(torch.randn(3, 7, 512)).shape == (3, 7, 117)
+
+
+def test_the_number_of_classes_can_be_chosen():
+    assert linear_decoder(8, 3)(torch.randn(2, 8)).shape == mlp_decoder(8, 3)(torch.randn(2, 8)).shape == (2, 3)
+
+
+def test_the_all_steps_decoder_has_the_published_size():
+    with torch.device("meta"):
+        assert sum(parameter.numel() for parameter in AllStepsDecoder(512).parameters()) == 12_120_181
+
+
+@torch.no_grad()
+def test_an_answer_of_all_steps_is_that_of_the_sweep_so_far():
+    decoder, features = AllStepsDecoder(6, 3, steps=5), torch.randn(2, 5, 6)
+    every, state = decoder.every_step(features), decoder.init_state(2)
+    for t in range(5):
+        streamed, state = decoder.step(features[:, t], state)
+        expected = decoder(features[:, : t + 1])
+        torch.testing.assert_close(streamed, expected, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(every[:, t], expected, atol=1e-5, rtol=1e-5)
+    with pytest.raises(UsageError, match="built for 5 steps and received step 6"):
+        decoder.step(features[:, 0], state)
+    with pytest.raises(UsageError, match="built for 5 steps"):
+        decoder(torch.zeros(1, 6, 6))
+
+
+def test_decoders_are_made_by_name():
+    assert make_decoder("linear", 8, 3)(torch.zeros(1, 8)).shape == (1, 3)
+    with pytest.raises(UsageError, match="Unknown decoder 'mpl'; did you mean 'mlp'"):
+        make_decoder("mpl", 8)
+    with pytest.raises(UsageError, match="at least 2 classes; received 1"):
+        make_decoder("linear", 8, 1)

@@ -1,0 +1,70 @@
+import math
+import warnings
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn import functional
+
+from brainbench.core.errors import UsageError
+from brainbench.models.ops.layers import Conv2d, Linear, activation, pair
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    kernel=st.tuples(st.integers(1, 4), st.integers(1, 4)),
+    grid=st.tuples(st.integers(1, 7), st.integers(1, 7)),
+)
+def test_same_padding_equals_pytorchs(kernel, grid):
+    layer = Conv2d(2, 3, kernel_size=kernel, bias=None)
+    x = torch.randn(2, 2, *grid)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # PyTorch warns about the zero-padded copy of even kernels
+        expected = functional.conv2d(x, layer.weight, layer.bias, padding="same")
+    torch.testing.assert_close(layer(x), expected, atol=1e-6, rtol=1e-5)
+
+
+def test_an_even_same_convolution_does_not_warn():
+    assert Conv2d(1, 1, kernel_size=(2, 2))(torch.ones(1, 1, 5, 7)).shape == (1, 1, 5, 7)
+
+
+@pytest.mark.parametrize("gain", [1.0, math.sqrt(2.0)])
+def test_weights_have_the_variance_they_promise(gain):
+    weight = Linear(400, 500, gain=gain).weight
+    assert weight.var().item() == pytest.approx(gain**2 / 400, rel=0.02)
+    assert weight.mean().item() == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_named_initialiser_is_used():
+    weight = Linear(8, 8, method={"method": "orthogonal_", "gain": 2.0}).weight
+    torch.testing.assert_close(weight @ weight.T, 4 * torch.eye(8), atol=1e-5, rtol=0)
+
+
+def test_a_rectified_stack_keeps_the_scale_of_its_signal():
+    x = torch.randn(200, 256)
+    for _ in range(12):
+        x = torch.relu(Linear(256, 256, gain=math.sqrt(2.0))(x))
+    assert 0.3 < x.pow(2).mean().sqrt().item() < 3.0
+
+
+def test_an_unknown_activation_names_the_nearest():
+    with pytest.raises(UsageError, match="did you mean 'relu'"):
+        activation("Rellu")
+
+
+@pytest.mark.parametrize("value", [0, (2, 0), (1, 2, 3), (2.0, 2)])
+def test_a_bad_kernel_size_says_what_was_received(value):
+    with pytest.raises(UsageError, match="kernel size must be a positive integer or a pair"):
+        pair(value, "kernel size")
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("padding", ["same", "valid", (1, 0)])
+@pytest.mark.parametrize("stride", [(1, 1), (2, 1)])
+def test_one_stimulus_gives_what_many_give(padding, stride):
+    options = {} if padding == "same" and stride != (1, 1) else {"stride": stride}
+    layer, x = Conv2d(400, 200, kernel_size=(2, 2), padding=padding, **options), torch.randn(3, 400, 4, 6)
+    torch.testing.assert_close(layer(x[:1]), layer(x)[:1], atol=1e-4, rtol=1e-4)
+    whole = layer.share(x[:1, :150], 0, use_bias=True) + layer.share(x[:1, 150:], 150, use_bias=False)
+    torch.testing.assert_close(whole, layer(x)[:1], atol=1e-4, rtol=1e-4)

@@ -1,0 +1,264 @@
+import logging
+import tracemalloc
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from brainbench.core.errors import UsageError
+from brainbench.models.activations import extract
+from brainbench.models.registry import load_model
+
+K, T = 5, 4
+
+
+@pytest.fixture
+def stimuli():
+    scale = np.array(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+    return (np.random.default_rng(0).standard_normal((K, T, 30, 5, 7)) * scale).astype(np.float32)
+
+
+class Recurrent(nn.Module):
+    """What a user writes: a cell in a loop, a normalisation, dropout and a head."""
+
+    def __init__(self):
+        super().__init__()
+        self.flatten = nn.Flatten(2)
+        self.norm = nn.BatchNorm1d(1050)
+        self.cell = nn.GRUCell(1050, 6)
+        self.drop = nn.Dropout(0.5)
+        self.head = nn.Linear(6, 3)
+
+    def forward(self, x):
+        x = self.norm(self.flatten(x).transpose(1, 2)).transpose(1, 2)
+        state = x.new_zeros(len(x), 6)
+        for t in range(x.shape[1]):
+            state = self.cell(x[:, t], state)
+        return self.head(self.drop(state))
+
+
+def test_every_layer_of_ours_comes_with_its_time_steps(stimuli):
+    model = load_model("zhuang-ugrnn-small+gpt")
+    activations = extract(model, stimuli)
+    assert tuple(activations) == model.layers
+    with torch.no_grad():
+        expected = model.activations(torch.from_numpy(stimuli))
+    for layer, values in activations.items():
+        assert values.dtype == np.float32
+        np.testing.assert_allclose(values, expected[layer].flatten(2), atol=1e-5, rtol=1e-4)
+    assert activations.nonfinite == {}
+
+
+def test_layers_can_be_chosen_and_unknown_ones_name_the_nearest(stimuli):
+    model = load_model("zhuang-small")
+    assert list(extract(model, stimuli, layers=["decoder", "encoder.fc7"])) == ["encoder.fc7", "decoder"]
+    with pytest.raises(UsageError, match=r"Unknown layer 'fc7'; did you mean 'encoder\.fc7'"):
+        extract(model, stimuli, layers=["fc7"])
+
+
+@settings(max_examples=10, deadline=None)
+@given(chunk=st.integers(1, 9))
+def test_the_chunk_changes_nothing(chunk):
+    x = torch.from_numpy(np.random.default_rng(1).standard_normal((7, T, 30, 5, 7)).astype(np.float32))
+    model = Recurrent().eval()
+    whole, parts = extract(model, x, chunk=100), extract(model, x, chunk=chunk)
+    assert {name: value.shape for name, value in whole.items()} == {name: v.shape for name, v in parts.items()}
+    for name, value in whole.items():
+        np.testing.assert_allclose(parts[name], value, atol=1e-5, rtol=1e-4)
+
+
+def test_a_loops_calls_become_time(stimuli):
+    model = Recurrent()
+    activations = extract(model, stimuli)
+    assert {name: value.shape for name, value in activations.items()} == {
+        "flatten": (K, T, 1050),
+        "norm": (K, 1, 1050 * T),
+        "cell": (K, T, 6),
+        "drop": (K, 1, 6),
+        "head": (K, 1, 3),
+        "output": (K, 1, 3),
+    }
+    np.testing.assert_array_equal(activations["cell"][:, -1], activations["drop"][:, 0])
+
+
+def test_the_model_is_left_as_it_was(stimuli):
+    model = Recurrent().train()
+    model.norm.eval()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    first, second = extract(model, stimuli), extract(model, stimuli)
+    np.testing.assert_array_equal(first["output"], second["output"])
+    assert model.training
+    assert model.drop.training
+    assert not model.norm.training
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert all(parameter.grad is None for parameter in model.parameters())
+    assert not any(module._forward_hooks for module in model.modules())
+
+
+def test_an_error_leaves_no_hook_and_no_mode_behind(stimuli):
+    model = Recurrent().train()
+    with pytest.raises(UsageError):
+        extract(model, stimuli[:, :, :6])
+    assert not any(module._forward_hooks for module in model.modules())
+    assert all(module.training for module in model.modules())
+
+
+class Sequence(nn.Module):
+    """An LSTM over the whole sweep, batch or time first; its output is a tuple."""
+
+    def __init__(self, batch_first):
+        super().__init__()
+        self.batch_first = batch_first
+        self.lstm = nn.LSTM(1050, 8, batch_first=batch_first)
+        self.each = nn.Linear(8, 2)
+
+    def forward(self, x):
+        x = x.flatten(2)
+        y, _ = self.lstm(x if self.batch_first else x.transpose(0, 1))
+        y = y if self.batch_first else y.transpose(0, 1)
+        return {"each": self.each(y.reshape(-1, 8)), "none": None}
+
+
+@pytest.mark.parametrize("count", [1, T - 1, T, T + 1, 2 * T])
+def test_time_is_found_wherever_it_is(count):
+    x = torch.randn(count, T, 30, 5, 7)
+    first, second = Sequence(True), Sequence(False)
+    second.load_state_dict(first.state_dict())
+    ours, theirs = extract(first, x), extract(second, x)
+    assert {name: value.shape[:2] for name, value in ours.items()} == dict.fromkeys(
+        ("lstm", "each", "output"), (count, T)
+    )
+    for name, value in ours.items():
+        np.testing.assert_allclose(theirs[name], value, atol=1e-6, rtol=1e-5)
+    with torch.no_grad():
+        expected = first.lstm(x.flatten(2))[0]
+    np.testing.assert_allclose(ours["lstm"], expected, atol=1e-5, rtol=1e-4)
+
+
+def test_calls_of_unequal_shape_are_kept_apart(stimuli):
+    class Shared(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.wide, self.narrow, self.relu = nn.Linear(1050, 9), nn.Linear(9, 4), nn.ReLU(inplace=True)
+
+        def forward(self, x):
+            return self.relu(self.narrow(self.relu(self.wide(x.flatten(2)))))
+
+    activations = extract(Shared(), stimuli)
+    assert activations["relu[0]"].shape == (K, T, 9)
+    assert activations["relu[1]"].shape == (K, T, 4)
+    assert activations["wide"].min() < 0, "an in-place rectifier must not change what was recorded before it"
+
+
+def test_submodules_can_be_asked_for_by_name(stimuli):
+    model = nn.Sequential(nn.Flatten(2), nn.Sequential(nn.Linear(1050, 4), nn.ReLU()))
+    assert list(extract(model, stimuli)) == ["0", "1.0", "1.1", "output"]
+    chosen = extract(model, stimuli, layers=["1"])
+    np.testing.assert_array_equal(chosen["1"], extract(model, stimuli)["1.1"])
+    with pytest.raises(UsageError, match=r"Unknown layer '1\.2'; did you mean '1"):
+        extract(model, stimuli, layers=["1.2"])
+
+
+def test_a_layer_that_knows_no_stimuli_is_an_error_only_when_asked_for(stimuli):
+    class Biased(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.bias, self.head, self.unused = nn.Embedding(7, 3), nn.Linear(1050, 3), nn.Linear(1, 1)
+
+        def forward(self, x):
+            return self.head(x.flatten(2)) + self.bias(torch.tensor([1]))
+
+    assert list(extract(Biased(), stimuli)) == ["head", "output"]
+    with pytest.raises(UsageError, match=r"Layer 'bias' gave \[\[1, 3\]\] for 5 stimuli of 4 steps"):
+        extract(Biased(), stimuli, layers=["bias"])
+    with pytest.raises(UsageError, match="Layer 'unused' gave nothing for 5 stimuli"):
+        extract(Biased(), stimuli, layers=["unused"])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_kept_and_counted(stimuli, value, caplog):
+    model = nn.Sequential(nn.Flatten(2), nn.Linear(1050, 3))
+    model[1].bias.data[1] = value
+    with caplog.at_level(logging.WARNING):
+        activations = extract(model, stimuli)
+    assert not np.isfinite(activations["output"][..., 1]).any()
+    assert activations.nonfinite == {"1": K * T, "output": K * T}
+    assert f"{K * T} of {3 * K * T} activations of layer '1' are not finite" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "wrap", [np.asarray, torch.from_numpy, lambda x: SimpleNamespace(input=x), lambda x: x.astype("f8")]
+)
+def test_stimuli_come_as_array_tensor_or_object(stimuli, wrap):
+    model = nn.Flatten(2)
+    np.testing.assert_array_equal(extract(model, wrap(stimuli))["output"], stimuli.reshape(K, T, -1))
+
+
+def test_a_model_of_another_precision_is_fed_in_it(stimuli):
+    model = nn.Sequential(nn.Flatten(2), nn.Linear(1050, 3)).double()
+    assert extract(model, stimuli)["output"].dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("model", "failure"),
+    [
+        (
+            lambda: load_model("zhuang-small"),
+            r"EAD .* expects \[batch, time, 30, 5, 7\] .*; received \[5, 4, 6, 5, 7\]",
+        ),
+        (Recurrent, "Recurrent .* RuntimeError: running_mean"),
+        (lambda: nn.Sequential(nn.Flatten(), nn.Linear(7, 1)), "Sequential .* RuntimeError: mat1 and mat2"),
+    ],
+)
+def test_a_stimulus_that_does_not_fit_says_what_was_given_and_what_failed(stimuli, model, failure):
+    with pytest.raises(UsageError, match=failure) as caught:
+        extract(model(), stimuli[:, :, :6])
+    assert "cannot process stimuli of shape [5, 4, 6, 5, 7] [stimulus, time, channel, row, column]" in str(caught.value)
+
+
+@pytest.mark.parametrize(("x", "chunk"), [(np.zeros((0, T, 30, 5, 7)), 4), (np.zeros(3), 4), (np.zeros((2, T, 3)), 0)])
+def test_nothing_to_extract_from_is_an_error(x, chunk):
+    with pytest.raises(UsageError, match="needs stimuli"):
+        extract(nn.Flatten(2), x, chunk=chunk)
+
+
+def test_a_model_that_forgets_its_stimuli_says_what_to_return(stimuli):
+    class Mean(nn.Module):
+        def forward(self, x):
+            return x.mean()
+
+    with pytest.raises(UsageError, match=r"Nothing in Mean gives an activation per stimulus.*Return \[B, \.\.\.\]"):
+        extract(Mean(), stimuli)
+
+
+def test_a_sweep_too_long_for_the_attender_says_so(stimuli):
+    with pytest.raises(UsageError, match="at most 32 steps"):
+        extract(load_model("zhuang-small+gpt"), np.zeros((1, 33, 30, 5, 7), np.float32))
+
+
+def test_activations_and_stimuli_may_lie_on_disk(stimuli, tmp_path):
+    model = load_model("zhuang-small", classes=5)
+    np.save(tmp_path / "stimuli.npy", np.asarray(stimuli))
+    mapped = np.load(tmp_path / "stimuli.npy", mmap_mode="r")
+    found = extract(model, mapped, chunk=2, folder=tmp_path / "layers")
+    assert all(isinstance(value, np.memmap) for value in found.values())
+    for name, expected in extract(model, stimuli).items():
+        np.testing.assert_allclose(np.load(tmp_path / "layers" / f"{name}.npy"), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_on_disk_memory_stays_that_of_a_chunk(tmp_path):
+    count, features = 400, 10_000
+    stimuli = np.lib.format.open_memmap(tmp_path / "x.npy", mode="w+", dtype=np.float32, shape=(count, 2, 6, 1, 1))
+    model = nn.Sequential(nn.Flatten(2), nn.Linear(6, features))
+    peaks = []
+    for folder in (None, tmp_path / "layers"):
+        tracemalloc.start()
+        found = extract(model, stimuli, layers=["1"], chunk=8, folder=folder)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert found["1"].nbytes == count * 2 * features * 4  # 32 MB
+    assert peaks[0] > found["1"].nbytes > 8 * peaks[1]

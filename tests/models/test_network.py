@@ -1,0 +1,112 @@
+import dataclasses
+
+import pytest
+import torch
+
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE
+from brainbench.core.errors import UsageError
+from brainbench.models.attenders.gpt import GPTAttender
+from brainbench.models.encoders.zhuang import ZhuangEncoder
+from brainbench.models.graph.temporal_graph import TemporalGraph
+from brainbench.models.heads.decoders import mlp_decoder
+from brainbench.models.network import EAD
+
+
+def _network(*, gpt=False, **options):
+    encoder = TemporalGraph(ZhuangEncoder("intersection", layer_norm=True, small=True).spec())
+    return EAD(encoder, GPTAttender(96, 32, blocks=2) if gpt else None, **options).eval()
+
+
+def _sweep(batch=2, steps=6):
+    scale = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)
+    return torch.randn(batch, steps, 30, *GRID_SHAPE) * scale[:, None, None]
+
+
+def test_the_answer_is_decoded_from_the_last_step_in_physical_units():
+    network, x = _network(), _sweep()
+    with torch.no_grad():
+        scaled = x / torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+        expected = network.decoder(network.encoder(scaled)[:, -1])
+        torch.testing.assert_close(network(x), expected, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("gpt", [False, True])
+def test_a_stream_gives_the_sweeps_answer_at_every_step(gpt):
+    network, x = _network(gpt=gpt), _sweep()
+    with torch.no_grad():
+        state = network.init_state(2)
+        for t in range(x.shape[1]):
+            y, state = network.step(x[:, t], state)
+            torch.testing.assert_close(y, network(x[:, : t + 1]), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("gpt", [False, True])
+def test_activations_come_in_the_order_of_the_layers(gpt):
+    network = _network(gpt=gpt)
+    with torch.no_grad():
+        activations = network.activations(x := _sweep())
+        y = network(x)
+    assert tuple(activations) == network.layers
+    assert network.layers[0] == "encoder.conv1"
+    assert network.layers[-1] == "decoder"
+    assert ("attender.lm_head" in network.layers) is gpt
+    assert all(value.shape[:2] == (2, 6) for value in activations.values())
+    torch.testing.assert_close(activations["decoder"][:, -1], y, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("layers", [["encoder.fc8"], ["decoder"], ["attender.block2"], ["decoder", "encoder.conv1"]])
+def test_a_choice_of_layers_equals_the_whole(layers):
+    network, x = _network(gpt=True), _sweep()
+    with torch.no_grad():
+        some, every = network.activations(x, layers), network.activations(x)
+    assert set(some) == set(layers)
+    for name, value in some.items():
+        torch.testing.assert_close(value, every[name])
+
+
+def test_an_unknown_layer_names_the_nearest():
+    with pytest.raises(UsageError, match=r"did you mean 'encoder\.conv3'"):
+        _network().activations(_sweep(), ["conv3"])
+
+
+def test_the_specification_says_what_goes_in():
+    plain, attended = _network().spec, _network(gpt=True).spec
+    assert plain.input_shape == (30, *GRID_SHAPE)
+    assert plain.channels[:7] == (*(f"0.{name}" for name in CHANNELS), "1.Fx")
+    assert plain.units[:6] == ("N", "N", "N", "N·m", "N·m", "N·m")
+    assert plain.sample_rate == pytest.approx(1000 / 45)
+    assert plain.causal
+    assert (plain.latency, plain.outputs) == (3, 117)
+    assert (plain.max_steps, attended.max_steps) == (None, 32)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        plain.outputs = 3
+
+
+def test_the_answer_is_blind_to_steps_within_the_latency():
+    network = _network()
+    with torch.no_grad():
+        short = network(_sweep(steps=3))
+        assert torch.equal(short, network(_sweep(steps=3)))
+        assert not torch.equal(network(_sweep(steps=4)), network(_sweep(steps=4)))
+
+
+def test_any_decoder_fits():
+    network = _network(decoder=mlp_decoder(96, 4))
+    assert network(_sweep()).shape == (2, 4)
+    assert network.spec.outputs == 4
+    with pytest.raises(UsageError, match="must end in a linear layer; received Identity"):
+        _network(decoder=torch.nn.Identity())
+
+
+@pytest.mark.parametrize("shape", [(2, 6, 6, 5, 7), (2, 30, 5, 7), (2, 0, 30, 5, 7), (2, 6, 30, 7, 5)])
+def test_a_wrong_stimulus_is_told_what_is_expected_and_received(shape):
+    with pytest.raises(UsageError) as caught:
+        _network()(torch.zeros(shape))
+    assert "[batch, time, 30, 5, 7]" in str(caught.value)
+    assert f"received {list(shape)}" in str(caught.value)
+
+
+def test_a_wrong_step_is_told_what_is_expected_and_received():
+    network = _network()
+    with pytest.raises(UsageError, match=r"\[batch, 30, 5, 7\]; received \[2, 6, 30, 5, 7\]"):
+        network.step(_sweep(), network.init_state(2))

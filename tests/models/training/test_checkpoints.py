@@ -1,0 +1,119 @@
+import json
+import sys
+import types
+
+import pytest
+import torch
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, MissingDependencyError, UsageError
+from brainbench.models import registry
+from brainbench.models.registry import describe_model, load_model
+from brainbench.models.training.checkpoints import find_folder, save_checkpoint
+
+NAME = "resnet18-small"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    model = load_model(NAME, seed=3, classes=7)
+    return save_checkpoint(
+        tmp_path / "mine", model, architecture=NAME, options={"classes": 7}, info={"objective": "ae"}, card="# Mine\n"
+    )
+
+
+def _equal(first, second):
+    return all(torch.equal(value, second.state_dict()[name]) for name, value in first.state_dict().items())
+
+
+def test_a_folder_is_a_model(folder):
+    loaded = load_model(f"local-dir:{folder}")
+    assert not loaded.training
+    assert loaded.spec.outputs == 7
+    assert _equal(load_model(NAME, seed=3, classes=7), loaded)
+    assert sorted(item.name for item in folder.iterdir()) == ["README.md", "config.json", "model.safetensors"]
+    described = describe_model(f"local-dir:{folder}")
+    assert described.trained["objective"] == "ae"
+    assert described.family == "resnet18"
+
+
+def test_a_folder_can_stand_for_a_tag(folder):
+    assert _equal(load_model(f"{NAME}.ae", pretrained=folder), load_model(f"local-dir:{folder}"))
+
+
+def test_shipped_weights_are_found_by_name(folder, monkeypatch):
+    monkeypatch.setattr(registry, "shipped", lambda: {f"{NAME}.simclr": folder})
+    assert _equal(load_model(f"{NAME}.simclr"), load_model(f"local-dir:{folder}"))
+    assert describe_model(f"{NAME}.simclr").name == f"{NAME}.simclr"
+    with pytest.raises(UsageError, match=r"no weights for 'resnet18-small\.supervised' yet; train them with"):
+        load_model(f"{NAME}.supervised")
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_half_precision_halves_the_file_and_loads_as_float32(folder, dtype):
+    size = (folder / "model.safetensors").stat().st_size
+    model = load_model(f"local-dir:{folder}")
+    save_checkpoint(folder, model, architecture=NAME, options={"classes": 7}, dtype=dtype)
+    assert (folder / "model.safetensors").stat().st_size < 0.55 * size
+    loaded = load_model(f"local-dir:{folder}")
+    assert all(parameter.dtype == torch.float32 for parameter in loaded.parameters())
+    for name, value in model.state_dict().items():
+        torch.testing.assert_close(loaded.state_dict()[name], value, rtol=2**-8, atol=1e-4)
+    assert torch.equal(loaded.normaliser.scale, model.normaliser.scale)
+
+
+def test_weights_that_are_not_finite_are_not_written(tmp_path):
+    model = load_model(NAME)
+    with torch.no_grad():
+        model.decoder.weight[0, 0] = 1e30
+    with pytest.raises(DataError, match=r"'decoder.weight' is not finite in float16"):
+        save_checkpoint(tmp_path / "bad", model, architecture=NAME, options={}, dtype="float16")
+    with pytest.raises(UsageError, match="Unknown precision of weights 'float8'"):
+        save_checkpoint(tmp_path / "bad", model, architecture=NAME, options={}, dtype="float8")
+    assert not (tmp_path / "bad").exists()
+
+
+def test_folders_that_are_no_models_are_told_apart(folder, tmp_path):
+    with pytest.raises(DataFileNotFoundError, match="no folder"):
+        load_model(f"local-dir:{tmp_path / 'none'}")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataFileNotFoundError, match=r"There is no config\.json"):
+        load_model(f"local-dir:{tmp_path / 'empty'}")
+    config = json.loads((folder / "config.json").read_text())
+    for change, message in (
+        ({"brainbench_model": 9}, "format 9, expected 1"),
+        ({"options": []}, "lacks the name 'architecture' or the mapping 'options'"),
+        ({"options": {"clases": 7}}, "did you mean 'classes'"),
+        ({"options": {"classes": 8}}, "do not fit the model"),
+        ({"architecture": "resnet81"}, "Unknown model 'resnet81'"),
+    ):
+        (folder / "config.json").write_text(json.dumps(config | change))
+        with pytest.raises((DataError, UsageError), match=message):
+            load_model(f"local-dir:{folder}")
+
+
+def test_the_hub_is_asked_only_by_its_prefix(folder, monkeypatch):
+    asked = []
+
+    def download(repository, *, revision, allow_patterns):
+        asked.append((repository, revision))
+        return str(folder)
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(snapshot_download=download))
+    assert load_model("hf-hub:someone/touch@v2").spec.outputs == 7
+    assert asked == [("someone/touch", "v2")]
+    with pytest.raises(UsageError, match=r"hf-hub:OWNER/NAME\[@REVISION\]; received 'hf-hub:touch'"):
+        find_folder("hf-hub:touch")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(MissingDependencyError, match=r"brainbench\[hub\]"):
+        load_model("hf-hub:someone/touch")
+
+
+def test_a_score_carries_what_the_checkpoint_says(folder):
+    from brainbench.scoring.model_responses import find_model
+
+    config = json.loads((folder / "config.json").read_text())
+    found = {"top1": 0.5, "top5": 0.9, "interval": {"low": 0.4, "high": 0.6}, "data": "abc", "collapsed": False}
+    (folder / "config.json").write_text(json.dumps(config | {"evaluation": found, "twin": NAME, "seed": 4}))
+    card = find_model(f"local-dir:{folder}").card
+    assert (card.objective, card.top1, card.accuracy_interval.high, card.twin, card.seed) == ("ae", 0.5, 0.6, NAME, 4)
+    assert find_model(NAME).card.objective == "untrained"

@@ -1,0 +1,99 @@
+import pytest
+import torch
+
+from brainbench.models.cells import CELLS
+from brainbench.models.training import trainer as running
+from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.cuda_graphs import captured, copy_state, fuse, make_capturable, reset_optimizer
+from brainbench.models.training.optimizers import OPTIMIZERS, make_optimizer
+from brainbench.models.training.trainer import train
+from tests.factories.training_sweeps import tiny
+
+
+def _step(layer, optimizer, x):
+    optimizer.zero_grad()
+    layer(x).square().sum().backward()
+    optimizer.step()
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_an_optimizer_put_back_to_zero_steps_like_a_new_one_with_its_rate_in_a_tensor(name):
+    torch.manual_seed(0)
+    first, second = torch.nn.Linear(5, 4), torch.nn.Linear(5, 4)
+    second.load_state_dict(first.state_dict())
+    plain = make_optimizer(name, first.parameters(), 1e-2)
+    other, rate = make_optimizer(name, second.parameters(), 1.0), torch.tensor(1.0)
+    make_capturable(other, rate)
+    start = {key: value.clone() for key, value in second.state_dict().items()}
+    _step(second, other, torch.randn(7, 5))
+    assert not torch.equal(second.weight, start["weight"])
+    copy_state(second, start)
+    reset_optimizer(other)
+    rate.fill_(1e-2)
+    for _ in range(4):
+        x = torch.randn(7, 5)
+        _step(first, plain, x)
+        _step(second, other, x)
+    torch.testing.assert_close(second.weight, first.weight)
+
+
+def test_on_the_cpu_work_is_repeated_as_it_is():
+    done = []
+    again = captured(lambda: done.append(1), torch.device("cpu"), warm_up=2)
+    again()
+    assert len(done) == 3
+
+
+@pytest.mark.parametrize("model", ["zhuang-small", "resnet18-small"])
+def test_a_run_of_recorded_steps_ends_with_the_weights_of_a_plain_one(model, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "fuse", lambda module: None)
+    finals = []
+    for how in ("off", "graphs"):
+        # 20 sweeps in batches of 8: the last batch of each epoch has another shape than the recorded one.
+        config = TrainingConfig.published(
+            model, "supervised", epochs=2, batch_size=8, precision="float32", decoder="linear", compile=how
+        )
+        result = train(config, tiny(train=20), out=tmp_path / how, device="cpu")
+        assert result.status == "finished"
+        finals.append((tmp_path / how / "best" / "model.safetensors").read_bytes())
+    assert finals[0] == finals[1]
+
+
+# PyTorch's compiler uses a part of PyTorch that PyTorch has deprecated.
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")
+@pytest.mark.slow
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("name", [name for name in CELLS if name != "time-decay"])
+def test_a_fused_cell_computes_what_the_plain_one_does(name, layer_norm):
+    torch.manual_seed(0)
+    cell = CELLS[name](8, 8, kernel_size=2, layer_norm=layer_norm)
+    x, state = torch.randn(3, 8, 4, 6, requires_grad=True), torch.randn(3, 8 * cell.state_factor, 4, 6)
+
+    def results():
+        cell.zero_grad()
+        x.grad = None
+        y, after = cell(x, state)
+        (y.sum() + after.square().sum()).backward()
+        return [y.detach(), after.detach(), x.grad, *(parameter.grad for parameter in cell.parameters())]
+
+    plain = results()
+    fuse(cell)
+    torch.testing.assert_close(results(), plain, atol=1e-4, rtol=1e-4)
+    fuse(cell, False)
+    assert not any(part in vars(cell) for part in cell.fused_parts)
+    torch.testing.assert_close(results(), plain)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("objective", ["supervised", "simclr"])
+def test_recorded_steps_learn_on_a_gpu_as_plain_ones_do(objective, tmp_path):
+    losses = []
+    for how in ("off", "graphs"):
+        config = TrainingConfig.published(
+            "zhuang-ugrnn-small", objective, epochs=4, batch_size=8, precision="float32", compile=how, probe_epochs=3
+        )
+        result = train(config, tiny(), out=tmp_path / how, device="cuda")
+        assert result.status == "finished"
+        losses.append([line["loss"] for line in running.read_log(tmp_path / how, "epoch")])
+    assert losses[1] == pytest.approx(losses[0], rel=0.02)

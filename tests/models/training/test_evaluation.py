@@ -1,0 +1,70 @@
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from brainbench.core.errors import DataError
+from brainbench.models.registry import load_model
+from brainbench.models.training.evaluation import collapse, evaluate, topk, wilson
+
+
+class Fixed(nn.Module):
+    """Answers with the first values of the stimulus."""
+
+    def __init__(self, classes):
+        super().__init__()
+        self.classes = classes
+
+    def forward(self, x):
+        return x.flatten(1)[:, : self.classes]
+
+
+def test_wilson_equals_a_published_value():
+    # 10 of 100 (Newcombe 1998, method 3, without continuity correction): .0552 to .1744.
+    interval = wilson(10, 100)
+    assert (interval.low, interval.high) == pytest.approx((0.0552, 0.1744), abs=5e-5)
+    assert wilson(0, 10).low == pytest.approx(0.0, abs=1e-12)
+    with pytest.raises(DataError, match="at least one observation"):
+        wilson(0, 0)
+
+
+def test_top_k_counts_labels_among_the_largest_and_ties_against_the_network():
+    answers = torch.tensor([[3.0, 2.0, 1.0], [1.0, 2.0, 3.0], [1.0, 1.0, 1.0], [math.nan, 0.0, 0.0]])
+    labels = torch.tensor([0, 1, 0, 0])
+    assert [topk(answers, labels, k) for k in (1, 2)] == [1, 2]
+
+
+def test_accuracy_is_counted_over_batches():
+    x = torch.eye(6).view(6, 1, 6, 1, 1)
+    labels = torch.tensor([0, 1, 2, 3, 4, 0])
+    result = evaluate(Fixed(6), [(x[:4], labels[:4]), (x[4:], labels[4:])])
+    assert (result.top1, result.count, result.predicted) == (pytest.approx(5 / 6), 6, 6)
+    assert not result.collapsed
+    assert math.isnan(result.spread)
+    again = evaluate(Fixed(6), [(x[:4], labels[:4]), (x[4:], labels[4:])])
+    assert again.data == result.data != evaluate(Fixed(6), [(x, labels.flip(0))]).data
+
+
+def test_a_network_that_always_gives_one_class_has_collapsed():
+    x = torch.tensor([1.0, 0.0, 0.0]).view(1, 1, 3, 1, 1).expand(6, -1, -1, -1, -1)
+    result = evaluate(Fixed(3), [(x, torch.tensor([0, 1, 2, 0, 1, 2]))])
+    assert result.collapsed
+    assert result.reason == "one class is predicted for every sweep"
+
+
+def test_features_in_one_point_have_collapsed():
+    model = load_model("zhuang-small", classes=3)
+    x = 1e-4 * torch.randn(6, 5, 30, 5, 7)
+    assert not evaluate(model, [(x, torch.arange(6) % 3)]).collapsed
+    with torch.no_grad():
+        model.encoder.node("fc8").operation.weight.zero_()
+        model.encoder.node("fc8").operation.bias.fill_(1.0)
+    assert evaluate(model, [(x, torch.arange(6) % 3)]).collapsed
+    assert collapse(2, 3, 0.001).startswith("the features of all sweeps are nearly equal")
+    assert collapse(2, 3, math.nan) == ""
+
+
+def test_an_empty_data_set_is_refused():
+    with pytest.raises(DataError, match="gave no batch"):
+        evaluate(Fixed(3), [])

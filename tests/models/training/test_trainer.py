@@ -1,0 +1,232 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.models.registry import describe_model, load_model
+from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.trainer import read_log, train
+from tests.factories.training_sweeps import CLASSES, sweeps, tiny
+
+MODEL = "zhuang-small"
+
+
+def _config(objective="supervised", **changes):
+    options = {
+        "epochs": 2,
+        "batch_size": 8,
+        "optimizer": "adamw",
+        "learning_rate": 1e-3,
+        "schedule": "constant",
+        "augmentation": "none",
+        "probe_epochs": 3,
+        "precision": "float32",
+    }
+    return TrainingConfig.published(changes.pop("model", MODEL), objective, **(options | changes))
+
+
+def _weights(folder):
+    return load_file(Path(folder) / "best" / "model.safetensors")
+
+
+def _equal(first, second):
+    return first.keys() == second.keys() and all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+def test_a_run_learns_what_can_be_learned_and_leaves_a_model_to_load(tmp_path):
+    result = train(_config(epochs=8), tiny(), out=tmp_path, device="cpu")
+    assert result.status == "finished"
+    assert (result.steps, result.epochs) == (24, 8)
+    assert result.evaluation.top1 > 0.8
+    assert not result.evaluation.collapsed
+    model = load_model(f"local-dir:{result.folder}")
+    x, labels = sweeps(9, 2)
+    with torch.no_grad():
+        assert (model(x).argmax(1) == labels).float().mean() == pytest.approx(result.evaluation.top1)
+    known = describe_model(f"local-dir:{result.folder}")
+    assert known.trained["classes"] == list(CLASSES)
+    assert known.trained["evaluation"]["top1"] == pytest.approx(result.evaluation.top1)
+    assert known.trained["twin"] == MODEL
+    card = (result.folder / "README.md").read_text()
+    assert f"{MODEL}.supervised" in card
+    assert "8 (published: 100)" in card
+    losses = [line["loss"] for line in read_log(tmp_path, "epoch")]
+    assert losses[-1] < losses[0]
+
+
+def test_on_the_cpu_precision_is_single_unless_asked_otherwise(tmp_path):
+    train(_config(precision="auto", epochs=1), tiny(), out=tmp_path, device="cpu")
+    assert json.loads((tmp_path / "run.json").read_text())["run"]["precision"] == "float32"
+
+
+@pytest.mark.parametrize("objective", ["simclr", pytest.param("simsiam", marks=pytest.mark.slow), "ae"])
+def test_self_supervised_runs_end_with_a_linear_probe(objective, tmp_path):
+    result = train(_config(objective, augmentation="physical"), tiny(), out=tmp_path, device="cpu")
+    assert result.status == "finished"
+    assert result.evaluation.count == 9
+    trained, fresh = load_model(f"local-dir:{result.folder}"), load_model(MODEL, classes=3)
+    assert trained.decoder.weight.shape == (3, 96)
+    assert not torch.equal(trained.encoder.node("fc8").operation.weight, fresh.encoder.node("fc8").operation.weight)
+    assert {line["kind"] for line in _lines(tmp_path)} == {"epoch", "validation", "test"}
+
+
+def _lines(folder):
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("objective", ["supervised", pytest.param("simclr", marks=pytest.mark.slow)])
+def test_a_run_stopped_after_every_step_ends_as_an_unbroken_one(objective, tmp_path):
+    config = _config(objective, model="resnet18-small+gpt", augmentation="physical", optimizer="sgd", masking=0.25)
+    train(config, tiny(), out=tmp_path / "whole", device="cpu")
+    for _ in range(7):
+        result = train(config, tiny(), out=tmp_path / "broken", device="cpu", stop_after=0.0)
+        if result.status == "finished":
+            break
+    assert result.status == "finished"
+    assert _equal(_weights(tmp_path / "whole"), _weights(tmp_path / "broken"))
+    logs = [[line for line in _lines(tmp_path / name)] for name in ("whole", "broken")]
+    assert logs[0] == logs[1]
+
+
+def test_equal_seeds_give_equal_weights_and_others_do_not(tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train(_config(epochs=1, seed=seed), tiny(test=0), out=tmp_path / name, device="cpu")
+    assert _equal(_weights(tmp_path / "a"), _weights(tmp_path / "b"))
+    assert not _equal(_weights(tmp_path / "a"), _weights(tmp_path / "c"))
+
+
+def test_a_finished_run_is_not_repeated(tmp_path):
+    first = train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
+    again = train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
+    assert again.evaluation == first.evaluation
+    assert len(_lines(tmp_path)) == 3
+
+
+def test_the_random_state_of_others_is_left_alone(tmp_path):
+    torch.manual_seed(11)
+    expected = torch.rand(2)
+    torch.manual_seed(11)
+    train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
+    assert torch.equal(torch.rand(2), expected)
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_last_good_model(tmp_path):
+    data = tiny()
+    train(_config(epochs=1), data, out=tmp_path, device="cpu")
+    good = _weights(tmp_path)
+    (tmp_path / "run.json").unlink()
+    x, labels = data.splits["train"]
+    data.splits["train"] = (x.clone(), labels)
+    data.splits["train"][0][3] = torch.nan
+    result = train(_config(epochs=3), data, out=tmp_path, device="cpu")
+    assert result.status == "diverged"
+    assert "the loss was nan" in result.reason
+    assert _equal(_weights(tmp_path), good)
+    failed = load_file(tmp_path / "failed-batch.safetensors")
+    assert torch.isnan(failed["view0"]).any()
+    assert len(failed["labels"]) == 8
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path):
+    train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
+    with pytest.raises(UsageError, match=r"holds another run: learning_rate 0\.001 \(now 0\.01\)"):
+        train(_config(epochs=1, learning_rate=0.01), tiny(), out=tmp_path, device="cpu")
+
+
+def test_a_damaged_state_is_named(tmp_path):
+    train(_config(), tiny(), out=tmp_path, device="cpu", stop_after=0.0)
+    (tmp_path / "state.safetensors").write_bytes(b"nothing")
+    with pytest.raises(DataError, match="not a readable training state"):
+        train(_config(), tiny(), out=tmp_path, device="cpu")
+
+
+def test_missing_data_and_devices_are_named(tmp_path):
+    with pytest.raises(DataError, match="no split 'train'"):
+        train(_config(), tiny(train=0), out=tmp_path, device="cpu")
+    with pytest.raises(UsageError, match="'tpuu' is not a device"):
+        train(_config(), tiny(), out=tmp_path, device="tpuu")
+
+
+def test_mixed_precision_trains_and_half_precision_weights_are_evaluated_as_shipped(tmp_path):
+    config = _config(epochs=4, precision="bf16", weights_dtype="float16")
+    result = train(config, tiny(), out=tmp_path, device="cpu")
+    assert {str(value.dtype) for name, value in _weights(tmp_path).items() if "scale" not in name} >= {"torch.float16"}
+    x, labels = sweeps(9, 2)
+    with torch.no_grad():
+        again = (load_model(f"local-dir:{result.folder}")(x).argmax(1) == labels).float().mean()
+    assert again == pytest.approx(result.evaluation.top1)
+
+
+SCRIPT = """
+import sys
+import torch
+from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.trainer import train
+from tests.factories.training_sweeps import tiny
+
+torch.set_num_threads(1)
+config = TrainingConfig.published(
+    "zhuang-small+gpt", "supervised", epochs=3, batch_size=8, optimizer="adamw", learning_rate=1e-3,
+    checkpoint_seconds=0.0, augmentation="physical", precision="float32",
+)
+if __name__ == "__main__":
+    train(config, tiny(), out=sys.argv[1], device="cpu")
+"""
+
+
+def _start(script, out, *prefix):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen([sys.executable, *prefix, str(script), str(out)], env=environment, text=True)
+
+
+@pytest.mark.parametrize("kills", [1, pytest.param(5, marks=pytest.mark.slow)])
+def test_a_run_killed_at_any_moment_ends_with_the_weights_of_an_unbroken_one(kills, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    assert _start(script, tmp_path / "whole").wait() == 0
+    state = tmp_path / "killed" / "state.safetensors"
+    for _ in range(kills):
+        before = state.stat().st_mtime_ns if state.exists() else 0
+        process = _start(script, tmp_path / "killed")
+        deadline = time.monotonic() + 60
+        # At least one step further each time, then dead without a word.
+        while time.monotonic() < deadline and process.poll() is None:
+            if state.exists() and state.stat().st_mtime_ns != before:
+                break
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert _start(script, tmp_path / "killed").wait() == 0
+    assert _equal(_weights(tmp_path / "whole"), _weights(tmp_path / "killed"))
+    assert _equal(load_file(tmp_path / "whole" / "state.safetensors"), load_file(state))
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.replace("zhuang-small+gpt", "zhuang-ugrnn-small"))
+    assert _start(script, tmp_path / "one").wait() == 0
+    two = _start(script, tmp_path / "two", "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    assert two.wait() == 0
+    first, second = _weights(tmp_path / "one"), _weights(tmp_path / "two")
+    for name, value in first.items():
+        torch.testing.assert_close(second[name], value, atol=2e-5, rtol=1e-3, msg=name)
+
+
+# PyTorch's compiler uses a part of PyTorch that PyTorch has deprecated.
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["parts", "default", "graphs"])
+def test_a_compiled_run_learns_too(how, tmp_path):
+    result = train(_config(epochs=4, compile=how, model="zhuang-small"), tiny(), out=tmp_path, device="cpu")
+    assert result.status == "finished"
+    assert result.evaluation.top1 > 0.5

@@ -1,0 +1,254 @@
+"""The control loop and its safety, on a hand of paper and by a clock of its own."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from robotics_bridge import hands
+from robotics_bridge.deploy.controller import Actuation, Controller
+from robotics_bridge.deploy.driver import HandReading, LinkCounters
+from robotics_bridge.deploy.monitor import LatencyHistogram, RateMonitor
+from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
+from robotics_bridge.deploy.touch import PressureCalibration, RealTouch
+
+JOINTS = ("a", "b", "c")
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += max(seconds, 1e-6)
+
+
+class PaperHand:
+    """Follows its targets at once; ``spoil(reading number, fields)`` may change what it reports."""
+
+    def __init__(self, clock: Clock, spoil=None) -> None:
+        self.joints, self.fingers = JOINTS, ("thumb", "index")
+        self.counters = LinkCounters()
+        self.clock, self.spoil = clock, spoil
+        self.position = np.zeros(3)
+        self.sent: list[np.ndarray] = []
+        self.number, self.stops = 0, 0
+        self.last: HandReading | None = None
+
+    def read(self) -> HandReading | None:
+        self.number += 1
+        fields = {
+            "sequence": self.number, "time": self.clock() - 50.0, "arrived": self.clock(),
+            "position": self.position.copy(), "velocity": np.zeros(3), "pressure": np.zeros((2, 3)),
+        }  # fmt: skip
+        if self.spoil is not None:
+            fields = self.spoil(self.number, fields)
+        if fields is not None:
+            self.last = HandReading(**fields)
+        return self.last
+
+    def send(self, targets) -> None:
+        self.sent.append(np.array(targets))
+        self.position = np.array(targets)
+
+    def stop(self) -> None:
+        self.stops += 1
+
+    def close(self) -> None:
+        pass
+
+
+ACTUATION = Actuation(
+    JOINTS, ("a", "c"), default=np.array([0.1, 0.2]), scale=np.array([0.5, 0.5]), low=np.array([-1.0, 0.0]),
+    high=np.array([1.0, 0.4]), frozen={"b": 0.3},
+)  # fmt: skip
+
+
+def _limits(**changes) -> SafetyLimits:
+    return SafetyLimits(np.full(3, -1.0), np.full(3, 1.0), np.full(3, 8.0), **changes)
+
+
+def _control(spoil=None, *, policy=None, seconds=2.0, clock=None, **changes):
+    clock = clock or Clock()
+    hand = PaperHand(clock, spoil)
+    controller = Controller(
+        policy or (lambda obs, forget: np.array([0.2, 0.1], np.float32)), hand, ACTUATION, _limits(),
+        groups=changes.pop("groups", ("proprio",)), clock=clock, sleep=clock.sleep, **changes,
+    )  # fmt: skip
+    return controller.run(seconds), hand, controller
+
+
+def test_a_quiet_session_runs_at_its_rate_and_ends_with_the_hand_holding() -> None:
+    report, hand, controller = _control()
+    assert (report.status, report.reason) == ("finished", "")
+    assert report.ticks == pytest.approx(80, abs=1)
+    assert hand.stops == 1
+    np.testing.assert_allclose(hand.sent[-1], [0.2, 0.3, 0.25], atol=1e-6)
+    assert len(controller.latency) == report.ticks
+
+
+def test_observations_are_those_of_the_tasks() -> None:
+    seen = []
+
+    def policy(obs, forget):
+        seen.append((obs["proprio"].copy(), forget))
+        return np.array([0.4, -0.2], np.float32)
+
+    def spoil(number, fields):
+        return {**fields, "velocity": np.array([1.0, 2.0, 3.0])}
+
+    _control(spoil, policy=policy, seconds=0.1)
+    first, second = seen[0], seen[1]
+    np.testing.assert_allclose(first[0], [0, 0, 0, 0.2, 0.4, 0.6, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(second[0][-2:], [0.4, -0.2], atol=1e-6)
+    assert [forget for _, forget in seen[:3]] == [True, False, False]
+
+
+def _from(number, **changes):
+    return lambda n, fields: {**fields, **{k: v for k, v in changes.items()}} if n > number else fields
+
+
+NAN = np.array([0.0, np.nan, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_from(20, position=NAN), "no numbers"),
+        (_from(20, velocity=NAN), "no numbers"),
+        (_from(20, pressure=np.full((2, 3), np.inf)), "no numbers"),
+        (_from(20, time=float("nan")), "no numbers"),
+        (_from(20, position=np.array([0.0, 1000.0, 0.0])), "joint 1 is reported at 1e"),
+        (_from(20, velocity=np.array([0.0, 0.0, -17.0])), "joint 2 is reported to move at -17 rad/s"),
+        (_from(20, pressure=np.full((2, 3), 40.0)), "a finger tip is pressed with 69.3"),
+        (lambda n, fields: None if n > 20 else fields, "ms old \\(allowed 100 ms\\)"),
+        (lambda n, fields: {**fields, "time": 50.5} if n > 20 else fields, "ms old"),
+        (lambda n, fields: {**fields, "time": fields["time"] - 0.2} if n > 20 else fields, "the newest report is 2"),
+    ],
+)
+def test_bad_data_stops_the_hand_before_it_is_acted_upon(spoil, message) -> None:
+    report, hand, _ = _control(spoil)
+    assert report.status == "stopped"
+    assert re.search(message, report.reason), report.reason
+    assert hand.stops == 1
+    assert len(hand.sent) == report.ticks < 30
+    assert all(np.isfinite(sent).all() for sent in hand.sent)
+
+
+def test_short_gaps_and_repeats_are_survived() -> None:
+    # Two of three reports are lost: the newest is at most 50 ms old.
+    report, _, _ = _control(lambda n, fields: fields if n % 3 == 0 else None)
+    assert report.status == "finished"
+    assert report.ticks > 70
+
+
+def test_a_silent_hand_is_not_waited_for_for_ever() -> None:
+    report, hand, _ = _control(lambda n, fields: None)
+    assert report.reason == "the hand said nothing for 3 s"
+    assert (report.ticks, hand.sent, hand.stops) == (0, [], 1)
+
+
+def test_a_policy_that_gives_no_numbers_or_fails_leaves_the_hand_holding() -> None:
+    calls = iter([np.zeros(2), np.zeros(2), np.array([np.nan, 0.0])])
+    report, hand, _ = _control(policy=lambda obs, forget: next(calls))
+    assert "policy gave values that are no numbers" in report.reason
+    assert len(hand.sent) == 2
+    clock = Clock()
+    hand = PaperHand(clock)
+
+    def broken(obs, forget):
+        raise RuntimeError("boom")
+
+    controller = Controller(
+        broken, hand, ACTUATION, _limits(), groups=("proprio",), clock=clock, sleep=clock.sleep
+    )  # fmt: skip
+    with pytest.raises(RuntimeError, match="boom"):
+        controller.run(1.0)
+    assert hand.stops == 1
+
+
+def test_slow_control_is_noticed() -> None:
+    clock = Clock()
+
+    def slow(obs, forget):
+        clock.now += 0.05
+        return np.zeros(2)
+
+    report, _, _ = _control(policy=slow, clock=clock, seconds=5)
+    assert "control runs at 20.0 Hz instead of 40" in report.reason
+    assert report.overruns > 15
+
+
+def test_targets_keep_to_limits_of_joint_and_speed() -> None:
+    report, hand, _ = _control(policy=lambda obs, forget: np.array([9.0, 9.0]))
+    sent = np.array(hand.sent)
+    assert np.abs(np.diff(sent, axis=0, prepend=np.zeros((1, 3)))).max() <= 8.0 / 40 + 1e-9
+    np.testing.assert_allclose(sent[-1], [1.0, 0.3, 0.4])
+    assert report.limited == 4  # until the slowest joint has come the 1 rad, 0.2 rad a tick
+
+
+def test_ages_are_told_without_a_common_clock() -> None:
+    offset = ClockOffset()
+
+    def reading(time, arrived):
+        return HandReading(0, time, arrived, np.zeros(1), np.zeros(1), np.zeros((0, 3)))
+
+    assert offset.age(reading(5.0, 105.02), 105.02) == pytest.approx(0.0)
+    assert offset.age(reading(5.1, 105.11), 105.11) == pytest.approx(0.0)  # came faster: the new zero
+    assert offset.age(reading(5.2, 105.31), 105.35) == pytest.approx(0.14)
+
+
+def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
+    pressure = np.array([[0.0, 0.0, 0.03], [0.02, 0.0, 0.1]])
+    reading = HandReading(0, 0.0, 0.0, np.zeros(3), np.zeros(3), pressure)
+    links, tips = ("palm", "index_tip", "thumb_tip"), {"index_tip": "index", "thumb_tip": "thumb"}
+    fallback = lambda r: np.full((5, 3, 1), 7.0)  # noqa: E731
+    touch = RealTouch("agg_bool", links, (5, 3, 1), tips=tips, fingers=("thumb", "index"), fallback=fallback)
+    assert touch(reading)[:, :, 0].tolist() == [[7.0, 1.0, 0.0]] * 5  # 4.31: |f| > 0.05
+    force = RealTouch("agg_force", links, (5, 3, 3), tips=tips, fingers=("thumb", "index"))
+    assert force(reading)[2].tolist() == [[0, 0, 0], [-20.0, 0.0, 100.0], [0.0, 0.0, 30.0]]
+    calibration = PressureCalibration(per_finger={"index": 500.0})
+    again = calibration.pressure(("thumb", "index"), calibration.force(("thumb", "index"), pressure))
+    np.testing.assert_allclose(again, pressure)
+    simulated = RealTouch("force", links, (5, 9, 3), tips=tips, fingers=(), fallback=lambda r: np.ones((5, 9, 3)))
+    assert simulated(reading).all()
+    with pytest.raises(UsageError, match="cannot measure 'force', one value per taxel"):
+        RealTouch("force", links, (5, 9, 3), tips=tips, fingers=())
+    with pytest.raises(UsageError, match=r"one item per link \(3\); the policy reads 4"):
+        RealTouch("agg_bool", links, (5, 4, 1), tips=tips, fingers=("thumb", "index"))
+
+
+def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
+    with pytest.raises(UsageError, match="reads the group 'goal', and nothing here gives it"):
+        _control(groups=("proprio", "goal"))
+    with pytest.raises(UsageError, match="lacks 'action_map'"):
+        Actuation.of({"joints": []})
+    with pytest.raises(UsageError, match="'timeout' is a positive number; received -1"):
+        _limits(timeout=-1)
+    hand = hands.load("xhand1")
+    limits = SafetyLimits.of_hand(hand, hand.joints)
+    assert limits.speed.max() == pytest.approx(14.38)
+    with pytest.raises(UsageError, match="has no joint 'knee'"):
+        SafetyLimits.of_hand(hand, ("knee",))
+    report, _, _ = _control(groups=("proprio", "goal"), sources={"goal": lambda r: np.array([np.nan])})
+    assert report.reason == "the observation 'goal' holds values that are no numbers"
+
+
+def test_histogram_and_rate() -> None:
+    histogram = LatencyHistogram()
+    for value in np.linspace(0.001, 0.1, 1000):
+        histogram.add(float(value))
+    assert histogram.counts.sum() == 1000
+    assert histogram.summary()["p50"] == pytest.approx(50.5, rel=1e-3)
+    assert histogram.summary()["max"] == pytest.approx(100.0)
+    assert histogram.text().count("\n") == 20  # two decades
+    monitor = RateMonitor(40, 1.0)
+    rates = [monitor.tick(0.05 * step) for step in range(60)]
+    assert rates[5] == 40  # too early to tell
+    assert rates[-1] == pytest.approx(20)

@@ -1,0 +1,49 @@
+"""Simulated touch beside a hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robotics_bridge import hands
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.shadow import ShadowTouch
+from robotics_bridge.deploy.touch import RealTouch
+from robotics_bridge.hands.scenes import closing
+
+HAND = hands.load("xhand1")
+
+
+def _reading(position, pressure=None) -> HandReading:
+    pressure = np.zeros((5, 3)) if pressure is None else pressure
+    return HandReading(0, 0.0, 0.0, np.asarray(position), np.zeros(12), pressure)
+
+
+def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball() -> None:
+    joints = HAND.joints[::-1]
+    shadow = ShadowTouch("xhand1", "force_torque", "hand", "low", joints=joints)
+    closed = closing(HAND, 0.5)
+    order = [joints.index(name) for name in HAND.joints]
+    reported = np.empty(12)
+    reported[order] = closed[[HAND.joints.index(name) for name in HAND.joints]]
+    for _ in range(40):
+        felt = shadow(_reading(reported))
+    assert felt.shape == (5, 90, 6)
+    assert np.isfinite(felt).all()
+    assert np.abs(felt[..., :3]).max() > 0.01
+    assert np.abs(shadow.hand.position - reported[order]).mean() < 0.2
+
+
+def test_measured_links_replace_simulated_ones() -> None:
+    shadow = ShadowTouch("xhand1", "agg_force", "hand", "low", joints=HAND.joints)
+    layout = HAND.layout("low", "hand")
+    tips = {chain[-1]: finger for finger, chain in HAND.fingers.items()}
+    touch = RealTouch(
+        "agg_force", tuple(layout), (5, len(layout), 3), tips=tips, fingers=tuple(HAND.fingers), fallback=shadow
+    )
+    pressure = np.full((5, 3), 0.01)
+    for _ in range(20):
+        felt = touch(_reading(np.zeros(12), pressure))
+    tip_rows = [row for row, link in enumerate(layout) if link in tips]
+    np.testing.assert_allclose(felt[:, tip_rows], np.broadcast_to([-10.0, -10.0, 10.0], (5, 5, 3)), rtol=1e-5)
+    palm = list(layout).index(HAND.palm)
+    assert np.abs(felt[:, palm]).max() > 0.1  # the ball lies on the simulated palm

@@ -1,0 +1,203 @@
+"""The map from taxels to an encoder's input."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from brainbench.core.errors import UsageError
+from robotics_bridge import hands
+from robotics_bridge.hands.observations import observation_type, observe
+from robotics_bridge.policies.encoders.finger_axes import finger_rows
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.sensors import Probes
+
+HANDS = ("xhand1", "sharpa")
+
+
+def _base_poses(name: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Links' rotations and origins in the palm's frame, from MuJoCo by another way than the grid's own."""
+    hand = hands.load(name)
+    data = mujoco.MjData(hand.model)
+    mujoco.mj_forward(hand.model, data)
+    palm = data.body(hand.palm)
+    base = Rotation.from_quat(palm.xquat, scalar_first=True)
+    return {
+        link: (
+            (base.inv() * Rotation.from_quat(data.body(link).xquat, scalar_first=True)).as_matrix(),
+            base.inv().apply(data.body(link).xpos - palm.xpos),
+        )
+        for link in (hand.palm, *(link for chain in hand.fingers.values() for link in chain))
+    }
+
+
+def _total(grid: TaxelGrid, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Force and moment about the palm's origin of a grid [6, 5, 7]."""
+    force, moment = image[:3], image[3:]
+    centers = grid.rays.centers.transpose(2, 0, 1)
+    about = moment + np.cross(centers, force, axis=0)
+    return force.sum((1, 2)), about.sum((1, 2))
+
+
+@pytest.mark.parametrize("resolution", hands.RESOLUTIONS)
+@pytest.mark.parametrize("placement", hands.PLACEMENTS)
+@pytest.mark.parametrize("name", HANDS)
+def test_force_and_torque_of_the_whole_hand_are_conserved(name, placement, resolution) -> None:
+    grid = TaxelGrid(name, placement=placement, resolution=resolution)
+    rng = np.random.default_rng(0)
+    readings = torch.from_numpy(rng.normal(size=(1, 1, grid.items, 6))).float()
+    image = grid(readings)[0].numpy().astype(float)
+    poses = _base_poses(name)
+    force, moment, item = np.zeros(3), np.zeros(3), 0
+    for link, probes in grid.layout.items():
+        turn, origin = poses[link]
+        for _ in range(int(probes.active.sum())):
+            wrench = readings[0, 0, item].numpy().astype(float)
+            force += turn @ wrench[:3]
+            moment += turn @ wrench[3:] + np.cross(origin, turn @ wrench[:3])
+            item += 1
+    assert item == grid.items
+    found = _total(grid, image)
+    np.testing.assert_allclose(found[0], force, atol=1e-4)
+    np.testing.assert_allclose(found[1], moment, atol=1e-4)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    name=st.sampled_from(HANDS), item=st.integers(0, 198), force=st.tuples(*[st.floats(-5, 5)] * 3),
+    torque=st.tuples(*[st.floats(-0.1, 0.1)] * 3),
+)  # fmt: skip
+def test_one_taxel_gives_its_wrench_about_the_centre_of_its_one_site(name, item, force, torque) -> None:
+    grid = _GRIDS[name]
+    readings = torch.zeros(1, 1, grid.items, 6)
+    links = [link for link, probes in grid.layout.items() for _ in range(int(probes.active.sum()))]
+    points = np.concatenate([probes.position[probes.active] for probes in grid.layout.values()])
+    turn, origin = grid.rays.place[links[item]]
+    # A taxel reads its own torque and the moment of its force about the link's origin.
+    readings[0, 0, item] = torch.tensor([*force, *(np.array(torque) + np.cross(points[item], force))])
+    image = grid(readings)[0].numpy()
+    rows, columns = grid.rays.sites(links[item], points[item][None])
+    site = image[:, rows[0], columns[0]]
+    lever = turn @ points[item] + origin - grid.rays.centers[rows[0], columns[0]]
+    expected = np.cross(lever, turn @ force) + turn @ torque
+    np.testing.assert_allclose(site[:3], turn @ force, atol=1e-5)
+    np.testing.assert_allclose(site[3:], expected, atol=1e-5)
+    image[:, rows[0], columns[0]] = 0
+    assert not image.any()
+
+
+_GRIDS = {name: TaxelGrid(name) for name in HANDS}
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_medium_resolution_fills_every_site_and_sites_run_from_tip_to_wrist(name) -> None:
+    grid = _GRIDS[name]
+    assert bool(grid.occupied.all())
+    centers = grid.rays.centers
+    for row in range(1, 5):  # the fingers point along z of the palm, the thumb does not
+        assert (np.diff(centers[row, :, 2]) < 0).all()
+    # Fingers lie side by side along y, from the radial side on.
+    assert (np.diff(centers[1:, 0, 1]) < 0).all()
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_spot_of_skin_keeps_its_cell_at_every_placement_and_resolution(name) -> None:
+    whole = _GRIDS[name]
+    for resolution in hands.RESOLUTIONS:
+        for placement in ("tips", "fingers"):
+            part = TaxelGrid(name, placement=placement, resolution=resolution)
+            np.testing.assert_array_equal(part.rays.edges, whole.rays.edges)
+            np.testing.assert_array_equal(part.rays.centers, whole.rays.centers)
+    tips = TaxelGrid(name, placement="tips").occupied
+    assert bool(tips[:, 0].all())
+    assert not tips[:, 4:].any()
+
+
+def test_sub_steps_become_channels_in_the_order_of_the_encoder() -> None:
+    grid = _GRIDS["xhand1"]
+    readings = torch.randn(2, 5, grid.items, 6)
+    image = grid(readings).view(2, 5, 6, 5, 7)
+    for step in range(5):
+        torch.testing.assert_close(image[:, step], grid(readings[:, step : step + 1]))
+
+
+def test_fillers_never_count() -> None:
+    grid = TaxelGrid("sharpa", resolution="high", placement="tips")
+    assert any(not probes.active.all() for probes in grid.layout.values())
+    readings = {link: torch.zeros(1, len(probes), 6) for link, probes in grid.layout.items()}
+    for link, probes in grid.layout.items():
+        readings[link][:, torch.from_numpy(~probes.active)] = 1e6
+    assert not grid.from_readings(readings).any()
+
+
+def test_readings_of_the_sensors_and_the_packed_observation_give_the_same_grid() -> None:
+    grid = _GRIDS["xhand1"]
+    steps = [{link: torch.randn(2, *p.shape, 6) for link, p in grid.layout.items()} for _ in range(5)]
+    packed = torch.stack([observe("force_torque", step, grid.layout) for step in steps], 1)
+    torch.testing.assert_close(grid.from_readings(steps), grid(packed.unflatten(2, (grid.items, 6))))
+
+
+@pytest.mark.parametrize("kind", ["bool", "depth", "agg_bool", "agg_force", "force", "elastomer", "proximity"])
+def test_every_type_with_touch_has_a_grid_that_pushes_into_the_skin(kind) -> None:
+    grid = TaxelGrid("xhand1", observe=kind)
+    channels = observation_type(kind).channels
+    assert grid.channels == channels
+    values = torch.zeros(1, 1, grid.items, channels)
+    values[..., 0] = 1.0
+    if kind in ("force", "elastomer", "proximity"):
+        force = grid(values)[0, :3].sum((1, 2)).numpy()
+        expected = np.zeros(3)
+        for link, probes in grid.layout.items():
+            expected += int(probes.active.sum()) * grid.rays.place[link][0][:, 0]
+        np.testing.assert_allclose(force, expected, atol=1e-3)
+    else:
+        if kind == "agg_force":  # what a real tip reports when its link is pushed: summed normals, axes z y x
+            normals = [probes.normal[probes.active].sum(axis=0) for probes in grid.layout.values()]
+            values[0, 0] = torch.tensor(np.array(normals)[:, ::-1].copy())
+        palm = list(grid.layout).index("right_hand_link")
+        if kind in ("agg_bool", "agg_force"):
+            values[0, 0, [i for i in range(grid.items) if i != palm]] = 0
+        force = grid(values)[0, :3].sum((1, 2)).numpy()
+        assert force[0] < 0  # the palm faces x and is pushed against it
+        assert abs(force[1]) < 1e-3 * abs(force[0]) or kind in ("bool", "depth")
+
+
+def test_a_hand_of_a_file_and_a_layout_of_ones_own_have_grids(tmp_path) -> None:
+    mjcf = """<mujoco><worldbody><body name="palm"><geom type="box" size=".04 .01 .04"/>
+      <body name="ff_1" pos=".03 0 .04"><joint name="a" axis="1 0 0" range="-90 0"/>
+        <geom type="capsule" size=".01" fromto="0 0 0 0 0 .04"/>
+        <body name="ff_tip" pos="0 0 .04"><joint name="b" axis="1 0 0" range="-90 0"/>
+          <geom type="capsule" size=".009" fromto="0 0 0 0 0 .03"/></body></body>
+      <body name="th_1" pos="-.04 0 0"><joint name="c" axis="0 0 1" range="-90 0"/>
+        <geom type="capsule" size=".01" fromto="0 0 0 -.04 0 0"/></body>
+      </body></worldbody></mujoco>"""
+    path = tmp_path / "two.xml"
+    path.write_text(mjcf)
+    hand = hands.load(path)
+    grid = TaxelGrid(hand)
+    assert bool(grid.occupied[0].any())  # thumb
+    assert bool(grid.occupied[1].any())  # index
+    assert not grid.occupied[2:].any()
+    own = hand.with_probes({"ff_tip": Probes.grid(2, 2, size=(0.01, 0.01), center=(0, -0.009, 0.015))})
+    assert TaxelGrid(own, resolution="custom").items == 4
+
+
+def test_unreadable_finger_names_take_rows_in_their_order() -> None:
+    assert finger_rows({"mf": (), "th": (), "ff": ()}) == {"mf": 2, "th": 0, "ff": 1}
+    assert finger_rows({"fingertip": (), "fingertip_2": ()}) == {"fingertip": 0, "fingertip_2": 1}
+    with pytest.raises(UsageError, match="rows for 5 fingers; this hand has 6"):
+        finger_rows({f"finger{i}": () for i in range(6)})
+
+
+def test_errors_say_what_is_wrong() -> None:
+    with pytest.raises(UsageError, match="'none' has no touch"):
+        TaxelGrid("xhand1", observe="none")
+    with pytest.raises(UsageError, match="199 items, 6 channels"):
+        _GRIDS["xhand1"](torch.zeros(1, 5, 198, 6))
+    with pytest.raises(UsageError, match="did you mean 'tips'"):
+        TaxelGrid("xhand1", placement="tip")

@@ -1,0 +1,171 @@
+"""Distillation of students that feel."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+from brainbench.core.errors import DataError, UsageError
+from robotics_bridge.policies.training.distill import StudentPolicy, distill, load_student
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from tests.factories.task_worlds import Follower, TouchWorld
+
+
+def _config(**changes) -> DistillConfig:
+    plain = {
+        "task": "follow", "placement": "tips", "resolution": "low", "encoder": "mlp", "embedder": "none",
+        "hidden": (32, 32), "num_envs": 16, "steps_per_env": 8, "save_interval": 2,
+    }  # fmt: skip
+    return DistillConfig(**{**plain, **changes})
+
+
+def _run(out, env=None, teacher=None, **changes):
+    config = _config(**changes)
+    world = env or TouchWorld(16, observe=config.observe)
+    return distill(config, out, env=world, teacher=teacher or Follower())
+
+
+def _losses(folder) -> list[dict[str, float]]:
+    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return [line for line in lines if line["kind"] == "loss"]
+
+
+@pytest.mark.slow
+def test_a_student_that_feels_learns_what_one_without_touch_cannot(tmp_path) -> None:
+    settings = {"iterations": 40, "learning_rate": 5e-3, "epochs": 4, "save_interval": 40, "steps_per_env": 16}
+    felt = _run(tmp_path / "felt", **settings)
+    numb = _run(tmp_path / "numb", observe="none", **settings)
+    assert felt.status == numb.status == "finished"
+    # Without touch the best guess of the aim is what the joints' own past tells.
+    assert felt.loss < 0.4 * numb.loss
+    last = _losses(tmp_path / "felt")[-1]
+    assert last["aux_aim"] < 0.4 * _losses(tmp_path / "numb")[-1]["aux_aim"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"encoder": "zhuang-small", "embedder": "lstm", "aggregate": 2, "teacher_share": 0.5, "teacher_iterations": 4},
+        {"encoder": "tactile_convrnn", "noisy": True, "loss": "inv_var_mse", "clip": 0.1, "max_grad_norm": 0.5},
+    ],
+)
+def test_a_killed_run_goes_on_exactly(tmp_path, changes) -> None:
+    unbroken = _run(tmp_path / "a", iterations=4, **changes)
+
+    class Killed(TouchWorld):
+        steps = 0
+
+        def step(self, action):
+            self.steps += 1
+            if self.steps > 3 * 8 - 4:  # in the third iteration, after the state of the second was saved
+                raise KeyboardInterrupt
+            return super().step(action)
+
+    with pytest.raises(KeyboardInterrupt):
+        _run(tmp_path / "b", Killed(16), iterations=4, **changes)
+    resumed = _run(tmp_path / "b", iterations=4, **changes)
+    assert resumed.iterations == unbroken.iterations == 4
+    assert resumed.loss == unbroken.loss
+    first, second = (load_student(tmp_path / name)[0].state_dict() for name in "ab")
+    for name, value in first.items():
+        torch.testing.assert_close(second[name], value, rtol=0, atol=0, msg=name)
+    assert _losses(tmp_path / "a") == _losses(tmp_path / "b")
+
+
+def test_a_run_that_stops_after_some_iterations_goes_on_exactly(tmp_path) -> None:
+    whole = _run(tmp_path / "a", iterations=4)
+    first = distill(_config(iterations=4), tmp_path / "b", env=TouchWorld(16), teacher=Follower(), stop_at=3)
+    assert (first.status, first.iterations, first.reason) == ("stopped", 3, "3 iterations were asked for.")
+    assert _run(tmp_path / "b", iterations=4).loss == whole.loss
+
+
+def test_a_loaded_student_acts_as_the_one_that_was_saved_and_forgets_on_reset(tmp_path) -> None:
+    _run(tmp_path, iterations=2, encoder="zhuang-small")
+    student, described = load_student(tmp_path)
+    assert described["deployment"]["rate"] == 40
+    assert described["deployment"]["frozen"] == {"c": 0.5}
+    policy, world = StudentPolicy(student), TouchWorld(3)
+    first = [policy(world.observations) for _ in range(5)]
+    policy.reset(torch.tensor([True, False, False]))
+    again = policy(world.observations)
+    torch.testing.assert_close(again[0], first[0][0])
+    policy.reset()
+    torch.testing.assert_close(policy(world.observations), first[0])
+
+
+def test_the_teacher_acts_in_its_share_of_steps(tmp_path) -> None:
+    class Counting(TouchWorld):
+        matched: tuple[int, int] = (0, 0)
+
+        def step(self, action):
+            right = Follower().act(self.observations)
+            hits = int((action == right).all(1).sum())
+            self.matched = (self.matched[0] + hits, self.matched[1] + len(action))
+            return super().step(action)
+
+    found = {}
+    for share in (0.0, 0.5, 1.0):
+        world = Counting(64)
+        _run(tmp_path / str(share), world, iterations=2, teacher_share=share)
+        found[share] = world.matched[0] / world.matched[1]
+    assert found[0.0] == 0
+    assert found[0.5] == pytest.approx(0.5, abs=4 * math.sqrt(0.25 / 1024))
+    assert found[1.0] == 1
+    config = _config(teacher_share=0.8, teacher_iterations=4)
+    assert [round(config.share(i), 3) for i in range(6)] == [0.8, 0.6, 0.4, 0.2, 0.0, 0.0]
+
+
+def test_a_frozen_network_sees_each_step_once_and_is_left_as_it_was(tmp_path) -> None:
+    from brainbench import load_model
+
+    _run(tmp_path, iterations=2, encoder="zhuang-small")
+    student, _ = load_student(tmp_path)
+    own = load_model("zhuang-small").state_dict()
+    for name, value in student.core.tactile.front.network.state_dict().items():  # type: ignore[union-attr]
+        torch.testing.assert_close(value, own[name], rtol=0, atol=0)
+
+
+def test_a_loss_that_is_no_number_ends_the_run_with_its_last_good_state(tmp_path) -> None:
+    class Mad(Follower):
+        calls = 0
+
+        def act(self, obs):
+            self.calls += 1
+            return super().act(obs) * (float("nan") if self.calls > 2 * 8 else 1.0)
+
+    result = _run(tmp_path, teacher=Mad(), iterations=4)
+    assert result.status == "diverged"
+    assert "iteration 3 is not finite" in result.reason
+    student, _ = load_student(tmp_path)
+    assert all(torch.isfinite(value).all() for value in student.state_dict().values())
+
+
+def test_tables_4_4_fills_what_is_left_open_and_logs_say_what_was_learned(tmp_path) -> None:
+    result = _run(tmp_path)
+    assert result.iterations == 4
+    saved = json.loads((tmp_path / "config.json").read_text())["distill"]
+    assert (saved["learning_rate"], saved["epochs"], saved["gradient_length"]) == (1e-3, 2, 2)
+    kinds = {json.loads(line)["kind"] for line in (tmp_path / "log.jsonl").read_text().splitlines()}
+    assert kinds == {"loss", "time", "teacher", "episode"}
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
+    _run(tmp_path, iterations=2)
+    with pytest.raises(UsageError, match="another student \\(its learning_rate differs\\)"):
+        _run(tmp_path, iterations=2, learning_rate=1e-2)
+    with pytest.raises(UsageError, match="did you mean 'mse'"):
+        _config(loss="ms")
+    with pytest.raises(UsageError, match="share lies between 0 and 1; received 2"):
+        _config(teacher_share=2)
+    with pytest.raises(UsageError, match="did you mean 'placement'"):
+        DistillConfig.of({"task": "x", "placment": "tips"})
+    with pytest.raises(UsageError, match="num_envs is a whole number of at least 1; received 0"):
+        _config(num_envs=0)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(DataError, match="holds no student"):
+        load_student(tmp_path)

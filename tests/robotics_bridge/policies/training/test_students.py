@@ -1,0 +1,55 @@
+"""A student from its configuration alone."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.core.files import write_json
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.students import calibrated, train_student
+from tests.factories.task_worlds import Follower, TouchWorld
+
+
+def _config(**changes) -> DistillConfig:
+    plain = {"task": "follow", "placement": "tips", "resolution": "low", "encoder": "zhuang-small"}
+    return DistillConfig(**{**plain, **changes})
+
+
+def test_a_networks_hand_calibration_is_measured_while_the_teacher_acts_and_then_kept(tmp_path) -> None:
+    config = calibrated(_config(), TouchWorld(16), Follower(), tmp_path)
+    found = config.encoder_settings["calibration"]
+    # Two taxels of a tip carry forces of 0.2 N times a standard normal aim, in sites of their own: rms of three axes.
+    assert found["force"] == pytest.approx(0.2 / 3**0.5, rel=0.25)
+    assert config.tactile is not None
+    assert config.tactile.calibration.force == found["force"]
+    write_json(tmp_path / "config.json", {"distill": config.plain()})
+    again = calibrated(_config(), TouchWorld(16, seed=5), Follower(), tmp_path)
+    assert again == config
+
+
+def test_learned_encoders_and_given_calibrations_are_left_alone(tmp_path) -> None:
+    for config in (
+        _config(encoder="mlp"), _config(observe="none"), _config(encoder_settings={"calibration": {"force": 2.0}}),
+    ):  # fmt: skip
+        assert calibrated(config, TouchWorld(2), Follower(), tmp_path) is config
+
+
+def test_a_teacher_that_touches_nothing_is_mentioned(tmp_path, caplog) -> None:
+    class Numb(TouchWorld):
+        def _observe(self):
+            found = super()._observe()
+            found["tactile"] = found["tactile"] * 0
+            return found
+
+    with caplog.at_level(logging.WARNING):
+        config = calibrated(_config(), Numb(2), Follower(), tmp_path)
+    assert config.encoder_settings["calibration"]["force"] == 0.5
+    assert "touched nothing" in caplog.text
+
+
+def test_a_student_needs_a_teacher(tmp_path) -> None:
+    with pytest.raises(UsageError, match="needs a teacher: the folder of a run"):
+        train_student(_config(), tmp_path)

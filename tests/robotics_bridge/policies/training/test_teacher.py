@@ -1,0 +1,188 @@
+"""The teacher: one small run, killed and gone on with, and what a checkpoint holds."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from brainbench.core.errors import DataError, UsageError
+from robotics_bridge import tasks
+from robotics_bridge.envs import Env
+from robotics_bridge.policies.training import state_tree
+from robotics_bridge.policies.training.teacher import RESUME, Trainer, load_teacher, newest, train
+from robotics_bridge.tasks.goals import SteppingRotation
+from robotics_bridge.tasks.settings import TeacherSettings
+
+SMALL = TeacherSettings(num_envs=4, steps_per_env=6, iterations=4, epochs=2, minibatches=2, hidden=(16, 16))
+
+
+def _env(seed: int = 0, **changes: Any) -> Env:
+    return tasks.make(replace(tasks.load("in_palm_rotate"), **changes), num_envs=4, threads=1, seed=seed)
+
+
+def test_settings_become_those_of_rsl_rl() -> None:
+    task = tasks.load("in_palm_rotate", "published")
+    config = task.teacher.config(dict(task.groups))
+    assert config["algorithm"]["rnd_cfg"]["weight"] == 100.0
+    assert config["obs_groups"]["critic"] == ["goal", "priv_proprio", "priv_obj_state", "priv_obj_props"]
+    assert config["actor"]["hidden_dims"] == [512, 256, 128]
+    assert "rnd_cfg" not in replace(task.teacher, rnd_weight=0.0).config(dict(task.groups))["algorithm"]
+
+
+def test_a_run_that_stops_halfway_goes_on_exactly(tmp_path: Path) -> None:
+    whole = train(_env(), tmp_path / "whole", settings=SMALL, iterations=4, save_every=1)
+    train(_env(), tmp_path / "parts", settings=SMALL, iterations=2, save_every=1)
+    rest = train(_env(seed=9), tmp_path / "parts", settings=SMALL, iterations=4, save_every=1)
+    assert [row["iteration"] for row in rest.history] == [3, 4]
+    for one, two in zip(whole.history[2:], rest.history, strict=True):
+        for name in ("reward", "loss/value", "loss/rnd", "curiosity", "std"):
+            assert one[name] == two[name], name
+    first, second = (state_tree.load(newest(tmp_path / part))["actor"] for part in ("whole", "parts"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    log = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in log] == [1, 2, 3, 4]
+    assert list((tmp_path / "parts").glob("events.out.tfevents*"))
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
+    text = f"""
+from pathlib import Path
+from tests.robotics_bridge.policies.training.test_teacher import SMALL, _env
+from robotics_bridge.policies.training.teacher import train
+train(_env(), Path({str(tmp_path / "killed")!r}), settings=SMALL, iterations=10000, save_every=1)
+"""
+    root = Path(__file__).parents[4]
+    process = subprocess.Popen([sys.executable, "-c", text], env={**os.environ, "PYTHONPATH": str(root)})
+    resume = tmp_path / "killed" / RESUME
+    deadline = time.monotonic() + 240
+    while time.monotonic() < deadline and not (resume.is_file() and len(list(resume.parent.glob("model_*"))) > 2):
+        time.sleep(0.2)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = int(state_tree.load(resume)["iteration"])
+    rest = train(_env(), tmp_path / "killed", settings=SMALL, iterations=done + 1, save_every=1)
+    whole = train(_env(), tmp_path / "whole", settings=SMALL, iterations=done + 1, save_every=100)
+    assert rest.history[-1]["reward"] == whole.history[-1]["reward"]
+    assert rest.history[-1]["loss/value"] == whole.history[-1]["loss/value"]
+
+
+def test_a_trained_actor_acts_alike_after_loading(tmp_path: Path) -> None:
+    env = _env()
+    train(env, tmp_path, settings=SMALL, iterations=1)
+    policy = load_teacher(tmp_path, env)
+    action = policy(env.observations)
+    assert action.shape == (4, 5)
+    assert torch.equal(action, load_teacher(newest(tmp_path), env).act(env.observations))
+    policy.reset(torch.ones(4, dtype=torch.bool))
+
+
+def test_loading_an_actor_leaves_episodes_and_random_numbers_as_they_were(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1)
+    env = _env()
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    load_teacher(tmp_path, env)
+    assert torch.equal(torch.rand(2), expected)
+    assert env.episode_length_buf.tolist() == [0] * 4
+
+
+def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
+    train(_env(), tmp_path / "first", settings=SMALL, iterations=2)
+    env = tasks.make("in_palm_rotate", config="careful", num_envs=4, threads=1)
+    settings = replace(SMALL, rnd_weight=0.0)
+    trainer = Trainer(env, settings)
+    trainer.begin_from(tmp_path / "first")
+    given = state_tree.load(newest(tmp_path / "first"))
+    own = trainer.algorithm.save()
+    for name in ("actor", "critic"):
+        assert all(torch.equal(value, own[f"{name}_state_dict"][key]) for key, value in given[name].items())
+    result = train(env, tmp_path / "second", settings=settings, iterations=1, start=tmp_path / "first")
+    assert result.iterations == 1
+    config = json.loads((tmp_path / "second" / "config.json").read_text())
+    assert config["start"]["file"].endswith("first/model_2.safetensors")
+    with pytest.raises(DataError, match=r"actor of .* does not fit: 'mlp\.0\.weight' has the shape \(16"):
+        Trainer(env, replace(settings, hidden=(32, 16))).begin_from(tmp_path / "first")
+
+
+def test_exploration_may_begin_anew_with_the_networks_of_another(tmp_path: Path) -> None:
+    train(_env(), tmp_path / "first", settings=SMALL, iterations=1)
+    settings = replace(SMALL, std_range=(0.1, 0.5), learning_rate_range=(9e-4, 1.1e-3), entropy=10.0)
+    for std, expected in ((0.25, 0.25), (3.0, 0.5)):
+        trainer = Trainer(_env(), settings)
+        trainer.begin_from(tmp_path / "first", std=std)
+        assert trainer.algorithm.act(trainer.env.get_observations()).shape == (4, 5)
+        assert trainer.algorithm.get_policy().output_std.mean().item() == pytest.approx(expected)
+    for _ in range(3):
+        assert 9e-4 <= trainer.iterate()["learning_rate"] <= 1.1e-3
+    with pytest.raises(UsageError, match="goes with a run to start from"):
+        train(_env(), tmp_path / "second", settings=SMALL, iterations=1, start_std=0.3)
+
+
+def test_a_run_of_before_a_setting_existed_goes_on(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1, save_every=1)
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["settings"]["std_range"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    assert train(_env(), tmp_path, settings=SMALL, iterations=2, save_every=1).iterations == 2
+
+
+def test_learning_begins_with_the_wide_goal_and_goes_on_with_the_one_it_reached(tmp_path: Path) -> None:
+    goal = SteppingRotation(start_threshold=3.2, narrowing=0.5)
+    # A threshold of half a turn and more is always met, so the first episodes to end narrow it.
+    changes: dict[str, Any] = {"goal": goal, "episode": 0.2}
+    whole = train(_env(**changes), tmp_path / "whole", settings=SMALL, iterations=4, save_every=1)
+    found = [row["threshold"] for row in whole.history]
+    assert found[0] > found[-1] > 0.1
+    train(_env(**changes), tmp_path / "parts", settings=SMALL, iterations=2, save_every=1, keep_env=False)
+    env = _env(**changes)
+    assert float(env.goals.threshold) == pytest.approx(0.1)
+    parts = Trainer(env, SMALL)
+    state = state_tree.load(tmp_path / "parts" / RESUME)
+    parts.load({**state, "env": env.state_dict()})
+    assert float(env.goals.threshold) == pytest.approx(found[1])
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1)
+    with pytest.raises(UsageError, match="Choose another folder"):
+        train(_env(), tmp_path, settings=replace(SMALL, epochs=3), iterations=2)
+
+
+def test_a_policy_of_another_task_is_refused(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1)
+    other = tasks.make("in_hand_repose", num_envs=2, threads=1)
+    with pytest.raises(DataError, match="does not fit this environment"):
+        load_teacher(tmp_path, other)
+    with pytest.raises(DataError, match="holds no trained policy"):
+        newest(tmp_path / "nothing")
+
+
+def test_curiosity_is_scaled_by_the_control_step() -> None:
+    trainer = Trainer(_env(), replace(SMALL, rnd_weight=100.0))
+    assert trainer.algorithm.rnd is not None
+    assert trainer.algorithm.rnd.initial_weight == pytest.approx(100.0 * 0.025)
+
+
+def test_trees_of_tensors_and_numbers_survive_a_file(tmp_path: Path) -> None:
+    tree = {"a": torch.arange(3), "b": [1.5, None, (torch.ones(2, 2), "x")], "state": {0: {"step": torch.tensor(2.0)}}}
+    state_tree.save(tmp_path / "tree.safetensors", tree)
+    back = state_tree.load(tmp_path / "tree.safetensors")
+    assert torch.equal(back["a"], tree["a"])
+    assert back["b"][:2] == [1.5, None]
+    assert torch.equal(back["b"][2][0], torch.ones(2, 2))
+    assert float(back["state"][0]["step"]) == 2.0
+    (tmp_path / "broken.safetensors").write_bytes(b"no tensors")
+    with pytest.raises(DataError, match="damaged"):
+        state_tree.load(tmp_path / "broken.safetensors")

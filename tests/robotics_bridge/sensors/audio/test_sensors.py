@@ -1,0 +1,313 @@
+"""Sound of contacts and drives: resonances, energy of impacts, pitch, distance and delay, materials apart."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.physics.cpu import MujocoEngine
+from robotics_bridge.physics.scene import Geometry, Scene
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.audio.materials import Modes
+from robotics_bridge.sensors.audio.microphone import Microphone
+from robotics_bridge.sensors.audio.modes import Solid, find_modes
+from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, joint_drive
+from robotics_bridge.sensors.suite import SensorSuite
+
+MODES = Modes((500.0, 1730.0, 4100.0), (8.0, 15.0, 40.0), (1.0, -0.7, 0.4))
+DT, K = 0.005, 160
+RATE = K / DT
+
+
+def _scene() -> Scene:
+    shapes = (
+        Geometry(name="box", link="box", kind="box", size=(0.1, 0.1, 0.01)),
+        Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
+    )
+    return Scene(("world", "box", "ball"), shapes)
+
+
+def _make(envs: int = 1, **knobs):
+    sensor = ContactAudio(link="box", modes=MODES, samples=K, **knobs)
+    return SensorSuite(_scene(), {"sound": sensor}, num_envs=envs), HandState.empty(envs, 3, 4 * envs)
+
+
+def _touch(state: HandState, force, envs=(0,)) -> None:
+    count = len(envs)
+    state.set_contacts(
+        list(envs), np.tile([[0, 1]], (count, 1)), force=np.full(count, force),
+        position=np.zeros((count, 3)), normal=np.tile([0.0, 0, 1], (count, 1)),
+    )  # fmt: skip
+
+
+def _strike(suite: SensorSuite, state: HandState, blocks: int, force: float = 10.0, name: str = "sound") -> np.ndarray:
+    suite.update(state, DT)
+    _touch(state, force)
+    heard = []
+    for _ in range(blocks):
+        suite.update(state, DT)
+        heard.append(suite.read_ground_truth(name)[0, 0].numpy().copy())
+        state.contact_count.fill_(0)
+    return np.concatenate(heard)
+
+
+def test_an_impact_rings_as_the_sum_of_damped_modes():
+    suite, state = _make()
+    heard = _strike(suite, state, 20)
+    t = np.arange(1, len(heard) + 1) / RATE
+    impulse = 10 * DT
+    expected = sum(
+        impulse * gain * np.exp(-decay * (t - 1 / RATE)) * np.sin(2 * np.pi * frequency * t)
+        for frequency, decay, gain in MODES.rows()
+    )
+    assert heard == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+
+
+def test_the_spectrum_peaks_at_the_modal_frequencies():
+    suite, state = _make()
+    heard = _strike(suite, state, 60)
+    spectrum = np.abs(np.fft.rfft(heard * np.hanning(len(heard))))
+    frequency = np.fft.rfftfreq(len(heard), 1 / RATE)
+    for mode in MODES.frequency:
+        near = np.abs(frequency - mode) < 100
+        assert frequency[near][spectrum[near].argmax()] == pytest.approx(mode, abs=4)
+        assert spectrum[near].max() > 20 * np.median(spectrum)
+
+
+def test_loudness_grows_with_the_impulse_and_a_steady_load_is_silent():
+    suite, state = _make()
+    soft, hard = _strike(*_make(), 4, force=5.0), _strike(*_make(), 4, force=50.0)
+    assert hard == pytest.approx(10 * soft, abs=float(1e-4 * np.abs(hard).max()))
+    _touch(state, 30.0)
+    for _ in range(400):
+        suite.update(state, DT)
+    assert np.abs(suite.read("sound").numpy()).max() < 1e-4 * np.abs(hard).max()
+    quiet = _strike(*_make(threshold=20.0), 3, force=15.0)
+    assert np.all(quiet == 0)
+
+
+def test_a_longer_contact_excites_high_modes_less():
+    def share(contact_time: float) -> float:
+        heard = _strike(*_make(contact_time=contact_time), 40)
+        spectrum = np.abs(np.fft.rfft(heard)) ** 2
+        frequency = np.fft.rfftfreq(len(heard), 1 / RATE)
+        return spectrum[frequency > 3000].sum() / spectrum.sum()
+
+    assert share(1e-3) < 0.1 * share(0.0)
+
+
+def test_sliding_colours_the_same_resonances_and_grows_with_speed_and_force():
+    def rub(speed: float, force: float = 2.0) -> np.ndarray:
+        suite, state = _make(threshold=1e9)
+        _touch(state, force)
+        velocity = np.zeros((1, 3, 6))
+        velocity[0, 2, 0] = speed
+        state.set_velocity(velocity)
+        heard = []
+        for _ in range(200):
+            suite.update(state, DT)
+            heard.append(suite.read("sound")[0, 0].numpy().copy())
+        return np.concatenate(heard[40:])
+
+    slow = rub(0.1)
+    assert np.all(rub(0.0) == 0)
+    assert rub(0.2) == pytest.approx(2 * slow, rel=1e-3, abs=1e-6)
+    assert rub(0.1, 6.0) == pytest.approx(3 * slow, rel=1e-3, abs=1e-6)
+    spectrum = np.abs(np.fft.rfft(slow)) ** 2
+    frequency = np.fft.rfftfreq(len(slow), 1 / RATE)
+    near = np.any([np.abs(frequency - mode) < 60 for mode in MODES.frequency], axis=0)
+    assert spectrum[near].sum() > 0.8 * spectrum.sum()
+
+
+def test_modes_beyond_half_the_sample_rate_are_left_out():
+    sensor = ContactAudio(link="box", modes=Modes((500.0, 20_000.0), (5.0, 5.0), (1.0, 100.0)), samples=K)
+    suite, state = SensorSuite(_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3, 4)
+    assert np.abs(_strike(suite, state, 3)).max() < 2 * 10 * DT
+
+
+def test_environments_ring_reset_and_break_alone_and_alike_in_any_batch():
+    alone = _strike(*_make(), 3)
+    suite, state = _make(envs=3)
+    suite.update(state, DT)
+    _touch(state, 10.0, envs=(0, 2))
+    suite.update(state, DT)
+    read = suite.read("sound").numpy()
+    assert np.array_equal(read[0, 0], alone[:K])
+    assert np.all(read[1] == 0)
+    state.contact_count.fill_(0)
+    suite.reset([0])
+    state.pose_torch[1, 1, 0] = math.nan
+    suite.update(state, DT)
+    read = suite.read("sound").numpy()
+    assert np.all(read[0] == 0)
+    assert np.isnan(read[1]).all()
+    assert np.array_equal(read[2, 0], alone[K : 2 * K])
+    assert read.shape == (3, 1, K)
+
+
+def test_drives_whine_at_their_speed_and_grow_louder_with_load():
+    sensor = ActuationAudio(link="box", joints=2, samples=K, friction=0.0, pitch=80.0, hum=0.0)
+    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    effort, speed = joint_drive(suite, "drives")
+    effort[0] = effort.new_tensor([1.0, 3.0])
+    speed[0] = speed.new_tensor([10.0, -5.0])
+    heard = []
+    for _ in range(200):
+        suite.update(state, DT)
+        heard.append(suite.read("drives")[0].numpy().copy())
+    sound = np.concatenate(heard, axis=1)
+    frequency = np.fft.rfftfreq(sound.shape[1], 1 / RATE)
+    spectrum = np.abs(np.fft.rfft(sound, axis=1)) / sound.shape[1] * 2
+    loud = [1e-3 * 1 + 1e-3 * 10, 1e-3 * 3 + 1e-3 * 15]
+    for joint, tone in enumerate((800.0, 400.0)):
+        assert frequency[spectrum[joint].argmax()] == pytest.approx(tone, abs=1.5)
+        assert spectrum[joint].max() == pytest.approx(loud[joint], rel=0.02)
+    assert np.abs(np.diff(sound[0])).max() < 4 * loud[0]
+
+
+def test_idle_drives_hum_and_moving_ones_rasp():
+    sensor = ActuationAudio(link="box", joints=1, samples=K, hum=0.01, hum_frequency=120.0, friction=1e-2)
+    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    suite.update(state, DT)
+    t = np.arange(1, K + 1) / RATE
+    assert suite.read("drives")[0, 0].numpy() == pytest.approx(0.01 * np.sin(2 * np.pi * 120 * t), abs=1e-5)
+    joint_drive(suite, "drives")[1].fill_(2.0)
+    suite.update(state, DT)
+    suite.update(state, DT)
+    assert suite.read("drives")[0, 0].numpy().std() == pytest.approx(0.02, rel=0.3)
+    with pytest.raises(UsageError, match="did you mean 'drives'"):
+        joint_drive(suite, "drive")
+
+
+@pytest.mark.parametrize("distance", [0.343, 1.0, 2.5])
+def test_a_microphone_hears_late_by_r_over_c_and_weaker_by_one_over_r(distance):
+    suite, state = _make()
+    listener = Microphone(position=(distance, 0.0, 0.0)).build(suite)
+    suite.update(state, DT)
+    listener.update(state, DT)
+    _touch(state, 10.0)
+    source, heard = [], []
+    for _ in range(6):
+        suite.update(state, DT)
+        listener.update(state, DT)
+        state.contact_count.fill_(0)
+        source.append(suite.read("sound")[0, 0].numpy().copy())
+        heard.append(listener.read()[0].numpy().copy())
+    source, heard = np.concatenate(source), np.concatenate(heard)
+    onset = np.flatnonzero(np.abs(heard) > 1e-6)[0] / RATE
+    assert onset == pytest.approx(distance / 343, abs=1.5 / RATE)
+    lag = distance / 343 * RATE
+    late = np.interp(np.arange(len(source)) - lag, np.arange(-1, len(source)), [0.0, *source], left=0.0) / distance
+    assert heard == pytest.approx(late, abs=1e-3 * np.abs(late).max())
+
+
+def test_sources_add_up_and_the_power_of_distance_is_chosen():
+    sensors = {name: ContactAudio(link=name, modes=MODES, samples=K) for name in ("box", "ball")}
+    suite, state = SensorSuite(_scene(), sensors, num_envs=1), HandState.empty(1, 3, 4)
+    pose = np.zeros((3, 7))
+    pose[:, 6] = 1
+    pose[1, 0], pose[2, 0] = 1.0, -1.0
+    state.set_pose(pose)
+    both = Microphone(power=2.0).build(suite)
+    one = Microphone(power=2.0, sources=("box",)).build(suite)
+    for block in range(3):
+        if block == 1:
+            _touch(state, 10.0)
+        suite.update(state, DT)
+        both.update(state, DT)
+        one.update(state, DT)
+    assert np.abs(one.read().numpy()).max() > 0
+    assert both.read().numpy() == pytest.approx(2 * one.read().numpy(), rel=1e-5)
+    with pytest.raises(UsageError, match="did you mean 'ball'"):
+        Microphone(sources=("bal",)).build(suite)
+
+
+def test_a_microphone_without_sources_and_wrong_settings_are_explained():
+    with pytest.raises(UsageError, match="no source of sound"):
+        Microphone().build(SensorSuite(_scene(), {}, num_envs=1))
+    with pytest.raises(UsageError, match="at least one sample"):
+        ContactAudio(link="box", modes=MODES, samples=0)
+    with pytest.raises(UsageError, match="threshold must be zero or positive"):
+        ContactAudio(link="box", modes=MODES, threshold=-1.0)
+    with pytest.raises(UsageError, match="joints ≥ 1"):
+        ActuationAudio(link="box", joints=0)
+    with pytest.raises(UsageError, match="speed_of_sound must be positive"):
+        Microphone(speed_of_sound=0.0)
+
+
+_DROP = """
+<mujoco><option timestep="0.005"/><worldbody>
+  <body name="slab"><geom name="slab" type="box" size="0.15 0.1 0.015"/></body>
+  <body name="ball" pos="0.03 0.02 0.036"><freejoint/><geom name="ball" size="0.02" mass="0.05"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.slow
+def test_balls_on_wood_metal_and_glass_are_told_apart_by_a_linear_classifier_at_new_speeds():
+    """Train on some impact speeds, test on others; features are log band powers, level removed."""
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    envs = 48
+    rng = np.random.default_rng(0)
+    model = mujoco.MjModel.from_xml_string(_DROP)
+    materials = ("wood", "metal", "glass")
+    sensors = {
+        name: ContactAudio(link="slab", samples=K, modes=find_modes(Solid("box", (0.15, 0.1, 0.015)), name, cells=8))
+        for name in materials
+    }
+    engine = MujocoEngine(model, envs, threads=1)
+    suite = SensorSuite(engine.scene, sensors, num_envs=envs)
+    velocity = np.zeros((envs, 6))
+    velocity[:, 2] = -rng.uniform(0.3, 3.0, envs)
+    velocity[:, :2] = rng.normal(0, 0.2, (envs, 2))
+    engine.set(qvel=velocity)
+    blocks = {name: [] for name in materials}
+    for _ in range(60):
+        engine.step()
+        suite.update(engine.state, engine.timestep)
+        for name in materials:
+            blocks[name].append(suite.read(name)[:, 0].numpy().copy())
+    features, labels, speed = [], [], np.abs(velocity[:, 2])
+    for label, name in enumerate(materials):
+        heard = np.concatenate(blocks[name], axis=1)
+        assert np.all(np.abs(heard).max(axis=1) > 0)
+        power = np.abs(np.fft.rfft(heard, axis=1)[:, 1:]) ** 2
+        bands = np.log(power[:, : power.shape[1] // 64 * 64].reshape(envs, 64, -1).mean(axis=2) + 1e-20)
+        features.append(bands - bands.mean(axis=1, keepdims=True))
+        labels.append(np.full(envs, label))
+    slow = np.tile(speed < np.median(speed), 3)
+    x, y = np.concatenate(features), np.concatenate(labels)
+    for train in (slow, ~slow):
+        rule = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000)).fit(x[train], y[train])
+        assert rule.score(x[~train], y[~train]) >= 0.95
+
+
+@pytest.mark.gpu
+def test_cpu_and_cuda_agree():
+    heard = {}
+    for device in ("cpu", "cuda"):
+        sensors = {
+            "contact": ContactAudio(link="box", modes=MODES, samples=K),
+            "drives": ActuationAudio(link="box", joints=3, samples=K, hum=0.01),
+        }
+        suite, state = SensorSuite(_scene(), sensors, num_envs=4, device=device), HandState.empty(4, 3, 16, device)
+        listener = Microphone(position=(0.5, 0.0, 0.2)).build(suite)
+        velocity = np.zeros((4, 3, 6))
+        velocity[:, 2, 0] = 0.1
+        state.set_velocity(velocity)
+        joint_drive(suite, "drives")[1].fill_(7.0)
+        blocks = []
+        for block in range(6):
+            if block == 1:
+                _touch(state, 10.0, envs=(0, 2))
+            suite.update(state, DT)
+            listener.update(state, DT)
+            blocks.append(np.concatenate([listener.read().cpu().numpy(), suite.read("contact")[:, 0].cpu().numpy()]))
+        heard[device] = np.stack(blocks)
+    assert heard["cuda"] == pytest.approx(heard["cpu"], abs=float(2e-4 * np.abs(heard["cpu"]).max()))

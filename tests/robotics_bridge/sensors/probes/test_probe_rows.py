@@ -1,0 +1,140 @@
+"""Probes that one thread takes in turn: all are taken once, and read what they read one to a thread."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brainbench.geometry import Mesh
+from robotics_bridge.physics import Geometry
+from robotics_bridge.sensors import KinematicTaxel, Noise, Probes, SensorSuite, sensor
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED
+from robotics_bridge.sensors.sensor import Place, probe_rows
+from robotics_bridge.sensors.taxels import kinematic
+from tests.factories.touch_scenes import pad_scene, random_pose, state_of
+
+NOISE = Noise(radius=5e-4, gain=(0.8, 1.2), white=1e-3, walk=1e-3, hysteresis=0.3, dead_probability=0.1, bias=0.01)
+TETRAHEDRON = Mesh(
+    0.012 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]]),
+    np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
+)
+OBJECTS = (
+    Geometry(name="ball", link="ball", kind="sphere", size=(0.012,)),
+    Geometry(name="box", link="box", kind="box", size=(0.01, 0.012, 0.009)),
+    Geometry(name="mesh", link="mesh", kind="mesh", mesh=TETRAHEDRON),
+)
+
+
+def _gpu(envs: int) -> Any:
+    return SimpleNamespace(num_envs=envs, device=SimpleNamespace(is_cuda=True, sm_count=132))
+
+
+@given(
+    counts=st.lists(st.sampled_from([1, 2, 3, 5, 31, 32, 33, 100, 1000]), min_size=1, max_size=4),
+    envs=st.sampled_from([1, 64, 4096, 16_384]),
+    mode=st.sampled_from([CLEAN, FUSED, STAGED]),
+    cuda=st.booleans(),
+)
+@settings(max_examples=100, deadline=None)
+def test_every_probe_is_taken_once_and_by_its_own_sensor(counts: list[int], envs: int, mode: int, cuda: bool) -> None:
+    context = _gpu(envs)
+    context.device.is_cuda = cuda
+    starts = np.cumsum([0, *counts])
+    places = [Place(int(start), (count,), False) for start, count in zip(starts, counts, strict=False)]
+    owner = np.full(starts[-1], -1)
+    for first, end, step, part in probe_rows(places, context, mode):
+        taken = np.arange(first, end, step)
+        assert taken.size
+        assert (owner[taken] == -1).all()
+        owner[taken] = part
+    np.testing.assert_array_equal(owner, np.repeat(np.arange(len(counts)), counts))
+
+
+@pytest.mark.parametrize(
+    ("taxels", "mode", "expected"),
+    [(1, CLEAN, 1), (100, CLEAN, 4), (1000, CLEAN, 8), (100, FUSED, 2), (1000, FUSED, 4), (10_000, FUSED, 4)],
+)
+def test_a_gpu_shares_as_much_as_was_fastest_when_measured(taxels: int, mode: int, expected: int) -> None:
+    rows = probe_rows([Place(0, (taxels,), False)], _gpu(16_384), mode)
+    assert len(rows) == -(-taxels // expected)
+
+
+def _readings(counts: tuple[int, ...], envs: int, noise: Noise, query: Any) -> list[np.ndarray]:
+    """Truth and measured readings of three updates of sensors that meet three objects, one environment lost."""
+    rng = np.random.default_rng(3)
+    scene = pad_scene(*OBJECTS)
+    sensors = {}
+    for number, count in enumerate(counts):
+        radius = rng.uniform(0.001, 0.004, count) * (rng.random(count) > 0.1)
+        position, normal = rng.uniform(-0.02, 0.02, (count, 3)), np.tile([0, 0, 1.0], (count, 1))
+        probes = Probes(position, normal, radius, shape=(1, count))
+        track = ("ball", "box", "mesh")[: number + 1]
+        sensors[f"s{number}"] = KinematicTaxel(link="hand", probes=probes, track=track, noise=noise, query=query)
+    suite = SensorSuite(scene, sensors, num_envs=envs, seed=5, resolution=24)
+    read = []
+    for _ in range(3):
+        poses = np.stack([np.stack([random_pose(rng, 0.01) for _ in scene.links]) for _ in range(envs)])
+        velocity = rng.normal(0, 0.3, (envs, len(scene.links), 6))
+        if envs > 2:
+            poses[2, 1] = np.nan
+        suite.update(state_of(scene, poses, velocity))
+        for name in sensors:
+            read += [suite.read(name).numpy().copy(), suite.read_ground_truth(name).numpy().copy()]
+    return read
+
+
+@pytest.mark.parametrize("counts", [(1,), (3,), (5,), (33,), (1, 3, 33, 5)])
+@pytest.mark.parametrize("noise", [Noise(), NOISE, Noise(crosstalk=0.3)], ids=["clean", "noisy", "staged"])
+def test_probes_that_share_a_thread_read_the_same(
+    counts: tuple[int, ...], noise: Noise, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    envs = 4
+    monkeypatch.setattr(sensor, "_SHARED", 1)
+    alone = _readings(counts, envs, noise, "sdf")
+    assert any(np.nanmax(np.abs(read)) > 0 for read in alone)
+    monkeypatch.setattr(sensor, "_SHARED", 32)
+    for shared, one in zip(_readings(counts, envs, noise, "sdf"), alone, strict=True):
+        np.testing.assert_array_equal(shared, one)
+    # The rows of a GPU, interleaved, four and eight probes of a thread.
+    for most in (4, 8):
+        monkeypatch.setattr(sensor, "_SHARED_CUDA", dict.fromkeys((CLEAN, FUSED, STAGED), (most, 1e-9)))
+        monkeypatch.setattr(kinematic, "probe_rows", lambda places, context, mode: probe_rows(places, _gpu(envs), mode))
+        for shared, one in zip(_readings(counts, envs, noise, "sdf"), alone, strict=True):
+            np.testing.assert_array_equal(shared, one)
+
+
+def test_triangles_are_asked_alike_by_probes_that_share_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sensor, "_SHARED", 1)
+    alone = _readings((5, 33), 3, Noise(), "raycast")
+    monkeypatch.setattr(sensor, "_SHARED", 32)
+    for shared, one in zip(_readings((5, 33), 3, Noise(), "raycast"), alone, strict=True):
+        np.testing.assert_array_equal(shared, one)
+
+
+@given(seed=st.integers(0, 10_000), spare=st.integers(0, 9))
+@settings(max_examples=20, deadline=None)
+def test_where_a_contact_stands_in_the_list_changes_nothing(seed: int, spare: int) -> None:
+    rng, scene, envs = np.random.default_rng(seed), pad_scene(*OBJECTS), 5
+    probes = Probes(rng.uniform(-0.02, 0.02, (9, 3)), np.tile([0, 0, 1.0], (9, 1)), 0.004)
+    poses = np.stack([np.stack([random_pose(rng, 0.01) for _ in scene.links]) for _ in range(envs)])
+    state = state_of(scene, poses)
+    count = int(state.contact_count.numpy()[0])
+    owner, pairs = state.contact_env.numpy()[:count], state.contact_geom.numpy()[:count]
+    sensors = {"t": KinematicTaxel(link="hand", probes=probes)}
+
+    def read(order: np.ndarray) -> np.ndarray:
+        mixed = type(state).empty(envs, len(scene.links), len(order) + spare)
+        mixed.set_pose(poses)
+        turned = np.where(rng.random((len(order), 1)) < 0.5, pairs[order], pairs[order, ::-1])
+        mixed.set_contacts(owner[order], turned)
+        suite = SensorSuite(scene, sensors, num_envs=envs, resolution=16)
+        suite.update(mixed)
+        return suite.read("t").numpy().copy()
+
+    kept = rng.permutation(count)[: rng.integers(1, count + 1)]
+    np.testing.assert_array_equal(read(kept), read(np.sort(kept)))

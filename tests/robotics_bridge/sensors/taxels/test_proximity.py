@@ -1,0 +1,127 @@
+"""Proximity taxels against a brute-force sum in double precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from robotics_bridge.physics import Geometry
+from robotics_bridge.sensors import Noise, Probes, ProximityTaxel, SensorSuite
+from robotics_bridge.sensors.queries.surface_points import surface_points
+from tests.factories.touch_scenes import pad_scene, poses_at, random_pose, state_of
+
+GRID = Probes.grid(4, 4, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.008)
+OBJECTS = (
+    Geometry(name="box", link="box", kind="box", size=(0.01, 0.006, 0.004), position=(0.003, 0, 0)),
+    Geometry(name="ball", link="ball", kind="sphere", size=(0.006,)),
+)
+
+
+def _brute_force(points: list[np.ndarray], pose: np.ndarray, velocity: np.ndarray, convention: str) -> np.ndarray:
+    hand = Rotation.from_quat(pose[1, 3:])
+    q, a = hand.apply(np.array(GRID.position)) + pose[1, :3], hand.apply(np.array(GRID.normal))
+    v_q = velocity[1, :3] + np.cross(velocity[1, 3:], q - pose[1, :3])
+    total = sum(len(p) for p in points)
+    f, tau = np.zeros((16, 3)), np.zeros((16, 3))
+    for link, cloud in zip((2, 3), points, strict=True):
+        p = Rotation.from_quat(pose[link, 3:]).apply(cloud + OBJECTS[link - 2].position) + pose[link, :3]
+        v = velocity[link, :3] + np.cross(velocity[link, 3:], p - pose[link, :3])
+        away = p[None] - q[:, None]
+        overlap = np.maximum(0.008 - np.linalg.norm(away, axis=2), 0) * 100 / total
+        slip = v[None] - v_q[:, None]
+        slip -= (slip * a[:, None]).sum(2, keepdims=True) * a[:, None]
+        sign = 1 if convention == "thesis" else -1
+        f += sign * 300 * overlap.sum(1)[:, None] * a + 10 * (overlap[..., None] * slip).sum(1)
+        tau += sign * 300 * (overlap[..., None] * np.cross(away, a[:, None])).sum(1)
+    f, tau = hand.inv().apply(f), hand.inv().apply(tau)
+    return np.concatenate([f, tau if convention == "thesis" else tau + np.cross(GRID.position, f)], axis=1)
+
+
+@pytest.mark.parametrize("convention", ["thesis", "physical"])
+def test_wrenches_are_the_sums_over_all_points(convention: str) -> None:
+    rng = np.random.default_rng(2)
+    scene = pad_scene(*OBJECTS)
+    pose = np.stack([random_pose(rng) for _ in scene.links])
+    hand = Rotation.from_quat(pose[1, 3:])
+    pose[2, :3] = hand.apply([0, 0, 0.012]) + pose[1, :3]
+    pose[3, :3] = hand.apply([0.008, 0.006, 0.013]) + pose[1, :3]
+    velocity = rng.normal(0, 0.5, (4, 6))
+    sensor = ProximityTaxel(link="hand", probes=GRID, points=700, convention=convention)  # type: ignore[arg-type]
+    suite = SensorSuite(scene, {"p": sensor}, num_envs=1)
+    suite.update(state_of(scene, pose[None], velocity[None], touch=False))
+    runtime = suite.runtimes[0]
+    shares = runtime.cloud.counts[0]  # type: ignore[attr-defined]
+    areas = np.array([8 * (0.01 * 0.006 + 0.006 * 0.004 + 0.01 * 0.004), 4 * np.pi * 0.006**2])
+    counts = [round(700 * areas[0] / areas.sum()), 0]
+    counts[1] = int(shares - counts[0])
+    points = [surface_points(g, count) for g, count in zip(OBJECTS, counts, strict=True)]
+    expected = _brute_force(points, pose, velocity, convention)
+    read = suite.read("p")[0].flatten(0, 1).numpy()
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(read, expected, atol=3e-5 * np.abs(expected).max())
+
+
+def test_an_object_is_felt_before_it_touches_and_not_beyond_the_radius() -> None:
+    scene = pad_scene(OBJECTS[1])
+    suite = SensorSuite(scene, {"p": ProximityTaxel(link="hand", probes=GRID, points=2000)}, num_envs=3)
+    poses = poses_at(3, {}, 3)
+    # The nearest taxel sits 4.7 mm beside the ball's axis.
+    poses[:, 2, 2] = 0.005 + 0.006 + np.array([0.001, 0.004, 0.02])
+    suite.update(state_of(scene, poses, touch=False))
+    force = -suite.read("p")[..., 2].sum((1, 2))
+    assert force[0] > force[1] > 0
+    assert force[2] == 0
+
+
+def test_radius_noise_leaves_the_truth_alone() -> None:
+    scene = pad_scene(OBJECTS[1])
+    sensors = {
+        "clean": ProximityTaxel(link="hand", probes=GRID, points=500),
+        "noisy": ProximityTaxel(link="hand", probes=GRID, points=500, noise=Noise(radius=1e-3, gain=(0.5, 0.5))),
+    }
+    suite = SensorSuite(scene, sensors, num_envs=1)
+    suite.update(state_of(scene, poses_at(3, {2: (0, 0, 0.012)}), touch=False))
+    np.testing.assert_allclose(suite.read_ground_truth("noisy"), suite.read("clean"), atol=1e-7)
+    ratio = (suite.read("noisy")[..., 2] / suite.read("clean")[..., 2])[suite.read("clean")[..., 2] != 0]
+    assert ratio.std() > 0.01
+    assert 0.3 < ratio.mean() < 0.7
+
+
+def test_points_cover_a_surface_evenly() -> None:
+    box = Geometry(name="b", link="b", kind="box", size=(1.0, 1.0, 0.5))
+    points = surface_points(box, 2000)
+    assert (np.abs(np.abs(points) / [1.0, 1.0, 0.5]).max(axis=1) > 1 - 1e-9).all()
+    top = points[points[:, 2] > 0.5 - 1e-9]
+    assert len(top) == pytest.approx(2000 * 4 / 16, rel=0.02)
+    # Random points would leave one cell of 100 without any in half of all draws, and 15 % of scatter in quarters.
+    cells = np.histogram2d(top[:, 0], top[:, 1], bins=10, range=[[-1, 1], [-1, 1]])[0]
+    assert cells.min() >= 2
+    quarters = cells.reshape(2, 5, 2, 5).sum(axis=(1, 3))
+    assert quarters.max() / quarters.min() < 1.1
+
+
+def test_points_gathered_by_cells_are_summed_as_each_probe_would_find_them() -> None:
+    noise = Noise(radius=1e-3, gain=(0.5, 1.5))
+    free = Probes(np.random.default_rng(0).normal(0, 0.01, (75, 3)), [[0, 0, 1.0]] * 75, [0.0, *np.full(74, 0.006)])
+    sensors = {
+        "grid": ProximityTaxel(link="hand", probes=Probes.grid(7, 11, size=(0.03, 0.02), center=(0, 0, 0.005))),
+        "free": ProximityTaxel(link="hand", probes=free, noise=noise),
+    }
+    scene = pad_scene(*OBJECTS)
+    suites = [SensorSuite(scene, sensors, num_envs=3) for _ in range(2)]
+    suites[1].runtimes[0]._gathered = False  # type: ignore[attr-defined]
+    poses = poses_at(len(scene.links), {}, 3)
+    poses[:, 2, :3] = (0.002, 0.001, 0.011)
+    poses[:, 3, :3] = (-0.006, 0.002, 0.012)
+    poses[1, 3, 2] = 0.5
+    poses[2, 2, 0] = np.nan
+    velocity = np.random.default_rng(1).normal(0, 0.5, (3, len(scene.links), 6))
+    for suite in suites:
+        suite.update(state_of(scene, poses, velocity, touch=False))
+    for name in sensors:
+        assert np.isnan(suites[0].read(name)[2].flatten(0, -2).numpy()[5]).all()
+        for read in ("read", "read_ground_truth"):
+            found, expected = (getattr(suite, read)(name).numpy() for suite in suites)
+            assert (np.abs(expected[:2]).max(axis=(1, 2) if name == "free" else (1, 2, 3)) > 0.05).all()
+            np.testing.assert_array_equal(found, expected)

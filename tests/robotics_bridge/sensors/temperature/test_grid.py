@@ -1,0 +1,371 @@
+"""The temperature grid against closed forms: eigenmodes, lumped cooling, contact of half-spaces, conservation."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.special import erf
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.physics.cpu import MujocoEngine
+from robotics_bridge.physics.scene import Geometry, Scene
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.noise.model import Noise
+from robotics_bridge.sensors.suite import SensorSuite
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature, lost_contacts
+from robotics_bridge.sensors.temperature.materials import MATERIALS, Body, ThermalMaterial, material
+from robotics_bridge.sensors.temperature.runtime import diffusion
+
+PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
+
+
+def _make(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), contacts: int = 0, **knobs):
+    """Return a suite with one grid on a box, and a state; links are world, pad and object."""
+    geometries = (
+        Geometry(name="pad", link="pad", kind="box", size=half),
+        Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
+    )
+    scene = Scene(("world", "pad", "object"), geometries)
+    defaults = {"convection": 0.0, "radiates": False, "material": PLAIN}
+    suite = SensorSuite(scene, {"grid": TemperatureGrid(link="pad", **{**defaults, **knobs})}, num_envs=envs)
+    return suite, HandState.empty(envs, 3, contacts)
+
+
+def _field(suite: SensorSuite, values: np.ndarray) -> None:
+    runtime = suite.runtimes[0]
+    runtime._field.assign(np.broadcast_to(values.ravel(), runtime._field.shape).astype(np.float64))
+
+
+def _face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: float = 0.03) -> None:
+    """Four contact points at the corners of a square on the upper face."""
+    corners = np.array([[x, y, height] for x in (-half, half) for y in (-half, half)])
+    env = np.repeat(envs, 4)
+    state.set_contacts(
+        env, np.tile([[0, 1]], (len(env), 1)), distance=np.full(len(env), -depth),
+        position=np.tile(corners, (len(envs), 1)), normal=np.tile([0.0, 0, 1], (len(env), 1)),
+    )  # fmt: skip
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.floats(1e-4, 1e-1), st.floats(1e-12, 1e2))
+def test_diffusion_keeps_heat_makes_no_new_extremes_and_forgets_at_last(cells, edge, spread):
+    matrix = diffusion(cells, edge, spread)
+    assert matrix.min() >= 0
+    assert matrix.sum(axis=0) == pytest.approx(np.ones(cells), abs=1e-9)
+    assert matrix.sum(axis=1) == pytest.approx(np.ones(cells), abs=1e-9)
+    assert diffusion(cells, edge, 1e9) == pytest.approx(np.full((cells, cells), 1 / cells), abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", [1, 2, 3])
+@pytest.mark.parametrize("dt", [1e-3, 0.1])
+def test_an_eigenmode_of_a_slab_decays_as_the_heat_equation_says(mode, dt):
+    cells, length = 48, 0.06
+    suite, state = _make(cells=(1, 1, cells), base_temperature=20.0)
+    suite.update(state, dt)
+    z = (np.arange(cells) + 0.5) / cells
+    shape = np.cos(mode * math.pi * z)
+    _field(suite, 20 + 5 * shape)
+    steps = round(4.0 / dt) if dt == 0.1 else 500
+    for _ in range(steps):
+        suite.update(state, dt)
+    rate = PLAIN.diffusivity * (mode * math.pi / length) ** 2
+    expected = 20 + 5 * shape * math.exp(-rate * steps * dt)
+    assert suite.read_ground_truth("grid")[0, 0, 0].numpy() == pytest.approx(expected, abs=5e-3 * mode**2)
+
+
+def test_many_tiny_steps_add_up_to_what_long_ones_do():
+    read = {}
+    for dt, steps in ((1e-5, 2000), (1e-2, 2)):
+        suite, state = _make(cells=(1, 1, 2), source=2e4, base_temperature=30.0)
+        for _ in range(steps):
+            suite.update(state, dt)
+        read[dt] = float(suite.read_ground_truth("grid").double().mean()) - 30
+    assert read[1e-5] == pytest.approx(2e4 * 0.02 / 1e6, rel=0.01)
+    assert read[1e-5] == pytest.approx(read[1e-2], rel=0.01)
+
+
+@pytest.mark.parametrize("dt", [1e-5, 1e-3, 1e-1])
+def test_an_insulated_grid_keeps_its_heat_and_a_level_one_its_temperature(dt):
+    suite, state = _make(cells=(3, 4, 5), base_temperature=31.0)
+    for _ in range(20):
+        suite.update(state, dt)
+    assert np.all(suite.read_ground_truth("grid").numpy() == 31.0)
+    start = np.random.default_rng(0).uniform(10, 50, (3, 4, 5))
+    _field(suite, start)
+    for _ in range(200):
+        suite.update(state, dt)
+    end = suite.read_ground_truth("grid")[0].double().numpy()
+    assert end.mean() == pytest.approx(start.mean(), abs=2e-4)
+    assert start.min() - 1e-4 <= end.min()
+    assert end.max() <= start.max() + 1e-4
+
+
+@pytest.mark.parametrize("dt", [1e-4, 1e-2, 0.1])
+def test_a_lump_cools_by_newtons_law_at_any_step(dt):
+    suite, state = _make(cells=(1, 1, 1), convection=200.0, ambient_temperature=20.0, base_temperature=60.0)
+    steps = max(1, min(round(20 / dt), 300))
+    for _ in range(steps):
+        suite.update(state, dt)
+    volume, area = 8 * 0.01 * 0.02 * 0.03, 8 * (0.01 * 0.02 + 0.02 * 0.03 + 0.03 * 0.01)
+    rate = 200 * area / (PLAIN.density * PLAIN.specific_heat * volume)
+    expected = 20 + 40 * math.exp(-rate * steps * dt)
+    assert float(suite.read_ground_truth("grid")) == pytest.approx(expected, abs=2e-3)
+
+
+def test_radiation_follows_stefan_and_boltzmann():
+    suite, state = _make(cells=(1, 1, 1), radiates=True, ambient_temperature=20.0, base_temperature=300.0)
+    dt, steps = 0.1, 600
+    for _ in range(steps):
+        suite.update(state, dt)
+    volume, area = 8 * 0.01 * 0.02 * 0.03, 8 * (0.01 * 0.02 + 0.02 * 0.03 + 0.03 * 0.01)
+    c = 0.8 * 5.670374419e-8 * area / (PLAIN.density * PLAIN.specific_heat * volume)
+    exact = solve_ivp(lambda t, y: -c * (y**4 - 293.15**4), (0, dt * steps), [573.15], rtol=1e-10, atol=1e-8)
+    assert float(suite.read_ground_truth("grid")) == pytest.approx(exact.y[0, -1] - 273.15, abs=0.02)
+
+
+def test_a_source_warms_by_its_power_and_nothing_else():
+    source = np.zeros((2, 2, 2))
+    source[1, 0, 1] = 5e5
+    suite, state = _make(cells=(2, 2, 2), source=source)
+    for _ in range(100):
+        suite.update(state, 0.01)
+    gain = suite.read_ground_truth("grid").double().mean() - 22
+    assert gain == pytest.approx(5e5 / 8 * 1.0 / (PLAIN.density * PLAIN.specific_heat), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["glass", "wood", "steel"])
+def test_touching_a_half_space_gives_the_temperatures_of_two_half_spaces(name):
+    """Carslaw & Jaeger: the interface is at (e₁T₁ + e₂T₂) / (e₁ + e₂), the grid follows the error function."""
+    # A face of 2 m so that heat flows straight through; 24 mm deep.
+    suite, state = _make(
+        half=(1.0, 1.0, 0.012), contacts=4, cells=(1, 1, 240), base_temperature=33.0,
+        bodies={"object": Body(name, 13.0)},
+    )  # fmt: skip
+    _face(state, 1.0, height=0.012)
+    dt, steps = 2e-3, 1000
+    for _ in range(steps):
+        suite.update(state, dt)
+    e1, e2 = PLAIN.effusivity, material(name).effusivity
+    interface = (e1 * 33 + e2 * 13) / (e1 + e2)
+    depth = (np.arange(240)[::-1] + 0.5) * 1e-4
+    expected = interface + (33 - interface) * erf(depth / (2 * math.sqrt(PLAIN.diffusivity * dt * steps)))
+    read = suite.read_ground_truth("grid")[0, 0, 0].numpy()
+    assert read == pytest.approx(expected, abs=0.02 * 20)
+    assert read[-1] == pytest.approx(interface, abs=0.03 * 20)
+
+
+def test_metal_feels_colder_than_wood_at_the_same_temperature():
+    felt = {}
+    for name in ("aluminium", "glass", "wood"):
+        suite, state = _make(
+            contacts=1,
+            half=(0.006, 0.006, 0.003),
+            cells=(5, 5, 5),
+            base_temperature=33.0,
+            material="skin",
+            bodies={"object": Body(name, 22.0)},
+        )
+        state.set_contacts(
+            [0], [[0, 1]], distance=[-1e-3], position=[[0.0, 0.0, 0.003]], normal=[[0.0, 0.0, 1.0]]
+        )  # fmt: skip
+        for _ in range(100):
+            suite.update(state, 0.02)
+        felt[name] = float(suite.read("grid")[0, 2, 2, 4])
+    assert felt["aluminium"] < felt["glass"] < felt["wood"] < 33
+    assert 33 - felt["aluminium"] > 1.5 * (33 - felt["wood"])
+
+
+def test_the_published_conduction_is_available_with_its_length_and_area():
+    suite, state = _make(
+        contacts=4, cells=(1, 1, 1), conduction="thesis", base_temperature=20.0, bodies={"object": Body("steel", 50.0)}
+    )
+    _face(state, 0.008)
+    for _ in range(1000):
+        suite.update(state, 1e-3)
+    k = 2 * PLAIN.conductivity * 15 / (PLAIN.conductivity + 15)
+    volume, area = 8 * 0.01 * 0.02 * 0.03, 0.016**2
+    flux = k * 30 / (volume / area)
+    expected = flux * area / volume / (PLAIN.density * PLAIN.specific_heat)
+    assert float(suite.read_ground_truth("grid")) - 20 == pytest.approx(expected, rel=2e-2)
+
+
+def test_a_contact_of_depth_has_the_area_of_a_cut_ball_and_none_gives_no_heat():
+    def gain(depth: float, conductance: float = 1.0) -> float:
+        suite, state = _make(
+            contacts=1, cells=(1, 1, 1), base_temperature=0.0, contact_conductance=conductance, contact_radius=0.004,
+            bodies={"object": Body("copper", 100.0)}, material=ThermalMaterial(400, 1000, 100, 0),
+        )  # fmt: skip
+        state.set_contacts([0], [[1, 0]], distance=[-depth], position=[[0.0, 0, 0.03]], normal=[[0.0, 0, -1]])
+        suite.update(state, 1.0)
+        return float(suite.read_ground_truth("grid"))
+
+    assert gain(0.0) == 0
+    # A poor interface is all the resistance: heat is proportional to the area.
+    assert gain(1e-3) / gain(5e-4) == pytest.approx((2 * 4 * 1 - 1) / (2 * 4 * 0.5 - 0.25), rel=1e-2)
+    capacity = 1000 * 100 * 8 * 0.01 * 0.02 * 0.03
+    area = math.pi * (2 * 0.004 * 1e-3 - 1e-6)
+    assert gain(1e-3) == pytest.approx(100 * area / capacity, rel=1e-2)
+
+
+@pytest.mark.parametrize("dt", [1e-5, 1e-3, 0.1])
+def test_no_step_is_too_long_even_for_a_thin_hot_copper_pad(dt):
+    suite, state = _make(
+        half=(0.01, 0.01, 1e-4), contacts=4, cells=(4, 4, 2), material="copper", convection=500.0, radiates=True,
+        bodies={"object": Body("copper", 400.0)}, ambient_temperature=-20.0,
+    )  # fmt: skip
+    _face(state, 0.01, depth=1e-3, height=1e-4)
+    for _ in range(100):
+        suite.update(state, dt)
+        field = suite.read_ground_truth("grid")
+        assert -20 <= float(field.min()) <= float(field.max()) <= 400
+
+
+def test_the_element_lags_exactly_and_reads_less_upward_than_downward():
+    for step in (0.01, 1.0):
+        suite, state = _make(cells=(1, 1, 1), tau=0.4, base_temperature=20.0)
+        suite.update(state, step)
+        _field(suite, np.array([30.0]))
+        for count in range(1, 4):
+            suite.update(state, step)
+            assert float(suite.read("grid")) == pytest.approx(30 - 10 * math.exp(-count * step / 0.4), abs=1e-4)
+        assert float(suite.read_ground_truth("grid")) == pytest.approx(30, abs=1e-4)
+    suite, state = _make(cells=(1, 1, 2), warm_range=5.0, cold_range=15.0, base_temperature=30.0)
+    suite.update(state, 1e-3)
+    _field(suite, np.array([80.0, -40.0]))
+    suite.update(state, 1e-5)
+    assert suite.read("grid").ravel().tolist() == pytest.approx([35.0, 15.0])
+
+
+def test_environments_are_reset_and_break_alone():
+    suite, state = _make(envs=3, contacts=12, cells=(2, 2, 2), bodies={"object": Body("steel", 60.0)})
+    _face(state, 0.008, envs=(0, 1, 2), depth=1e-3)
+    warm = link_temperature(suite, "grid")
+    warm[2] = 22.0
+    for _ in range(50):
+        suite.update(state, 0.02)
+    read = suite.read("grid").clone()
+    assert read[0, ..., 1].mean() > 22.03
+    assert np.array_equal(read[0], read[1])
+    assert np.all(np.abs(read[2].numpy() - 22) < 1e-4)
+    suite.reset([1])
+    pose = state.pose_torch
+    pose[0, 1, 0] = math.nan
+    suite.update(state, 0.02)
+    after = suite.read("grid")
+    assert after[0].isnan().all()
+    assert after[1].max() < read[1].max()
+    assert np.all(np.abs(after[2].numpy() - 22) < 1e-4)
+    pose[0, 1, 0] = 0.0
+    suite.update(state, 0.02)
+    assert suite.read("grid")[0].isfinite().all()
+
+
+def test_noise_touches_the_measured_branch_alone():
+    suite, state = _make(envs=200, cells=(2, 2, 2), noise=Noise(white=0.1, quantum=0.05))
+    suite.update(state, 0.01)
+    assert np.all(suite.read_ground_truth("grid").numpy() == 22)
+    error = suite.read("grid").numpy() - 22
+    assert error.std() == pytest.approx(0.1, rel=0.1)
+    assert error / 0.05 == pytest.approx(np.round(error / 0.05), abs=1e-3)
+
+
+def test_a_hot_ball_resting_on_a_plate_warms_the_cells_below_it():
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody>
+      <body name="plate"><geom name="plate" type="box" size="0.05 0.05 0.005"/></body>
+      <body name="ball" pos="0.03 0.03 0.0449"><freejoint/><geom name="ball" size="0.04" mass="0.5"/></body>
+    </worldbody></mujoco>""")
+    engine = MujocoEngine(model, 2, threads=1)
+    grid = TemperatureGrid(link="plate", cells=(5, 5, 1), material="aluminium", bodies={"ball": Body("steel", 45.0)})
+    suite = SensorSuite(engine.scene, {"grid": grid}, num_envs=2)
+    for _ in range(100):
+        engine.step()
+        suite.update(engine.state, engine.timestep)
+    read = suite.read_ground_truth("grid")[0, :, :, 0]
+    assert np.unravel_index(int(read.argmax()), (5, 5)) == (4, 4)
+    assert float(read.max()) > 22.001
+    assert np.array_equal(read, suite.read_ground_truth("grid")[1, :, :, 0])
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ({"cells": (2, 0, 1)}, "three positive numbers of cells"),
+        ({"low": (0, 0, 0)}, "both corners"),
+        ({"low": (0, 0, 0), "high": (1, 0, 1)}, "differ along every axis"),
+        ({"material": "alumium"}, "did you mean 'aluminium'"),
+        ({"source": np.zeros((1, 2))}, "source is a number or an array"),
+        ({"tau": -1.0}, "tau must be zero or positive"),
+        ({"conduction": "real"}, "Unknown conduction"),
+        ({"bodies": {"object": Body("woood")}}, "did you mean 'wood'"),
+        ({"noise": Noise(gain=(0.5, 2.0))}, "TemperatureGrid has no noise knob 'gain'"),
+    ],
+)
+def test_wrong_settings_are_explained(knobs, message):
+    with pytest.raises(UsageError, match=message):
+        TemperatureGrid(link="pad", **knobs)
+
+
+def test_a_grid_needs_finite_geometry_or_corners():
+    scene = Scene(("world",), (Geometry(name="floor", link="world", kind="plane"),))
+    with pytest.raises(UsageError, match="no geometry of finite size"):
+        SensorSuite(scene, {"grid": TemperatureGrid(link="world")}, num_envs=1)
+    with pytest.raises(UsageError, match="positive"):
+        ThermalMaterial(-1, 1, 1)
+    assert MATERIALS["steel"].effusivity == pytest.approx(math.sqrt(15 * 7900 * 480))
+    suite, _state = _make()
+    with pytest.raises(UsageError, match="Unknown temperature grid 'gird'; did you mean 'grid'"):
+        link_temperature(suite, "gird")
+
+
+def test_contacts_without_room_are_counted():
+    suite, state = _make(contacts=60, bodies={"object": Body("steel", 60.0)})
+    state.set_contacts(
+        np.zeros(60), np.tile([[0, 1]], (60, 1)), distance=np.full(60, -1e-4),
+        position=np.random.default_rng(0).normal(size=(60, 3)) * 0.01, normal=np.tile([0.0, 0, 1], (60, 1)),
+    )  # fmt: skip
+    suite.update(state, 0.01)
+    assert lost_contacts(suite, "grid").tolist() == [12]
+    assert float(suite.read("grid").max()) > 22
+
+
+def test_an_empty_scene_is_read_at_the_shortest_and_the_longest_step():
+    scene = Scene(("world", "pad"))
+    grid = TemperatureGrid(link="pad", low=(0, 0, 0), high=(0.01, 0.01, 0.01), base_temperature=30.0)
+    suite, state = SensorSuite(scene, {"grid": grid}, num_envs=2), HandState.empty(2, 2)
+    for dt in (1e-5, 0.1, 10.0):
+        suite.update(state, dt)
+        assert 22 < float(suite.read("grid").min()) <= float(suite.read("grid").max()) <= 30
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_cells_keep_their_heat():
+    suite, state = _make(cells=(100, 100, 10), source=1e5)
+    for _ in range(5):
+        suite.update(state, 0.01)
+    assert suite.read_ground_truth("grid").double().mean() - 22 == pytest.approx(1e5 * 0.05 / 1e6, rel=1e-3)
+
+
+@pytest.mark.gpu
+def test_cpu_and_cuda_agree():
+    read = {}
+    for device in ("cpu", "cuda"):
+        geometries = (
+            Geometry(name="pad", link="pad", kind="box", size=(0.01, 0.02, 0.03)),
+            Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
+        )
+        grid = TemperatureGrid(link="pad", cells=(4, 5, 6), bodies={"object": Body("steel", 60.0)}, tau=0.1)
+        suite = SensorSuite(Scene(("world", "pad", "object"), geometries), {"grid": grid}, num_envs=8, device=device)
+        state = HandState.empty(8, 3, 32, device)
+        _face(state, 0.008, envs=tuple(range(8)), depth=1e-3)
+        for _ in range(100):
+            suite.update(state, 0.01)
+        read[device] = suite.read("grid").cpu().numpy()
+    assert read["cuda"] == pytest.approx(read["cpu"], abs=1e-3)
+    assert read["cpu"].max() > 22.05

@@ -1,0 +1,262 @@
+"""The main job on recordings whose geometry is known, through files, as a user would run it."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from torch import nn
+
+import brainbench
+from brainbench.core.errors import UsageError
+from brainbench.datasets import make_session, open_recordings, write_recordings
+from brainbench.models.features import write_features
+from brainbench.scoring.scores import score_record
+
+LABELS = ("a", "b", "c", "d", "e", "f")
+TRIALS = 30
+
+
+def _rates(units: int, *, geometry: int = 0, tuning: int) -> np.ndarray:
+    """Rates [K, units] (Hz) of units with random tuning to five dimensions that the stimuli differ in."""
+    dimensions = np.random.default_rng(geometry).normal(size=(len(LABELS), 5))
+    return 12 * np.exp(0.4 * dimensions @ np.random.default_rng([8, tuning]).normal(size=(5, units)))
+
+
+def _geometry(seed: int = 0) -> np.ndarray:
+    """Features [K, 2000]: what very many noiseless units of that geometry would show."""
+    return _rates(2000, geometry=seed, tuning=99)
+
+
+def _make_recordings(
+    folder: Path, *, animals: int = 4, units: int = 80, trials: int = TRIALS, missing: str = ""
+) -> Path:
+    """Animals whose rates are random mixtures of one geometry, with Poisson spikes."""
+    for animal in range(animals):
+        rng = np.random.default_rng([7, animal])
+        rates = _rates(units, tuning=animal)
+        order = rng.permutation(np.repeat(np.arange(len(LABELS)), trials))
+        if animal == 0 and missing:
+            order = order[order != LABELS.index(missing)]
+        starts = 1.0 + 1.5 * np.arange(len(order))
+        spikes = [
+            np.sort(
+                np.concatenate(
+                    [
+                        start + rng.uniform(0, 1, rng.poisson(rates[k, unit]))
+                        for start, k in zip(starts, order, strict=True)
+                    ]
+                )
+            )
+            for unit in range(units)
+        ]
+        table = {"start_time": starts, "stop_time": starts + 1.0, "stimulus": [LABELS[k] for k in order]}
+        span = np.array([[0.0, starts[-1] + 2]])
+        session = make_session(f"m{animal}", "s", spikes, {"trials": table}, observed=[span] * units)
+        write_recordings(folder / f"m{animal}.h5", session)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _make_recordings(tmp_path_factory.mktemp("recordings"))
+
+
+@pytest.fixture(scope="module")
+def recordings(folder: Path) -> xr.Dataset:
+    return open_recordings(folder, conditions="trials:stimulus")
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    layers = {"other": _geometry(9), "true": _geometry()}
+    return write_features(tmp_path_factory.mktemp("features") / "model.h5", LABELS, layers)
+
+
+def test_the_true_geometry_scores_near_one_and_chooses_its_layer(truth: Path, recordings: xr.Dataset):
+    score = brainbench.score(str(truth), recordings=recordings)
+    assert score.status == "ok"
+    assert score.value == pytest.approx(1.0, abs=0.15)
+    assert score.layer == "true"
+    assert {item.layer for item in score.subjects} == {"true"}
+    assert score.p <= 0.01
+    assert score.ceiling is not None
+    assert score.ceiling.lower < score.ceiling.upper <= 1
+    assert score.best_layer_value >= score.value - 1e-12
+    assert len(score.model_rdm) == len(score.brain_rdm) == 15
+
+
+def test_an_unrelated_geometry_does_not(recordings: xr.Dataset, tmp_path: Path):
+    path = write_features(tmp_path / "other.h5", LABELS, {"fc": _geometry(9)})
+    score = brainbench.score(str(path), recordings=recordings)
+    assert score.value < 0.6
+    assert score.p > 0.02
+
+
+def test_order_of_trials_and_labels_changes_nothing(truth: Path, recordings: xr.Dataset, tmp_path: Path):
+    first = brainbench.score(str(truth), recordings=recordings)
+    order = np.random.default_rng(1).permutation(recordings.sizes["trial"])
+    shuffled = recordings.isel(trial=order)
+    rows = [3, 0, 5, 1, 4, 2]
+    turned = write_features(
+        tmp_path / "turned.h5",
+        [LABELS[row] for row in rows],
+        {"other": _geometry(9)[rows], "true": _geometry()[rows]},
+    )
+    second = brainbench.score(str(turned), recordings=shuffled)
+    assert second.value == pytest.approx(first.value, abs=1e-12)
+    assert second.reliability == pytest.approx(first.reliability, abs=1e-12)
+    assert second.p == first.p
+    np.testing.assert_allclose(second.model_rdm, first.model_rdm, atol=1e-12)
+
+
+def test_order_of_files_changes_nothing(folder: Path, truth: Path):
+    paths = sorted(folder.glob("*.h5"))
+    both = [
+        brainbench.score(str(truth), recordings=order, conditions="trials:stimulus") for order in (paths, paths[::-1])
+    ]
+    assert both[0].value == both[1].value
+
+
+def test_a_seed_reproduces_a_record_and_provenance_says_what_was_scored(truth: Path, folder: Path):
+    first, second = (
+        score_record(str(truth), recordings=str(folder), conditions="trials:stimulus", seed=3) for _ in range(2)
+    )
+    assert first.identity == second.identity
+    origin = first.score.provenance
+    assert origin["recordings"]["content_hash"]
+    assert origin["settings"]["seed"] == 3
+    assert first.card is not None
+    assert first.card.weights
+    assert first.animal_to_animal is not None
+    assert first.animal_to_animal.value == pytest.approx(1.0, abs=0.15)
+    assert not first.synthetic
+
+
+def test_a_subject_without_a_stimulus_is_named_and_the_others_still_count(truth: Path, tmp_path: Path):
+    folder = _make_recordings(tmp_path, missing="c", units=30, trials=12)
+    score = brainbench.score(str(truth), recordings=str(folder), conditions="trials:stimulus")
+    lost = score.subjects[0]
+    assert lost.subject == "m0"
+    assert lost.status == "undefined"
+    assert any("m0" in reason and "'c'" in reason for reason in score.reasons)
+    assert math.isfinite(score.value)
+
+
+def test_dropped_labels_leave_the_comparison(truth: Path, recordings: xr.Dataset):
+    score = brainbench.score(str(truth), recordings=recordings, match={"f": None})
+    assert score.stimuli == LABELS[:5]
+    assert len(score.model_rdm) == 10
+
+
+def test_unmatched_labels_are_an_error_that_lists_both_sides(recordings: xr.Dataset, tmp_path: Path):
+    path = write_features(tmp_path / "x.h5", [*LABELS[:5], "z"], {"fc": _geometry()})
+    with pytest.raises(UsageError, match=r"without a stimulus: 'f'; without recordings: 'z'.*--match"):
+        brainbench.score(str(path), recordings=recordings)
+
+
+@pytest.mark.parametrize("fill", [np.nan, 1.0])
+def test_nan_or_constant_activations_give_an_undefined_score_with_a_reason(
+    recordings: xr.Dataset, tmp_path: Path, fill: float
+):
+    path = write_features(tmp_path / "x.h5", LABELS, {"fc": np.full((6, 5), fill)})
+    record = score_record(str(path), recordings=recordings)
+    assert record.score.status == "undefined"
+    assert math.isnan(record.score.value)
+    assert "constant or NaN" in record.score.reasons[0]
+    assert record.from_json(record.to_json()).to_json() == record.to_json()
+
+
+def test_one_nan_layer_is_never_chosen(recordings: xr.Dataset, tmp_path: Path):
+    bad = _geometry()
+    bad[2, 3] = np.nan
+    path = write_features(tmp_path / "x.h5", LABELS, {"bad": bad, "true": _geometry()})
+    score = brainbench.score(str(path), recordings=recordings)
+    assert score.layer == "true"
+    assert next(item for item in score.layers if item.layer == "bad").status == "undefined"
+
+
+def test_layers_can_be_chosen_and_a_typo_is_corrected(truth: Path, recordings: xr.Dataset):
+    score = brainbench.score(str(truth), recordings=recordings, layers=("other",))
+    assert [item.layer for item in score.layers] == ["other"]
+    with pytest.raises(UsageError, match="did you mean 'true'"):
+        brainbench.score(str(truth), recordings=recordings, layers=("treu",))
+
+
+def test_the_published_estimator_says_that_it_is_optimistic(truth: Path, recordings: xr.Dataset):
+    score = brainbench.score(str(truth), recordings=recordings, estimator="thesis")
+    assert score.estimator == "thesis"
+    assert any("optimistic" in reason for reason in score.reasons)
+    with pytest.raises(UsageError, match="did you mean 'thesis'"):
+        brainbench.score(str(truth), recordings=recordings, estimator="theses")
+
+
+class _Tiny(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(8, 5)
+
+    def forward(self, x):
+        return self.fc(x.flatten(2)).relu().mean(1)
+
+
+@pytest.fixture
+def arrays(tmp_path: Path) -> Path:
+    import h5py
+
+    path = tmp_path / "stimuli.h5"
+    values = np.random.default_rng(2).normal(size=(6, 4, 2, 2, 2)).astype(np.float32)
+    with h5py.File(path, "w") as file:
+        file["stimuli"] = values
+        file["labels"] = np.array(LABELS, dtype=h5py.string_dtype())
+    return path
+
+
+def test_a_plain_module_is_scored_on_arrays_without_registration(recordings: xr.Dataset, arrays: Path):
+    record = score_record(_Tiny(), recordings=recordings, stimuli=str(arrays))
+    assert [item.layer for item in record.score.layers] == ["fc", "output"]
+    assert set(record.baselines) == {"raw input", "random features"}
+    assert record.card is not None
+    assert record.card.parameters == 45
+    assert record.card.input == "as given"
+
+
+def test_a_model_whose_input_does_not_fit_says_what_it_was_given(recordings: xr.Dataset, arrays: Path):
+    with pytest.raises(UsageError, match=r"cannot process stimuli of shape \[6, 4, 2, 2, 2\]"):
+        brainbench.score(nn.Linear(3, 2), recordings=recordings, stimuli=str(arrays))
+
+
+def test_a_lazy_layer_without_weights_is_named():
+    with pytest.raises(
+        UsageError, match=r"Sequential has lazy layers without weights yet \(1\.weight, 1\.bias\): run it"
+    ):
+        brainbench.score(nn.Sequential(nn.Flatten(), nn.LazyLinear(3)))
+
+
+def test_other_things_are_no_models():
+    with pytest.raises(UsageError, match="received int"):
+        brainbench.score(3)
+    with pytest.raises(UsageError, match="did you mean 'zhuang'"):
+        brainbench.score("zhuagn")
+    with pytest.raises(UsageError, match="Unknown time rule 'median'"):
+        brainbench.score(_Tiny(), time="median")
+
+
+def test_scores_of_mappings_follow_the_order_of_the_stimuli(recordings: xr.Dataset, arrays: Path, truth: Path):
+    by_file = brainbench.score(str(truth), recordings=recordings)
+    by_mapping = brainbench.score(
+        {"other": _geometry(9), "true": _geometry()}, recordings=recordings, stimuli=str(arrays)
+    )
+    assert by_mapping.value == pytest.approx(by_file.value, abs=1e-6)
+    with pytest.raises(UsageError, match="expected \\[K, F\\]"):
+        brainbench.score({"fc": np.ones((5, 2))}, recordings=recordings, stimuli=str(arrays))
+
+
+def test_both_time_rules_agree_when_there_is_one_step(truth: Path, recordings: xr.Dataset):
+    mean, concatenated = (
+        brainbench.score(str(truth), recordings=recordings, time=rule) for rule in ("mean", "concatenate")
+    )
+    assert mean.value == pytest.approx(concatenated.value, abs=1e-12)
+    assert dataclasses.asdict(mean)["stimuli"] == LABELS

@@ -1,0 +1,249 @@
+"""The search for what is near among triangles, against every triangle looked at and against a reference library."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, spatial_order, tree_boxes
+from brainbench.stimuli.engines.rod.packing import Surface
+from brainbench.stimuli.objects.obstacle import TriangleMesh
+from tests.factories.rod_threads import WARP, Memory, thread_warp
+
+wp = pytest.importorskip("warp")
+
+
+def _surface(name="gear-0"):
+    from brainbench.stimuli.objects.collections import resolve_objects
+
+    surface = resolve_objects([name], surfaces=True)[name].load().surface
+    # The kernels' millimetres; trimesh takes small triangles in metres for points.
+    return TriangleMesh(surface.vertices * 1e3, surface.faces)
+
+
+def _segments(surface, count, seed=0):
+    """Segments that begin near random vertices, some a long way from the surface."""
+    rng = np.random.default_rng(seed)
+    size = np.ptp(surface.vertices, axis=0).max()
+    start = surface.vertices[rng.integers(len(surface.vertices), size=count)]
+    start = start + rng.normal(size=(count, 3)) * size * rng.choice([0.01, 0.05, 0.3], (count, 1))
+    return start, start + rng.normal(size=(count, 3)) * size * 0.05
+
+
+def test_every_aligned_run_of_triangles_is_a_box_that_holds_them():
+    surface = _surface()
+    corners = surface.vertices[surface.faces]
+    order = spatial_order(corners)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(corners)))
+    corners, boxes, run, first = corners[order], tree_boxes(corners[order]), WIDE, 0
+    while first < len(boxes):
+        count = -(-len(corners) // run)
+        for rank in range(count):
+            inside = corners[rank * run : (rank + 1) * run].reshape(-1, 3)
+            np.testing.assert_array_equal(boxes[first + rank], [inside.min(axis=0), inside.max(axis=0)])
+        first, run = first + count, run * WIDE
+    assert first == len(boxes)
+    # Neighbours in the order are neighbours in space: leaves are far smaller than those of triangles in any order.
+    leaves = -(-len(corners) // WIDE)
+    extent = np.ptp(boxes[:leaves], axis=1).max(axis=1).mean()
+    mixed = np.ptp(tree_boxes(corners[np.random.default_rng(0).permutation(len(corners))])[:leaves], axis=1)
+    assert extent < 0.3 * mixed.max(axis=1).mean()
+
+
+def _ask(surface, starts, stops, radius, within, leaf):
+    """Squared distances [segment, 3] of the kernel's search from the segments, their ends and their starts."""
+    from brainbench.core.devices import to_struct
+    from brainbench.stimuli.engines.rod.kernels.inputs import structs
+    from brainbench.stimuli.engines.rod.kernels.mesh_search import searches
+
+    wp.init()
+    nearest, kinds = searches(wp.float64, 1).nearest, structs(wp.float64)
+    filled = to_struct(kinds.Bodies, _bodies(surface), "cpu")
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def ask(
+        bodies: kinds.Bodies,
+        a: wp.array(dtype=wp.vec3d),
+        b: wp.array(dtype=wp.vec3d),
+        radius: wp.float64,
+        within: wp.float64,
+        leaf: wp.array(dtype=wp.int32),
+        out: wp.array(dtype=wp.vec3d),
+        opened: wp.array(dtype=wp.int32),
+    ):
+        k = wp.tid()
+        got = nearest(bodies, 0, a[k], b[k], radius, within, leaf[k], 0, 1)
+        out[k] = wp.vec3d(got.side, got.end, got.start)
+        opened[k] = got.boxes
+
+    out, opened = wp.zeros(len(starts), dtype=wp.vec3d), wp.zeros(len(starts), dtype=wp.int32)
+    inputs = [filled, wp.array(starts, dtype=wp.vec3d), wp.array(stops, dtype=wp.vec3d), radius, within]
+    wp.launch(ask, len(starts), [*inputs, wp.array(leaf, dtype=wp.int32), out, opened], device="cpu")
+    return out.numpy(), opened.numpy()
+
+
+def _bodies(surface):
+    from brainbench.stimuli.engines.rod.packing import Shapes
+
+    shapes = Shapes()
+    one, still = np.ones(1), np.array([[1.0, 0, 0, 0]])
+    prepared = Surface.of(surface.vertices, surface.faces)
+    shapes.add_placed(prepared, track=np.zeros(1), turn=still, scale=one, radius=one, speed=np.zeros(1))
+    return shapes.arrays()
+
+
+def _distances(surface, points):
+    """Distances of points from a surface, by trimesh."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    return trimesh.proximity.closest_point_naive(mesh, points)[1]
+
+
+@pytest.mark.parametrize("hint", [False, True])
+def test_the_nearest_triangle_is_found_wherever_the_search_begins(hint):
+    surface = _surface()
+    starts, stops = _segments(surface, 60)
+    size = np.ptp(surface.vertices, axis=0).max()
+    leaves = np.random.default_rng(1).integers(-(-len(surface.faces) // WIDE), size=len(starts)) if hint else None
+    # Within so much of each, everything is found on its own.
+    found, _ = _ask(surface, starts, stops, 2 * size, 2 * size, np.full(len(starts), -1) if leaves is None else leaves)
+    ends = np.sqrt(found[:, 1:])
+    np.testing.assert_allclose(ends[:, 0], _distances(surface, stops), atol=1e-9 * size)
+    # What a start is near to is a matter of the link before.
+    first = found.argmin(axis=1) == 2
+    assert first.any()
+    np.testing.assert_allclose(ends[first, 1], _distances(surface, starts)[first], atol=1e-9 * size)
+    share = np.linspace(0, 1, 41)[:, None, None]
+    along = _distances(surface, (starts + share * (stops - starts)).reshape(-1, 3)).reshape(41, -1).min(axis=0)
+    nearest = np.sqrt(found.min(axis=1))
+    half_gap = np.linalg.norm(stops - starts, axis=1) / 80
+    assert (nearest <= along + 1e-9 * size).all()
+    assert (nearest >= along - half_gap - 1e-9 * size).all()
+
+
+def test_only_what_is_nearest_of_all_is_sought_beyond_what_matters_and_that_takes_fewer_boxes():
+    surface = _surface()
+    starts, stops = _segments(surface, 60)
+    size = np.ptp(surface.vertices, axis=0).max()
+    anywhere = np.full(len(starts), -1)
+    full, many = _ask(surface, starts, stops, 2 * size, 2 * size, anywhere)
+    quick, few = _ask(surface, starts, stops, 2 * size, 0.01 * size, anywhere)
+    np.testing.assert_array_equal(quick.min(axis=1), full.min(axis=1))
+    near = full[:, :2] <= (0.01 * size) ** 2
+    assert near.any()
+    assert not near.all()
+    np.testing.assert_array_equal(quick[:, :2][near], full[:, :2][near])
+    assert few.sum() < many.sum()
+    # Nothing within the radius is said to be nearer, and nothing without it is found.
+    short, _ = _ask(surface, starts, stops, 0.02 * size, 0.01 * size, anywhere)
+    np.testing.assert_allclose(np.sqrt(short.min(axis=1)), np.minimum(np.sqrt(full.min(axis=1)), 0.02 * size))
+
+
+def _inside(surface, points):
+    """Whether points lie in a closed surface: its triangles fill the whole sphere around them."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] - points[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=-1) for x in (a, b, c))
+    triple = np.einsum("...k,...k", a, np.cross(b, c))
+    dots = (np.einsum("...k,...k", x, y) for x, y in ((a, b), (b, c), (c, a)))
+    ab, bc, ca = dots
+    half = np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return half.sum(axis=1) > np.pi
+
+
+def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begins():
+    from brainbench.core.devices import to_struct
+    from brainbench.stimuli.engines.rod.kernels.inputs import structs
+    from brainbench.stimuli.engines.rod.kernels.motion import tracks
+    from brainbench.stimuli.engines.rod.kernels.narrow_phase import looks
+    from brainbench.stimuli.engines.rod.limits import MESHES
+
+    wp.init()
+    look_at, bodies, pose = looks(wp.float64, MESHES).look_at, structs(wp.float64).Bodies, tracks(wp.float64).Pose
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def ask(
+        bodies: bodies,
+        a: wp.array(dtype=wp.vec3d),
+        b: wp.array(dtype=wp.vec3d),
+        margin: wp.float64,
+        leaf: wp.array(dtype=wp.int32),
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        k = wp.tid()
+        body = pose()
+        body.turn = wp.vec4d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
+        thin = wp.vec4d(wp.float64(1e-3), wp.float64(1e-3), wp.float64(0.0), wp.float64(1.0))
+        touch = look_at(bodies, 0, body, a[k], b[k], thin, margin, leaf[k], 0, 1)
+        out[k, 0] = wp.where(touch.between == 1, touch.gap, wp.float64(1e30))
+        out[k, 1] = wp.where(touch.end == 1, touch.end_gap, wp.float64(1e30))
+
+    # So small that every triangle is within sight.
+    surface = _surface()
+    surface = TriangleMesh(surface.vertices * (3.0 / np.ptp(surface.vertices, axis=0).max()), surface.faces)
+    # Links that stand on a face, most of each further away than what is looked for on its own.
+    rng = np.random.default_rng(0)
+    corners = surface.vertices[surface.faces[rng.integers(len(surface.faces), size=400)]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
+    starts = corners.mean(axis=1) + 0.02 * normal
+    stops = starts + 0.3 * (normal + 0.5 * rng.normal(size=normal.shape))
+    share = np.linspace(0, 1, 21)[:, None, None]
+    points = starts + share * (stops - starts)
+    outside = ~np.array([_inside(surface, some) for some in points]).any(axis=0)
+    away = np.array([_distances(surface, some) for some in points]).min(axis=0)
+    outside &= away > 0.01
+    starts, stops = starts[outside], stops[outside]
+    assert len(starts) > 50
+    leaf = np.random.default_rng(1).integers(1, -(-len(surface.faces) // WIDE), size=len(starts))
+    out = wp.zeros((len(starts), 2), dtype=wp.float64)
+    inputs = [
+        to_struct(bodies, _bodies(surface), "cpu"),
+        wp.array(starts, dtype=wp.vec3d),
+        wp.array(stops, dtype=wp.vec3d),
+    ]
+    margin = 0.02 * np.ptp(surface.vertices, axis=0).max()
+    wp.launch(ask, len(starts), [*inputs, margin, wp.array(leaf, dtype=wp.int32), out], device="cpu")
+    gaps = out.numpy()
+    assert (gaps > 0).all()
+    # What is within the margin is told, at its true distance.
+    ends = _distances(surface, stops) - 1e-3
+    close = ends < margin
+    assert close.any()
+    np.testing.assert_allclose(gaps[close, 1], ends[close], atol=1e-9)
+
+
+@pytest.mark.parametrize("lanes", [2, 4, 8])
+def test_threads_that_search_together_find_what_one_finds(lanes):
+    surface = _surface()
+    count = WARP // lanes
+    starts, stops = _segments(surface, 3 * count, seed=lanes)
+    size = np.ptp(surface.vertices, axis=0).max()
+    radius, within = 0.5 * size, 0.02 * size
+    leaves = np.random.default_rng(2).integers(-1, 20, size=len(starts))
+    alone, _ = _ask(surface, starts, stops, radius, within, leaves)
+    # The single kernel may look at more than it must, but only within what matters.
+    counts = (alone <= within**2) & (np.arange(3) < 2)
+    alone = np.where((alone == alone.min(axis=1, keepdims=True)) | counts, alone, np.nan)
+    arrays = _bodies(surface)
+    with thread_warp() as (threads, modules):
+        nearest = modules.search.searches(np.float64, lanes).nearest
+        bodies = SimpleNamespace(**{name: Memory(values) for name, values in arrays.items()})
+        for begin in range(0, len(starts), count):
+            found = {}
+
+            def look(thread, begin=begin, found=found):
+                which = thread // lanes
+                # The last group has nothing to look at and keeps the others company.
+                live = int(which < count - 1)
+                a, b, leaf = starts[begin + which], stops[begin + which], int(leaves[begin + which])
+                got = nearest(bodies, 0, a, b, radius, within, leaf, thread % lanes, live)
+                found[thread] = (got.side, got.end, got.start, got.face)
+
+            threads.run(look)
+            for which in range(count - 1):
+                own = [found[which * lanes + part] for part in range(lanes)]
+                assert len(set(own)) == 1
+                exact = alone[begin + which]
+                sure = np.isfinite(exact)
+                np.testing.assert_allclose(np.array(own[0][:3])[sure], exact[sure], rtol=1e-9, atol=1e-18)

@@ -1,0 +1,101 @@
+"""Presets and the measured table behind them."""
+
+from dataclasses import replace
+
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.core.files import to_plain
+from brainbench.stimuli.engines.fidelity import Fidelity, list_presets, measured
+
+
+def _table():
+    return {Fidelity(**point.settings): point for point in measured()}
+
+
+def test_presets_are_on_record_as_accurate_as_they_promise():
+    for name, promise in zip(list_presets(), (0.15, 0.05, 0.03), strict=True):
+        assert _table()[Fidelity.preset(name)].error <= promise
+
+
+def test_presets_cost_more_as_they_get_more_accurate():
+    costs = [_table()[Fidelity.preset(name)].cost for name in list_presets()]
+    assert costs == sorted(costs)
+
+
+def test_auto_takes_the_cheapest_measured_setting_that_is_good_enough():
+    for error in (0.1, 0.05, 0.03):
+        good = [point for point in measured() if point.error <= error]
+        assert _table()[Fidelity.auto(error=error)].cost == min(point.cost for point in good)
+
+
+def test_auto_refuses_what_was_never_measured():
+    with pytest.raises(UsageError, match="No measured setting reaches an error of 1e-06"):
+        Fidelity.auto(error=1e-6)
+    with pytest.raises(UsageError, match="error must be positive"):
+        Fidelity.auto(error=0)
+    with pytest.raises(UsageError, match="Unknown measured backend 'mujocco'; did you mean 'mujoco'"):
+        Fidelity.auto(backend="mujocco")
+
+
+def test_links_per_mm_give_long_whiskers_more_links():
+    fidelity = Fidelity(links=6, links_per_mm=1.0)
+    assert fidelity.link_count(0.003) == 6
+    assert fidelity.link_count(0.0205) == 21
+    with pytest.raises(UsageError, match="at most 100"):
+        Fidelity(links_per_mm=10).link_count(0.05)
+
+
+def test_stiff_whiskers_get_shorter_steps():
+    fidelity = Fidelity(time_step=1e-4, steps_per_period=25)
+    assert fidelity.step(100.0) == 1e-4
+    assert fidelity.step(1000.0) == pytest.approx(4e-5)
+    assert Fidelity(time_step=1e-4).step(1000.0) == 1e-4
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"links": 1}, "links must lie between 2 and 100"),
+        ({"links_per_mm": 0.0}, "links_per_mm must be positive"),
+        ({"time_step": 0.1}, "time_step must lie between"),
+        ({"steps_per_period": 1}, "steps_per_period must lie between"),
+    ],
+)
+def test_impossible_settings_are_refused(values, message):
+    with pytest.raises(UsageError, match=message):
+        Fidelity(**values)
+
+
+def test_an_unknown_preset_suggests_the_nearest():
+    with pytest.raises(UsageError, match="did you mean 'balanced'"):
+        Fidelity.preset("balance")
+
+
+def test_a_preset_in_a_text_may_be_changed_value_by_value():
+    assert Fidelity.parse("balanced") == Fidelity.preset("balanced")
+    changed = Fidelity.parse("fast, links=12, time_step=5e-4, steps_per_period=none, solver=quasistatic")
+    assert changed == replace(
+        Fidelity.preset("fast"), links=12, time_step=5e-4, steps_per_period=None, solver="quasistatic"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("balancd", "balanced"),
+        ("fast,link=3", "'links'"),
+        ("fast,links=many", "links takes a whole number; received 'many'"),
+        ("fast,time_step=", "time_step takes a number; received ''"),
+        ("fast,solver=static", "quasistatic"),
+        ("fast,time_step=1", "between 1e-7 and 5e-3"),
+    ],
+)
+def test_a_wrong_text_is_answered_in_words(text, message):
+    with pytest.raises(UsageError, match=message):
+        Fidelity.parse(text)
+
+
+def test_a_value_that_came_later_leaves_old_hashes_alone():
+    assert "solver" not in to_plain(Fidelity())
+    assert to_plain(Fidelity(solver="quasistatic"))["solver"] == "quasistatic"

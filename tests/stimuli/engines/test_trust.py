@@ -1,0 +1,70 @@
+"""What the engines share: how far things move in a step, and what then cannot be trusted."""
+
+import math
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.protocol import Job, StillFollicle
+from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.engines.trust import passed_unseen, require_parts, step_travel, strongest_force
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+WHISKER = Whisker(0.02, 50e-6, 5e-6, young_modulus=4e9, density=1260.0, damping_ratio=0.3)
+TIMES = np.linspace(0.0, 0.01, 11)
+STILL = StillFollicle().pose(TIMES)
+CORNERS = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]])
+TETRAHEDRON = TriangleMesh(CORNERS, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32))
+
+
+def _moving(place, turn=None):
+    def motion(times):
+        half = np.zeros(len(times)) if turn is None else turn * times / 2
+        zero = np.zeros(len(times))
+        return np.outer(times, place), np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
+
+    return motion
+
+
+def test_the_travel_of_a_step_adds_that_of_the_whisker_and_that_of_the_object():
+    position, euler = np.outer(TIMES, [0.1, 0, 0]), np.outer(TIMES, [2.0, 0, 0]) + STILL[1]
+    ball = Obstacle((Sphere((5e-3, 0, 0), 1e-3),), _moving((0, 0.3, 0), turn=4.0))
+    travel = step_travel(WHISKER, position, euler, ball, TIMES)
+    # Per millisecond: base .1 mm, tip 2 rad/s × 20 mm, object .3 mm, its far side at most 4 rad/s × |(6, 1, 1)| mm.
+    np.testing.assert_allclose(travel, 1e-3 * (0.1 + 2.0 * 0.02 + 0.3 + 4.0 * 6e-3 * math.sqrt(1 + 2 / 36)), rtol=1e-5)
+    still = Obstacle((Sphere((5e-3, 0, 0), 1e-3),))
+    np.testing.assert_allclose(step_travel(WHISKER, position, euler, still, TIMES), 1e-4 + 4e-5, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "thickness"),
+    [
+        (Obstacle((Capsule((0.01, -0.02, -5e-3), (0.01, -0.02, 5e-3), 2e-4),), _moving((0, 4.0, 0))), 0.5),
+        (Obstacle((), _moving((0.0, 4.0, 0)), surface=TETRAHEDRON.moved(np.eye(3), np.array([0.01, -0.02, 0]))), 1.1),
+    ],
+    ids=["part", "surface"],
+)
+def test_an_object_that_flies_farther_than_it_is_thick_may_pass_unseen(obstacle, thickness):
+    job = Job(WHISKER, StillFollicle(), (obstacle,), TIMES[1:])
+    reach = reachable(WHISKER, STILL[0], (obstacle,), TIMES, surfaces=True)
+    step, reason = passed_unseen(job, reach, *STILL, TIMES)
+    assert step < 5
+    assert f"moves by 4 mm against the whisker in one step at {TIMES[step]:g} s" in reason
+    assert f"is only {thickness:g} mm thick" in reason
+    fine = np.linspace(0.0, 0.01, 201)
+    assert passed_unseen(job, reach, *StillFollicle().pose(fine), fine) == (200, "")
+
+
+def test_the_force_that_no_whisker_bears_is_its_stiffness_against_stretching():
+    # E A = 4e9 Pa × π (50 µm)²; keratin breaks at some hundredth of it.
+    assert strongest_force(WHISKER) == pytest.approx(31.4159, rel=1e-4)
+
+
+def test_a_surface_without_parts_is_refused_in_words():
+    parts = Obstacle((Sphere((0, 0, 0), 1e-3),), surface=TETRAHEDRON)
+    require_parts([Job(WHISKER, StillFollicle(), (parts,), TIMES[1:])], "mujoco")
+    bare = Obstacle((), surface=TETRAHEDRON)
+    with pytest.raises(UsageError, match="a concave surface of 4 triangles"):
+        require_parts([Job(WHISKER, StillFollicle(), (parts, bare), TIMES[1:])], "mujoco")

@@ -1,0 +1,152 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.motion.trajectories import (
+    ROTATIONS,
+    ArrayFollicle,
+    Spin,
+    Still,
+    Translation,
+    Whisking,
+    smooth_step,
+)
+from brainbench.stimuli.whiskers.array import WhiskerArray
+
+ARRAY = WhiskerArray.mouse(side="both")
+TIMES = np.linspace(0, 1, 20001)
+
+
+def test_after_the_onset_whisking_is_the_published_sinusoid():
+    whisking = Whisking(frequency=8.0, protraction=0.6, retraction=0.2, onset=0.05)
+    times = TIMES[TIMES >= 0.05]
+    published = np.cos(2 * np.pi * 8 * times + np.pi) * (0.6 + 0.2) / 2 + (0.6 - 0.2) / 2
+    np.testing.assert_allclose(whisking.azimuth(times), published, atol=1e-14)
+
+
+@given(st.floats(1, 25), st.floats(0, 1), st.floats(-0.3, 0.8), st.floats(0.005, 0.2))
+def test_azimuth_stays_between_retraction_and_protraction(frequency, protraction, retraction, onset):
+    if protraction + retraction <= 1e-6:
+        return
+    azimuth = Whisking(frequency, protraction, retraction, onset).azimuth(TIMES)
+    assert azimuth.min() >= -retraction - 1e-12
+    assert azimuth.max() <= protraction + 1e-12
+
+
+def test_whisking_starts_retracted_without_a_jump_of_position_velocity_or_acceleration():
+    whisking = Whisking()
+    times = np.arange(5) * 1e-5
+    azimuth = whisking.azimuth(times)
+    assert azimuth[0] == -whisking.retraction
+    top = 2 * np.pi * whisking.frequency * (whisking.protraction + whisking.retraction) / 2
+    assert abs(np.diff(azimuth)[0] / 1e-5) < 1e-6 * top
+    assert abs(np.diff(azimuth, n=2)[0] / 1e-10) < 1e-4 * top * 2 * np.pi * whisking.frequency
+
+
+def test_without_onset_whisking_is_the_plain_sinusoid_from_the_first_instant():
+    np.testing.assert_allclose(Whisking(onset=0.0).azimuth(np.array([0.025])), [math.radians(30)])
+
+
+def test_each_row_couples_elevation_and_torsion_with_its_published_coefficients():
+    whisking = Whisking()
+    peak = np.array([0.025 + 0.05])
+    tables = {"elevation": [0.398, 0.591, 0.578, 0.393, 0.217], "torsion": [-0.900, -0.284, 0.243, 0.449, 0.744]}
+    for row, name in enumerate(["A1", "B1", "C1", "D1", "E1"]):
+        mount = WhiskerArray.mouse()[name]
+        theta, phi, zeta = (whisking.angles(mount, peak)[0] - mount.angles) / math.radians(30)
+        assert theta == pytest.approx(1)
+        assert phi == pytest.approx(tables["elevation"][row])
+        assert zeta == pytest.approx(tables["torsion"][row])
+
+
+def test_the_second_published_set_is_available_by_name():
+    assert ROTATIONS["knutsen-b"].elevation == (0.12, 0.30, 0.30, 0.14, 0.02)
+    assert ROTATIONS["knutsen-b"].torsion == (-0.76, -0.25, 0.22, 0.43, 0.73)
+
+
+def test_protraction_carries_the_tips_of_both_sides_forward():
+    whisking = Whisking()
+    for name in ("RC1", "LC1"):
+        angles = whisking.angles(ARRAY[name], np.array([0.05, 0.075]))
+        # azimuth of the base axis against rostral: cos(θ − π/2 − π/2) grows as the whisker protracts
+        forward = np.sin(angles[:, 0] - np.pi / 2) * np.cos(angles[:, 1])
+        assert forward[1] > forward[0]
+
+
+def test_the_left_side_whisks_as_the_mirror_image():
+    right = Whisking().angles(ARRAY["RB2"], TIMES[::500])
+    left = Whisking().angles(ARRAY["LB2"], TIMES[::500])
+    np.testing.assert_allclose(left, right * [-1, 1, -1], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frequency": 0.0}, "whisking frequency .Hz. must be positive; received 0.0"),
+        ({"frequency": float("nan")}, "must be positive"),
+        ({"protraction": 30.0}, "within ±90° .given in rad.; received 30.0"),
+        ({"protraction": -0.2, "retraction": 0.1}, "sum is the peak-to-peak amplitude"),
+        ({"onset": -1.0}, "onset .s. must be zero or more"),
+    ],
+)
+def test_impossible_whisking_is_refused(changes, message):
+    with pytest.raises(UsageError, match=message):
+        Whisking(**changes)
+
+
+def test_translation_reaches_its_velocity_smoothly_and_then_keeps_it():
+    motion = Translation((0.0, -0.03, 0.0), onset=0.02)
+    path = motion.displacement(TIMES)
+    speed = np.gradient(path[:, 1], TIMES)
+    assert path[0, 1] == 0
+    assert speed[TIMES > 0.021] == pytest.approx(-0.03)
+    # The area under the smooth start is half of what full speed would have covered.
+    assert path[-1, 1] == pytest.approx(-0.03 * (1 - 0.01))
+    assert abs(speed[0]) < 1e-6
+
+
+def test_translation_integrates_the_smooth_step():
+    motion = Translation((1.0, 0.0, 0.0), onset=0.3)
+    numerical = np.concatenate([[0], np.cumsum(np.diff(TIMES) * smooth_step((TIMES[1:] + TIMES[:-1]) / 2, 0.3))])
+    np.testing.assert_allclose(motion.displacement(TIMES)[:, 0], numerical, atol=1e-8)
+
+
+def test_a_spin_turns_about_its_axis_by_the_integral_of_its_speed():
+    rate, axis = 4.0, np.array([1.0, 2.0, -2.0]) / 3
+    motion = Spin(tuple(rate * axis), onset=0.2)
+    turned = motion.turn(TIMES)
+    np.testing.assert_allclose(turned @ axis, np.tile(axis, (len(TIMES), 1)), atol=1e-12)
+    angle = np.arccos((np.trace(turned, axis1=1, axis2=2) - 1) / 2)
+    travelled = Translation((rate, 0.0, 0.0), onset=0.2).displacement(TIMES)[:, 0]
+    folded = np.abs((travelled + np.pi) % (2 * np.pi) - np.pi)
+    np.testing.assert_allclose(angle, folded, atol=1e-7)
+    # A quarter turn about z takes x to y, not to −y.
+    quarter = Spin((0.0, 0.0, np.pi / 2), onset=0.0).turn(np.array([1.0]))[0]
+    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    assert (motion.displacement(TIMES) == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(((1.0, 2.0),), "three finite numbers in rad/s"), (((0, 0, 1), -1.0), "spin onset .s. must be zero or more")],
+)
+def test_an_impossible_spin_is_refused(arguments, message):
+    with pytest.raises(UsageError, match=message):
+        Spin(*arguments)
+
+
+def test_a_travelling_head_carries_its_follicles():
+    mount = ARRAY["RC2"]
+    motion = Translation((0.01, 0.0, 0.0), onset=0.0)
+    position, euler = ArrayFollicle(mount, Still(), motion.displacement).pose(np.array([0.0, 0.1]))
+    np.testing.assert_allclose(position - mount.position, [[0, 0, 0], [1e-3, 0, 0]], atol=1e-15)
+    np.testing.assert_allclose(euler, [mount.angles] * 2)
+
+
+def test_a_velocity_needs_three_numbers():
+    with pytest.raises(UsageError, match="three finite numbers in m/s"):
+        Translation((1.0, 2.0))

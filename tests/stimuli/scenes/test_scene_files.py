@@ -1,0 +1,279 @@
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Path, Spin, Still, Translation
+from brainbench.stimuli.objects.obstacle import Cylinder
+from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene_files import load_scene
+
+POLE = """
+description = "a pole"
+[array]
+species = "rat"
+side = "left"
+whiskers = "C*"
+[array.replace.C2]
+young_modulus = 3.3e9
+[head]
+position_mm = [1, 2, 3]
+rotation_deg = [0, 90, 0]
+[whisking]
+frequency_hz = 8
+rotations = "knutsen-b"
+[frames]
+first_ms = 0
+interval_ms = 1
+count = 10
+[[object]]
+shape = "box"
+size_mm = [1, 2, 3]
+[[scene]]
+label = "near"
+[[scene.object]]
+shape = "cylinder"
+radius_mm = 0.5
+height_mm = 20
+position_mm = [14, 5, 0]
+friction = 0.3
+velocity_mm_s = [0, -30, 0]
+[[scene]]
+label = "free"
+[scene.whisking]
+kind = "still"
+[scene.head]
+position_mm = [0, 0, 0]
+"""
+
+
+def _write(tmp_path, text, name="pole.toml"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_scene_file_becomes_scenes_in_si_units(tmp_path):
+    recipe = load_scene(_write(tmp_path, POLE))
+    near, _ = recipe.scenes
+    assert (recipe.name, recipe.description, recipe.labels) == ("pole", "a pole", ("near", "free"))
+    assert near.array.species == "rat"
+    assert near.array.side == "left"
+    assert near.array.names == tuple(f"C{col}" for col in range(7))
+    assert near.array["C2"].whisker.young_modulus == 3.3e9
+    assert near.whisking.frequency == 8
+    assert near.whisking.rotations == ROTATIONS["knutsen-b"]
+    assert near.frames.times == pytest.approx(np.arange(10) * 1e-3)
+    assert near.head.position == pytest.approx((1e-3, 2e-3, 3e-3))
+    assert near.head.rotation[1] == pytest.approx(math.pi / 2)
+    box, pole = near.objects
+    assert box.solid.bounds[1] == pytest.approx([0.5e-3, 1e-3, 1.5e-3])
+    assert isinstance(pole.solid.parts[0], Cylinder)
+    assert pole.position == pytest.approx((0.014, 0.005, 0))
+    assert pole.friction == 0.3
+    assert pole.motion == Translation((0.0, -0.03, 0.0))
+
+
+def test_a_scene_overrides_shared_tables_key_by_key(tmp_path):
+    near, free = load_scene(_write(tmp_path, POLE)).scenes
+    assert free.whisking == Still()
+    assert free.head.position == (0, 0, 0)
+    assert free.head.rotation == near.head.rotation
+    assert len(free.objects) == 1
+
+
+def test_whiskers_can_be_chosen_at_loading(tmp_path):
+    assert load_scene(_write(tmp_path, POLE), whiskers="C1-C2").scenes[0].array.names == ("C1", "C2")
+
+
+def test_a_mesh_is_found_beside_the_file(tmp_path):
+    trimesh.creation.box(extents=(1, 1, 1)).export(tmp_path / "cube.stl")
+    text = (
+        '[[scene]]\nlabel = "cube"\n[[scene.object]]\nshape = "mesh"\npath = "cube.stl"\nunit = "cm"\ndiagonal_mm = 20'
+    )
+    (scene,) = load_scene(_write(tmp_path, text)).scenes
+    assert scene.objects[0].solid.diagonal == pytest.approx(0.02)
+
+
+def test_a_procedural_shape_is_named_by_family_and_seed(tmp_path):
+    path = _write(
+        tmp_path,
+        '[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "family:torus"\nseed = 3\ndetail = 2000\n'
+        '[[scene.object]]\nshape = "family:brick"\ndiagonal_mm = 20\ncollision = "hull"\n',
+    )
+    torus, brick = (item.solid for item in load_scene(path).scenes[0].objects)
+    assert torus.name == "torus-3"
+    assert torus.diagonal == pytest.approx(0.04)
+    assert brick.diagonal == pytest.approx(0.02)
+    path.write_text('[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "family:torsu"\n')
+    with pytest.raises(UsageError, match="did you mean 'torus'"):
+        load_scene(path)
+
+
+def test_a_mesh_can_be_decomposed_by_keys_of_its_table(tmp_path):
+    trimesh.creation.annulus(1, 2, 1, segment=[[0, 0, 0], [0, 0, 1]]).export(tmp_path / "ring.stl")
+    text = (
+        '[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "mesh"\npath = "ring.stl"\nunit = "mm"\n'
+        'collision = "decomposition"\nthreshold = 0.3\n'
+    )
+    solid = load_scene(_write(tmp_path, text)).scenes[0].objects[0].solid
+    assert len(solid.parts) > 1
+    with pytest.raises(UsageError, match=r"threshold of a decomposition lies between 0\.01 and 1"):
+        load_scene(_write(tmp_path, text.replace("0.3", "3")))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"pole\.toml: the file has no \[\[scene\]\]"),
+        ("[[scene]]\n", r"\[\[scene\]\] needs the key 'label'"),
+        (
+            'descripton = "x"\n[[scene]]\nlabel="a"',
+            r"Unknown key of the scene file 'descripton'; did you mean 'description'",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[scene.whisking]\nfrequency = 3',
+            r"key of \[whisking\] 'frequency'; did you mean 'frequency_hz'",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[scene.whisking]\nfrequency_hz = "3"',
+            r"'frequency_hz' of \[whisking\] must be a finite number",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[scene.whisking]\nkind = "sinusoidal"',
+            "Unknown kind of whisking 'sinusoidal'; did you mean 'sinusoid'",
+        ),
+        ('[[scene]]\nlabel="a"\n[scene.whisking]\nrotations = "knutson"', "did you mean 'knutsen'"),
+        (
+            '[[scene]]\nlabel="a"\n[scene.head]\nposition_mm = [1, 2]',
+            r"'position_mm' of \[head\] must be three numbers in brackets",
+        ),
+        ('[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "spere"', "Unknown shape 'spere'; did you mean 'sphere'"),
+        (
+            '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"',
+            r"\[\[object\]\] of scene 'a' needs the key 'radius_mm'",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = -1',
+            "radius of a sphere must be positive",
+        ),
+        (
+            '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = 1\ncolour = "red"',
+            "Unknown key of .*'colour'",
+        ),
+        ('[[scene]]\nlabel="a"\n[[scene]]\nlabel="a"', "several scenes have the label 'a'"),
+        ('[array]\nspecies = "mous"\n[[scene]]\nlabel="a"', "Unknown species 'mous'; did you mean 'mouse'"),
+        ('[array]\nwhiskers = "C9"\n[[scene]]\nlabel="a"', "Unknown whisker 'C9'"),
+        ('[frames]\ncount = 1.5\n[[scene]]\nlabel="a"', r"'count' of \[frames\] must be a whole number"),
+        ("scene = 3", "must be a list of tables"),
+        ("array = 3", "must be a table"),
+    ],
+)
+def test_mistakes_in_a_scene_file_are_named_with_the_file(tmp_path, text, message):
+    with pytest.raises(UsageError, match=message) as caught:
+        load_scene(_write(tmp_path, text))
+    assert "pole.toml" in str(caught.value)
+
+
+def test_a_file_that_is_not_toml_is_refused(tmp_path):
+    with pytest.raises(DataError, match="cannot be read as TOML"):
+        load_scene(_write(tmp_path, "= ="))
+
+
+def test_a_missing_scene_file_is_named(tmp_path):
+    with pytest.raises(DataFileNotFoundError, match=r"no scene file .*gone\.toml"):
+        load_scene(tmp_path / "gone.toml")
+
+
+def test_the_frames_table_sets_rate_filter_axes_and_clip(tmp_path):
+    table = "rate_hz = 100\naverage = 10\nlowpass_hz = 40\nphase = 'causal'\naxes = 'follicle'\nclip_newton = 1"
+    frames = load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", table))).scenes[0].frames
+    assert frames == Frames(0.0, 0.01, 10, 10, lowpass=40.0, phase="causal", axes="follicle", clip=1.0)
+    both = POLE.replace("interval_ms = 1", "interval_ms = 1\nrate_hz = 1000")
+    with pytest.raises(UsageError, match="interval_ms or rate_hz, not both"):
+        load_scene(_write(tmp_path, both))
+    with pytest.raises(UsageError, match=r"'rate_hz' of .frames. must be positive"):
+        load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "rate_hz = 0")))
+    with pytest.raises(UsageError, match="did you mean 'lowpass_hz'"):
+        load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "lowpas_hz = 40")))
+
+
+MOVING = """
+[array]
+whiskers = "C1,C2"
+[head]
+times_ms = [0, 100, 2000]
+path_mm = [[0, 0, 0], [1, 0, 0], [1, 2, 0]]
+path_deg = [[0, 0, 0], [0, 0, 90], [0, 0, 90]]
+[[animal]]
+name = "b"
+[animal.array]
+species = "rat"
+whiskers = "C*"
+[animal.head]
+position_mm = [50, 0, 0]
+[animal.whisking]
+kind = "still"
+[[scene]]
+label = "crowd"
+"""
+
+
+def test_a_scene_file_moves_heads_and_holds_several_animals(tmp_path):
+    (scene,) = load_scene(_write(tmp_path, MOVING)).scenes
+    assert scene.names[:3] == ("a:C1", "a:C2", "b:C0")
+    assert scene.head.motion.times == pytest.approx((0, 0.1, 2))
+    assert scene.head.motion.displacements[2] == pytest.approx((1e-3, 2e-3, 0))
+    assert scene.head.motion.rotations[1] == pytest.approx((0, 0, math.pi / 2))
+    (other,) = scene.others
+    assert other.head.position == pytest.approx((0.05, 0, 0))
+    assert other.whisking == Still()
+    assert load_scene(_write(tmp_path, MOVING), whiskers="C1").scenes[0].names == ("a:C1", "b:C1")
+    assert load_scene(_write(tmp_path, MOVING), whiskers="b:C3").scenes[0].names == ("C3",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("times_ms = [0, 100, 2000]\n", "", r"\[head\] needs the key 'times_ms' beside its path"),
+        ("times_ms = [0, 100, 2000]", "times_ms = 3", "'times_ms' of .* must be a list"),
+        ("[1, 2, 0]]", "[1, 2]]", "'path_mm' of .* must be three numbers in brackets"),
+        ('name = "b"\n', "", r"\[\[animal\]\] needs the key 'name'"),
+        ('name = "b"', 'name = "a"', "need different names"),
+    ],
+)
+def test_mistakes_in_moving_scenes_are_named(tmp_path, old, new, message):
+    with pytest.raises(UsageError, match=message):
+        load_scene(_write(tmp_path, MOVING.replace(old, new)))
+
+
+def _object_motion(tmp_path, keys):
+    text = f'[[scene]]\nlabel = "a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = 1\n{keys}\n'
+    return load_scene(_write(tmp_path, text)).scenes[0].objects[0].motion
+
+
+def test_an_object_turns_or_follows_keyframes(tmp_path):
+    assert _object_motion(tmp_path, "") == Still()
+    spin = _object_motion(tmp_path, "spin_deg_s = [0, 0, 180]\nspin_onset_ms = 20")
+    assert spin == Spin((0.0, 0.0, math.pi), 0.02)
+    assert _object_motion(tmp_path, "spin_deg_s = [0, 0, 180]").onset == Spin((0, 0, 1)).onset
+    path = _object_motion(
+        tmp_path, "times_ms = [0, 50]\npath_mm = [[0, 0, 0], [1, 0, 0]]\npath_deg = [[0, 0, 0], [0, 0, 90]]"
+    )
+    assert path == Path((0.0, 0.05), ((0, 0, 0), (1e-3, 0, 0)), ((0, 0, 0), (0, 0, math.pi / 2)))
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("spin_deg_s = [0, 0, 9]\nvelocity_mm_s = [1, 0, 0]", "takes a velocity, a spin or keyframes, not several"),
+        ("spin_deg_s = 9", "'spin_deg_s' of .* must be three numbers in brackets"),
+        ("spin_deg = [0, 0, 9]", "did you mean 'spin_deg_s'"),
+        ("path_mm = [[0, 0, 0], [1, 0, 0]]", "needs the key 'times_ms' beside its path"),
+    ],
+)
+def test_motions_of_objects_that_cannot_be_meant_are_refused(tmp_path, keys, message):
+    with pytest.raises(UsageError, match=message):
+        _object_motion(tmp_path, keys)

@@ -1,0 +1,151 @@
+import json
+import logging
+import os
+import shutil
+from collections import namedtuple
+
+import pytest
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.stimuli.sweeps import local_pool
+from brainbench.stimuli.sweeps.generation import generate
+from tests.factories.sweep_batches import files_of, small_plan
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return small_plan(("brick:4", "cone:4"), shard_size=4)
+
+
+@pytest.fixture(scope="module")
+def unbroken(plan, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("unbroken")
+    generate(plan, folder, workers=1)
+    return folder
+
+
+def test_the_manifest_tells_of_every_shard_object_and_split(plan, unbroken):
+    manifest = json.loads((unbroken / "manifest.json").read_text())
+    assert manifest["config_hash"] == plan.config_hash
+    assert manifest["sweeps"] == 32
+    assert {split: item["sweeps"] for split, item in manifest["splits"].items()} == {
+        "train": 16, "validation": 8, "test": 8,
+    }  # fmt: skip
+    assert [item["name"] for item in manifest["shards"]] == sorted(
+        (path.name for path in unbroken.glob("*.h5")), key=[task.name for task in plan.shards].index
+    )
+    assert sum(item["sweeps"] for item in manifest["shards"]) == 32
+    assert all(item["bytes"] == (unbroken / item["name"]).stat().st_size for item in manifest["shards"])
+    brick = manifest["objects"]["brick-0"]
+    assert brick["label"] == "brick"
+    assert len(brick["hash"]) == 16
+    assert sum(brick["sweeps"].values()) == 4
+    assert manifest["unstable"] == manifest["unusable"] == 0
+    assert 0 < manifest["steps"] < manifest["steps_in_full"] + 1
+    assert "time" not in manifest["provenance"]
+
+
+def test_shards_that_are_there_are_left_alone_and_missing_ones_are_made_again(plan, unbroken, tmp_path):
+    folder = tmp_path / "set"
+    shutil.copytree(unbroken, folder)
+    (folder / "manifest.json").unlink()
+    (folder / plan.shards[1].name).unlink()
+    # A kill leaves this.
+    (folder / ".train-00001-0123456789abcdef.h5").write_bytes(b"half a shard")
+    kept = folder / plan.shards[0].name
+    before = kept.stat().st_mtime_ns
+    seen = []
+    generate(plan, folder, workers=1, progress=lambda *told: seen.append(told))
+    assert seen == [(4, 4, "simulating sweeps")]
+    assert kept.stat().st_mtime_ns == before
+    assert files_of(folder) == files_of(unbroken)
+
+
+def test_a_shard_cut_off_by_a_power_cut_is_made_again(plan, unbroken, tmp_path):
+    folder = tmp_path / "set"
+    shutil.copytree(unbroken, folder)
+    os.truncate(folder / plan.shards[2].name, 300)
+    generate(plan, folder, workers=1)
+    assert files_of(folder) == files_of(unbroken)
+
+
+def test_the_pipeline_behind_a_gpu_writes_the_same_bytes(plan, unbroken, tmp_path, monkeypatch):
+    monkeypatch.setattr(local_pool, "_pool", _threads)
+    shutil.copy(unbroken / "config.json", tmp_path)
+    done = []
+    local_pool.run_pipelined(plan.shards, tmp_path, 2, done.append)
+    assert sum(done) == 32
+    expected = {name: data for name, data in files_of(unbroken).items() if name != "manifest.json"}
+    assert files_of(tmp_path) == expected
+
+
+def _threads(processes):
+    """A pool of threads in place of one of processes: quick to start."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    return ThreadPoolExecutor(processes)
+
+
+def test_several_processes_write_the_same_bytes(plan, unbroken, tmp_path):
+    generate(plan, tmp_path / "set", workers=2)
+    assert files_of(tmp_path / "set") == files_of(unbroken)
+
+
+def test_another_data_set_in_the_folder_is_refused_and_named(unbroken, tmp_path):
+    with pytest.raises(UsageError, match=r"begun with other seed, whiskers"):
+        generate(small_plan(("brick:4", "cone:4"), shard_size=4, seed=3, whiskers="C2"), unbroken)
+    (tmp_path / "thesis.docx").write_text("")
+    with pytest.raises(UsageError, match=r"not empty and holds no data set of sweeps \(it has 'thesis.docx'\)"):
+        generate(small_plan(), tmp_path)
+
+
+def test_a_first_try_that_made_nothing_does_not_stand_in_the_way(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({"seed": 7}))
+    plan = small_plan(("brick:1",), limit=1)
+    generate(plan, tmp_path, workers=1)
+    assert json.loads((tmp_path / "config.json").read_text()) == json.loads(json.dumps(plan.config))
+
+
+def test_a_disk_that_is_too_small_is_said_before_anything_is_simulated(tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(1e9, 1e9 - 60e6, 60e6))
+    with pytest.raises(DataError, match=r"The 16 sweeps still to be made take .* has 60 MB free; choose another"):
+        generate(small_plan(), tmp_path / "set")
+    assert not list((tmp_path / "set").glob("*.h5"))
+
+
+def test_two_runs_do_not_write_one_folder_at_a_time(plan, unbroken):
+    import fcntl
+
+    handle = os.open(unbroken, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(UsageError, match="Another process is writing"):
+            generate(plan, unbroken)
+    finally:
+        os.close(handle)
+    assert generate(plan, unbroken)["sweeps"] == 32
+
+
+def test_an_object_that_changed_between_shards_is_found(tmp_path):
+    plan = small_plan(("brick:1",), split="sweep", shard_size=2)
+    folder = tmp_path / "set"
+    generate(plan, folder, workers=1)
+    import h5py
+
+    with h5py.File(folder / plan.shards[0].name, "r+") as file:
+        file["object_hash"][0] = b"0" * 16
+    with pytest.raises(DataError, match="'brick-0' was not built alike"):
+        generate(plan, folder, workers=1)
+
+
+def test_the_remaining_time_is_logged(tmp_path, caplog):
+    with caplog.at_level(logging.INFO, logger="brainbench.stimuli.sweeps.generation"):
+        generate(small_plan(("brick:1",), limit=1), tmp_path / "set")
+    assert "1 of 1 sweeps" in caplog.text
+    assert "sweeps/s, about 0 s left" in caplog.text
+
+
+def test_no_workers_are_refused(tmp_path):
+    with pytest.raises(UsageError, match="workers must be at least 1"):
+        generate(small_plan(), tmp_path, workers=0)

@@ -1,0 +1,114 @@
+import math
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli import Fidelity
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
+from tests.factories.sweep_batches import small_plan
+
+FAST = Fidelity.preset("fast")
+
+
+def _all(plan, name):
+    return np.concatenate([getattr(task, name) for task in plan.shards])
+
+
+def test_every_sweep_is_in_exactly_one_shard():
+    plan = small_plan(("brick:7", "cone:12"), shard_size=10)
+    assert sorted(_all(plan, "index").tolist()) == list(range(19 * 4))
+    assert all(len(task) <= 10 for task in plan.shards)
+    assert plan.sweeps == 76
+
+
+def test_no_object_is_in_two_splits():
+    plan = small_plan(("brick:20", "cone:20"), shard_size=7)
+    where = {}
+    for task in plan.shards:
+        for item in task.objects:
+            where.setdefault(item.name, set()).add(task.split)
+    assert len(where) == 40
+    assert all(len(splits) == 1 for splits in where.values())
+    by_sweep = small_plan(("brick:20", "cone:20"), shard_size=7, split="sweep")
+    objects = [{item.name for task in by_sweep.shards if task.split == name for item in task.objects} for name in
+               ("train", "test")]  # fmt: skip
+    assert objects[0] & objects[1]
+
+
+def test_a_shard_knows_which_object_and_sweep_each_of_its_numbers_is():
+    plan = small_plan(("brick:4", "cone:4"), shard_size=6)
+    names = list(plan.objects)
+    for task in plan.shards:
+        assert (np.diff(task.owner) >= 0).all()
+        for owner, within, index in zip(task.owner, task.within, task.index, strict=True):
+            assert names[index // 4] == task.objects[owner].name
+            assert index % 4 == within
+
+
+def test_classes_mix_within_the_shards():
+    plan = small_plan(("brick:30", "cone:30"), shard_size=40)
+    first = plan.shards[0]
+    assert {item.label for item in first.objects} == {"brick", "cone"}
+
+
+def test_a_sample_is_a_random_fraction_and_a_limit_the_first_sweeps():
+    sampled = small_plan(("brick:50",), sample=0.1)
+    assert sampled.sweeps == 20
+    assert len(np.unique(_all(sampled, "index") // 4)) > 10
+    limited = small_plan(("brick:50",), limit=2)
+    assert set(_all(limited, "within").tolist()) == {0, 1}
+    # The split does not depend on what is left out.
+    full = small_plan(("brick:50",))
+    np.testing.assert_array_equal(full.splits, sampled.splits)
+
+
+def test_the_published_grids_are_planned_quickly_and_small():
+    objects = resolve_objects(["procedural-24:40"])
+    plan = GenerationPlan(
+        "thesis-high", GRIDS["thesis-high"], objects, Settings(FAST, backend="mujoco", shard_size=2048)
+    )
+    assert plan.sweeps == 960 * 208
+    assert sum(map(len, plan.shards)) == plan.sweeps
+    assert len(plan.shards) == sum(math.ceil(split * 208 * 24 / 2048) for split in (32, 4, 4))
+    low = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, Settings(FAST))
+    assert sum(task.bytes for task in low.shards) == pytest.approx(960 * 16 * 110 * 30 * 24, rel=0.05)
+
+
+def test_what_determines_the_bytes_is_in_the_hash():
+    plans = [
+        small_plan(),
+        small_plan(seed=1),
+        small_plan(split="sweep"),
+        small_plan(shard_size=5),
+        small_plan(limit=1),
+        small_plan(whiskers="C2"),
+        small_plan(fidelity=Fidelity.preset("balanced")),
+        small_plan(("brick:2", "cone:3")),
+    ]
+    assert len({plan.config_hash for plan in plans}) == len(plans)
+    assert small_plan().config_hash == plans[0].config_hash
+
+
+def test_shards_are_small_where_sweeps_are_slow():
+    sizes = [Settings(FAST, backend=backend, device=device).sweeps_per_shard for backend, device in
+             (("bullet", "cpu"), ("mujoco", "cpu"), ("rod", "cpu"), ("rod", "cuda"))]  # fmt: skip
+    assert sizes == sorted(sizes)
+    assert len(set(sizes)) == 4
+    assert Settings(FAST, shard_size=7).sweeps_per_shard == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"split": "objects"}, "Unknown split 'objects'; did you mean 'object'"),
+        ({"sample": 1.5}, "sample is a fraction"),
+        ({"sample": 0.5, "limit": 2}, "not both"),
+        ({"limit": 0}, "limit must be at least 1"),
+    ],
+)
+def test_settings_out_of_range_are_named(options, message):
+    with pytest.raises(UsageError, match=message):
+        Settings(FAST, **options)

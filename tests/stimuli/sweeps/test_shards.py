@@ -1,0 +1,153 @@
+import dataclasses
+import io
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError
+from brainbench.core.files import hash_arrays
+from brainbench.stimuli import simulate
+from brainbench.stimuli.sweeps.manifest import is_whole
+from brainbench.stimuli.sweeps.shards import (
+    ALIGNMENT,
+    OK,
+    UNSTABLE,
+    UNUSABLE,
+    _write_all,
+    make_shard,
+    prepare_shard,
+    simulate_shard,
+    write_shard,
+)
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from tests.factories.sweep_batches import GRID, small_plan
+
+
+def test_a_shard_holds_the_simulated_forces_and_what_they_belong_to(tmp_path):
+    plan = small_plan(("brick:2", "cone"), whiskers="C2,C3", shard_size=100)
+    task = plan.shards[0]
+    assert make_shard(task, str(tmp_path)) == len(task)
+    scenes = SweepScenes(GRID, {name: item.load for name, item in plan.objects.items()}, whiskers="C2,C3")
+    with h5py.File(tmp_path / task.name) as file:
+        for row, index in enumerate(file["sweep"][:].tolist()):
+            dataset = simulate(scenes[index], fidelity="fast", backend="mujoco", cache=False)
+            np.testing.assert_array_equal(file["wrench"][row], dataset["wrench"].values[0])
+            name = file["object"].asstr()[file["owner"][row]]
+            assert file["class"].asstr()[file["label"][row]] == name.split("-")[0]
+            label = f"{name}/n{file['draw'][row]}_h{file['height'][row] * 1e3 + 0:g}_d{file['distance'][row] * 1e3:g}"
+            assert str(dataset["stimulus"].values[0]).startswith(label)
+        assert file["wrench"].shape == (len(task), 10, 2, 6)
+        assert file["status"][:].max() == OK
+        assert file["contact"][:].max() > 0
+        assert (file["time"][:] == GRID.frames.times).all()
+        assert file["row"][:].tolist() == [2, 2]
+        assert file["col"][:].tolist() == [2, 3]
+
+
+def test_the_forces_can_be_mapped_into_memory(tmp_path):
+    task = small_plan(("brick:5",), whiskers="C2,C3").shards[0]
+    make_shard(task, str(tmp_path))
+    path = tmp_path / task.name
+    with h5py.File(path) as file:
+        wrench, offset = file["wrench"][:], file["wrench"].id.get_offset()
+        assert file["wrench"].chunks is None
+        assert file["wrench"].compression is None
+    assert offset % ALIGNMENT == 0
+    np.testing.assert_array_equal(np.memmap(path, "<f4", "r", offset, wrench.shape), wrench)
+
+
+def test_xarray_opens_a_shard_with_named_axes(tmp_path):
+    import xarray as xr
+
+    task = small_plan().shards[0]
+    make_shard(task, str(tmp_path))
+    with xr.open_dataset(tmp_path / task.name, engine="h5netcdf") as dataset:
+        assert dataset["wrench"].dims == ("sweep", "time", "whisker", "channel")
+        assert dataset["speed"].dims == ("sweep",)
+        assert dataset["object_class"].dims == ("object",)
+
+
+def test_the_same_shard_has_the_same_bytes_and_its_hash_tells_of_its_content(tmp_path):
+    task = small_plan().shards[0]
+    for folder in ("a", "b"):
+        make_shard(task, str(tmp_path / folder), workers=1 + (folder == "b"))
+    assert (tmp_path / "a" / task.name).read_bytes() == (tmp_path / "b" / task.name).read_bytes()
+    content = simulate_shard(task, prepare_shard(task))
+    with h5py.File(tmp_path / "a" / task.name) as file:
+        stored = {name: file[name][:] for name in content.arrays}
+        assert hash_arrays(stored) == hash_arrays(content.arrays) == file.attrs["content_hash"]
+    stored["wrench"][0, 0, 0, 0] += 1
+    assert hash_arrays(stored) != hash_arrays(content.arrays)
+
+
+def test_unstable_sweeps_are_marked_and_counted(tmp_path):
+    grid = dataclasses.replace(GRID, start=-0.006)
+    task = small_plan(("brick:2",), grid=grid, whiskers="C2,C3").shards[0]
+    make_shard(task, str(tmp_path))
+    with h5py.File(tmp_path / task.name) as file:
+        status, wrench, reasons = file["status"][:], file["wrench"][:], file["reason"].asstr()[:]
+        bad = (status == UNSTABLE).any(axis=1)
+        assert 0 < file.attrs["unstable"] == bad.sum() < len(bad)
+    wrench = np.moveaxis(wrench, 1, 2)
+    assert np.isnan(wrench[status == UNSTABLE][:, -1]).all()
+    assert np.isfinite(wrench[status == OK]).all()
+    assert all(bool(reason) == is_bad for reason, is_bad in zip(reasons, bad, strict=True))
+
+
+def _broken():
+    raise DataError("it has no volume")
+
+
+def test_sweeps_of_an_object_that_cannot_be_built_are_marked_and_the_others_are_there(tmp_path):
+    task = small_plan(("brick:2",), shard_size=100, split="sweep").shards[0]
+    broken = dataclasses.replace(task.objects[1], load=_broken)
+    task = dataclasses.replace(task, objects=(task.objects[0], broken))
+    make_shard(task, str(tmp_path))
+    with h5py.File(tmp_path / task.name) as file:
+        mine = file["owner"][:] == 1
+        assert (file["status"][:][mine] == UNUSABLE).all()
+        assert (file["status"][:][~mine] == OK).all()
+        assert np.isnan(file["wrench"][:][mine]).all()
+        assert np.isfinite(file["wrench"][:][~mine]).all()
+        assert set(file["reason"].asstr()[:][mine]) == {"it has no volume"}
+        assert file.attrs["unusable"] == mine.sum()
+
+
+def test_thousands_of_classes_fit_into_a_shard(tmp_path):
+    task = small_plan(("brick:1",), limit=1).shards[0]
+    classes = ("brick", *(f"a class of its own, number {number}" for number in range(5000)))
+    task = dataclasses.replace(task, classes=classes, config={**task.config, "classes": list(classes)})
+    make_shard(task, str(tmp_path))
+    with h5py.File(tmp_path / task.name) as file:
+        assert tuple(file["class"].asstr()[:]) == classes
+        assert json.loads(file.attrs["config"])["seed"] == 0
+
+
+@pytest.mark.parametrize("kept", [0, 100, 5000])
+def test_a_shard_that_was_cut_off_is_not_whole(tmp_path, kept):
+    task = small_plan().shards[0]
+    write_shard(simulate_shard(task, prepare_shard(task)), tmp_path)
+    path = tmp_path / task.name
+    assert is_whole(path, task)
+    path.write_bytes(path.read_bytes()[:kept])
+    assert not is_whole(path, task)
+
+
+def test_a_shard_of_another_data_set_is_not_taken_for_ones_own(tmp_path):
+    task = small_plan().shards[0]
+    make_shard(task, str(tmp_path))
+    other = small_plan(seed=1).shards[0]
+    with pytest.raises(DataError, match="belongs to another data set"):
+        is_whole(tmp_path / task.name, other)
+
+
+def test_a_write_that_the_system_cuts_short_goes_on():
+    class Short(io.BytesIO):
+        def write(self, data):
+            return super().write(data[:7])
+
+    stream, array = Short(), np.arange(100, dtype=np.float32).reshape(5, 20)
+    _write_all(stream, array)
+    assert stream.getvalue() == array.tobytes()

@@ -1,0 +1,130 @@
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.stimuli import load_stimuli, read_stimulus_set, to_grid, write_stimulus_set
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.scenes.recipes import get_recipe
+from brainbench.stimuli.simulation import simulate
+from tests.factories.engines import FakeBackend
+
+OPTIONS = {"fidelity": Fidelity(), "backend": FakeBackend()}
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return simulate(get_recipe("rodgers", whiskers="C0-C3,D1").scenes, **OPTIONS)
+
+
+def _arrays(path, **content):
+    with h5py.File(path, "w") as file:
+        for key, value in content.items():
+            file[key] = value
+    return path
+
+
+def test_a_recipe_name_gives_labelled_input():
+    stimuli = load_stimuli("rodgers", whiskers="C0-C3", **OPTIONS)
+    assert stimuli.labels[0] == "convex-close"
+    assert stimuli.input.shape == (6, 22, 30, 5, 7)
+    assert stimuli.input.dtype == np.float32
+    assert "Rodgers (2022)" in stimuli.description
+    assert repr(stimuli).startswith("Stimuli('convex-close', 'convex-medium'")
+    assert "input 6 × 22 × 30 × 5 × 7" in repr(stimuli)
+    assert stimuli.content_hash == stimuli.dataset.attrs["content_hash"]
+
+
+def test_a_scene_file_is_simulated(tmp_path):
+    path = tmp_path / "one.toml"
+    path.write_text('[array]\nwhiskers = "C2"\n[[scene]]\nlabel = "free"\n')
+    stimuli = load_stimuli(str(path), **OPTIONS)
+    assert stimuli.labels == ("free",)
+    assert stimuli.description == "one"
+
+
+def test_a_stimulus_set_survives_the_disk_unchanged(tmp_path, dataset):
+    path = write_stimulus_set(dataset, tmp_path / "set.h5")
+    xr.testing.assert_identical(read_stimulus_set(path), dataset)
+    stimuli = load_stimuli(path)
+    np.testing.assert_array_equal(stimuli.input, to_grid(dataset))
+    assert stimuli.content_hash == dataset.attrs["content_hash"]
+
+
+def test_whiskers_of_a_finished_set_can_be_chosen(tmp_path, dataset):
+    path = write_stimulus_set(dataset, tmp_path / "set.nc")
+    stimuli = load_stimuli(path, whiskers="C*")
+    assert list(stimuli.dataset["whisker"].values) == ["C0", "C1", "C2", "C3"]
+    assert stimuli.content_hash != dataset.attrs["content_hash"]
+    assert load_stimuli(dataset, whiskers="C*").content_hash == stimuli.content_hash
+    assert load_stimuli(load_stimuli(dataset), whiskers="C*").content_hash == stimuli.content_hash
+    with pytest.raises(UsageError, match="Unknown whisker 'A0'"):
+        load_stimuli(path, whiskers="A0")
+
+
+def test_choosing_whiskers_leaves_the_data_set_of_the_caller_alone(dataset):
+    before = dataset.attrs["content_hash"]
+    load_stimuli(dataset, whiskers="C2")
+    assert dataset.attrs["content_hash"] == before
+
+
+def test_arrays_are_taken_as_they_are(tmp_path):
+    values = np.random.default_rng(0).normal(size=(3, 4, 5))
+    path = _arrays(tmp_path / "a.h5", stimuli=values, labels=["one", "two", "three"])
+    stimuli = load_stimuli(path)
+    np.testing.assert_array_equal(stimuli.input, values.astype(np.float32))
+    assert stimuli.labels == ("one", "two", "three")
+    assert stimuli.dataset is None
+    other = _arrays(tmp_path / "b.h5", stimuli=values, labels=["one", "three", "two"])
+    assert load_stimuli(other).content_hash != stimuli.content_hash
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"x": np.zeros((2, 3))}, r"lacks stimuli and labels.*It holds: 'x \[2, 3\]'"),
+        ({"stimuli": np.zeros((2, 3))}, "lacks labels"),
+        ({"stimuli": np.zeros(2), "labels": ["a", "b"]}, r"must be numbers of shape \[K, T, …\]; it is \[2\]"),
+        ({"stimuli": np.zeros((2, 3)), "labels": ["a"]}, r"must be 2 texts, one per stimulus; it is \[1\]"),
+        ({"stimuli": np.zeros((2, 3)), "labels": [1, 2]}, "must be 2 texts"),
+        ({"stimuli": np.zeros((2, 3)), "labels": ["a", "a"]}, "names a stimulus twice"),
+        ({"stimuli": np.full((2, 3), np.nan), "labels": ["a", "b"]}, "not finite, in 'a', 'b'"),
+    ],
+)
+def test_an_array_file_that_does_not_fit_says_what_it_holds(tmp_path, content, message):
+    path = _arrays(tmp_path / "bad.h5", **content)
+    with pytest.raises(DataError, match=message):
+        load_stimuli(path)
+
+
+def test_whiskers_of_an_array_file_have_no_names(tmp_path):
+    path = _arrays(tmp_path / "a.h5", stimuli=np.zeros((1, 2)), labels=["a"])
+    with pytest.raises(UsageError, match="leave the selection at 'all'"):
+        load_stimuli(path, whiskers="C2")
+
+
+def test_an_unknown_name_suggests_the_nearest_and_the_kinds_of_files():
+    with pytest.raises(UsageError, match=r"Unknown stimuli 'rodger'; did you mean 'rodgers'.*scene file"):
+        load_stimuli("rodger")
+
+
+def test_files_that_are_missing_or_damaged_are_named(tmp_path, dataset):
+    with pytest.raises(DataFileNotFoundError, match=r"no stimulus file .*gone\.h5"):
+        load_stimuli(tmp_path / "gone.h5")
+    text = tmp_path / "text.h5"
+    text.write_text("hello")
+    with pytest.raises(DataError, match=r"text\.h5.* cannot be read as HDF5"):
+        load_stimuli(text)
+    path = write_stimulus_set(dataset, tmp_path / "set.h5")
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(DataError, match=r"set\.h5"):
+        load_stimuli(path)
+
+
+def test_an_edited_set_is_noticed(tmp_path, dataset):
+    path = write_stimulus_set(dataset, tmp_path / "set.h5")
+    with h5py.File(path, "r+") as file:
+        file["wrench"][0, 0, 0, 0] += 1
+    with pytest.raises(DataError, match="do not match the content hash"):
+        load_stimuli(path)

@@ -1,0 +1,108 @@
+"""The chain of links against the rod it stands for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.validation.references import natural_frequencies
+from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
+NEEDLE = Whisker(0.0056, 31e-6, 1.5e-6, young_modulus=5e9, density=1300.0, damping_ratio=0.32)
+
+
+@pytest.mark.parametrize("links", [3, 10, 25])
+def test_mass_and_moment_of_inertia_about_the_base_are_those_of_the_rod(links):
+    chain = build_chain(C2, links)
+    assert chain.masses.sum() == pytest.approx(C2.mass, rel=1e-12)
+    centres = chain.nodes[:-1] + chain.centres
+    inertia = np.sum(chain.masses * centres**2 + chain.inertias[:, 1])
+    rod = quad(lambda s: C2.linear_density(s) * (s**2 + C2.radius(s) ** 2 / 4), 0, C2.arc_length, epsabs=0)[0]
+    assert inertia == pytest.approx(rod, rel=1e-10)
+
+
+def test_a_link_of_a_cylinder_has_the_inertia_of_a_cylinder():
+    chain = build_chain(replace(C2, tip_radius=48.365e-6, density=1260.0), 4)
+    mass, length, radius = chain.masses[0], chain.lengths[0], 48.365e-6
+    assert chain.inertias[0, 0] == pytest.approx(mass * radius**2 / 2, rel=1e-12)
+    assert chain.inertias[0, 1] == pytest.approx(mass * (3 * radius**2 + length**2) / 12, rel=1e-12)
+
+
+def test_uniform_joints_stand_for_their_cells_with_gregory_end_weights():
+    chain = build_chain(replace(C2, tip_radius=48.365e-6), 12)
+    cells = float(C2.bending_stiffness(0.0)) / chain.stiffness / (C2.arc_length / 12)
+    np.testing.assert_allclose(cells[:3], [3 / 8, 7 / 6, 23 / 24], rtol=1e-12)
+    np.testing.assert_allclose(cells[3:-1], 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("links", "tolerance"), [(10, 0.002), (20, 0.0002)])
+def test_static_compliance_under_a_tip_load_is_that_of_the_rod(links, tolerance):
+    chain = build_chain(C2, links)
+    lever = C2.arc_length - chain.nodes[:-1]
+    exact = quad(lambda s: (C2.arc_length - s) ** 2 / C2.bending_stiffness(s), 0, C2.arc_length, epsabs=0)[0]
+    assert np.sum(lever**2 / chain.stiffness) == pytest.approx(exact, rel=tolerance)
+
+
+@pytest.mark.parametrize(("links", "tolerance"), [(10, (0.0015, 0.003, 0.005)), (20, (1e-4, 3e-4, 3e-4))])
+def test_natural_frequencies_are_those_of_the_rod(links, tolerance):
+    found = build_chain(C2, links).frequencies(3) / (2 * np.pi)
+    assert np.all(np.abs(found / natural_frequencies(C2) - 1) < tolerance)
+
+
+@given(
+    links=st.integers(2, 40),
+    tip=st.floats(1.5e-6, 9e-5),
+    length=st.floats(0.004, 0.06),
+    curvature=st.floats(-40, 40),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_joint_is_elastic_and_every_link_has_mass_whatever_the_taper(links, tip, length, curvature):
+    whisker = Whisker(length, 9e-5, tip, young_modulus=4e9, density=1300.0, damping_ratio=0.2, curvature=curvature)
+    chain = build_chain(whisker, links)
+    assert (chain.stiffness > 0).all()
+    assert (chain.masses > 0).all()
+    assert (chain.inertias > 0).all()
+    assert ((chain.centres > 0) & (chain.centres < chain.lengths)).all()
+
+
+def test_a_needle_with_a_steep_tip_still_has_its_first_frequency_and_its_compliance():
+    chain = build_chain(NEEDLE, 10)
+    assert chain.frequencies()[0] / (2 * np.pi) == pytest.approx(natural_frequencies(NEEDLE, 1)[0], rel=0.005)
+    at = 0.7 * NEEDLE.arc_length
+    exact = quad(lambda s: (at - s) ** 2 / NEEDLE.bending_stiffness(s), 0, at, epsabs=0)[0]
+    lever = np.maximum(at - chain.nodes[:-1], 0)
+    assert np.sum(lever**2 / chain.stiffness) == pytest.approx(exact, rel=0.01)
+
+
+@pytest.mark.parametrize("links", [2, 5, 20])
+def test_joints_lie_on_the_rest_curve_for_any_number_of_links(links):
+    chain = build_chain(replace(C2, curvature=25.0), links)
+    np.testing.assert_allclose(chain.points[:, 1], 25.0 * chain.points[:, 0] ** 2, rtol=1e-9, atol=1e-15)
+    headings = np.cumsum(chain.rest_angles)
+    steps = chain.lengths[:, None] * np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    np.testing.assert_allclose(np.cumsum(steps, axis=0), chain.points[1:], atol=1e-15)
+
+
+def test_damping_gives_the_first_mode_its_ratio_once_the_step_is_counted():
+    chain = build_chain(C2, 10)
+    omega = chain.frequencies()[0]
+    beta = chain.damping(1e-4) / chain.stiffness
+    np.testing.assert_allclose((beta + 1e-4) * omega / 2, 0.32, rtol=1e-9)
+    assert chain.achieved_damping_ratio(1e-4) == pytest.approx(0.32)
+
+
+def test_a_step_too_long_to_damp_so_little_is_told():
+    chain = build_chain(C2, 10)
+    assert (chain.damping(2e-3) == 0).all()
+    assert chain.achieved_damping_ratio(2e-3) == pytest.approx(chain.frequencies()[0] * 1e-3)
+
+
+def test_one_link_cannot_bend():
+    with pytest.raises(UsageError, match="at least 2 links"):
+        build_chain(C2, 1)

@@ -1,0 +1,76 @@
+"""One whisker's geometry against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+
+def _make_whisker(**changes):
+    values = {
+        "arc_length": 0.02,
+        "base_radius": 50e-6,
+        "tip_radius": 5e-6,
+        "young_modulus": 3e9,
+        "density": 1300.0,
+        "damping_ratio": 0.2,
+    }
+    return Whisker(**{**values, **changes})
+
+
+def test_a_cylinder_has_the_mass_and_stiffness_of_a_cylinder():
+    whisker = _make_whisker(tip_radius=50e-6)
+    assert whisker.mass == pytest.approx(1300 * math.pi * 50e-6**2 * 0.02, rel=1e-12)
+    assert whisker.bending_stiffness(0.01) == pytest.approx(3e9 * math.pi * 50e-6**4 / 4, rel=1e-12)
+
+
+def test_the_mass_of_a_cone_frustum_is_exact():
+    volume = math.pi * 0.02 / 3 * (50e-6**2 + 50e-6 * 5e-6 + 5e-6**2)
+    assert _make_whisker().mass == pytest.approx(1300 * volume, rel=1e-12)
+
+
+def test_mass_with_a_density_gradient_is_the_integral_of_the_linear_density():
+    whisker = _make_whisker(density=(1260.0, 1690.0))
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    s = (nodes + 1) / 2 * whisker.arc_length
+    assert whisker.mass == pytest.approx(np.dot(weights, whisker.linear_density(s)) * whisker.arc_length / 2, rel=1e-12)
+
+
+@given(curvature=st.floats(-80, 80), arc_length=st.floats(0.004, 0.06))
+def test_the_centre_line_is_the_parabola_measured_along_its_arc(curvature, arc_length):
+    whisker = _make_whisker(curvature=curvature, arc_length=arc_length)
+    x, y = whisker.centre_line(arc_length)
+    assert y == pytest.approx(curvature * x**2, abs=1e-15)
+    u = 2 * curvature * x
+    along = x if abs(u) < 1e-6 else (u * math.sqrt(1 + u * u) + math.asinh(u)) / (4 * curvature)
+    assert along == pytest.approx(arc_length, rel=1e-9)
+    assert math.tan(whisker.tangent_angle(arc_length)) == pytest.approx(u, rel=1e-9, abs=1e-12)
+
+
+def test_a_curvature_of_the_other_sign_mirrors_the_shape():
+    s = np.linspace(0, 0.02, 11)
+    up, down = _make_whisker(curvature=15.0).centre_line(s), _make_whisker(curvature=-15.0).centre_line(s)
+    np.testing.assert_allclose(down, up * [1, -1], atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"arc_length": -1.0}, "arc_length of a whisker must be positive"),
+        ({"tip_radius": 0.0}, "tip_radius of a whisker must be positive"),
+        ({"young_modulus": math.nan}, "young_modulus of a whisker must be a finite number"),
+        ({"density": (1.0, 2.0, 3.0)}, "one number or \\(base, tip\\)"),
+        ({"density": (1260.0, -1.0)}, "density of a whisker must be positive"),
+        ({"damping_ratio": -0.1}, "damping_ratio of a whisker must be zero or more"),
+        ({"curvature": math.inf}, "curvature of a whisker must be a finite number"),
+        ({"base_radius": 0.05}, "no slender rod"),
+    ],
+)
+def test_impossible_values_are_refused_by_name(changes, message):
+    with pytest.raises(UsageError, match=message):
+        _make_whisker(**changes)
