@@ -24,7 +24,7 @@ from brainbench.metrics.inference.bootstrap import _factors, _scores, animal_cou
 from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
 from brainbench.metrics.inference.multiple import sign_flip_p, step_down
 from brainbench.metrics.inference.permutation import label_orders
-from brainbench.metrics.inference.power import Design, _experiments
+from brainbench.metrics.inference.power import ExperimentDesign, _experiments
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.rdms.comparison import compare_all, features
 from brainbench.metrics.rdms.pairs import permuted_pairs
@@ -55,7 +55,7 @@ def null_statistics(simulations: int, layers: int, animals: int, seed: int) -> t
     rng = np.random.default_rng(seed)
     held, each = [], []
     for _ in range(0, simulations, 20):
-        model, brain = _experiments(rng, Design(animals=animals, effect=0.0, layers=layers), 20)
+        model, brain = _experiments(rng, ExperimentDesign(animals=animals, effect=0.0, layers=layers), 20)
         left, right = features(model, "pearson"), features(brain, "pearson")
         r = np.einsum("slnp,sap->snla", left[:, :, PAIRS], right, optimize=True)
         held.append(held_out(r).mean(axis=-1) if layers > 1 else r[:, :, 0].mean(axis=-1))
@@ -77,7 +77,7 @@ def p_values(simulations: int) -> Result:
     rng = np.random.default_rng(3)
     resampled = []
     for _ in range(simulations):
-        model, brain = _experiments(rng, Design(effect=0.0), 1)
+        model, brain = _experiments(rng, ExperimentDesign(effect=0.0), 1)
         resampled.append(t_interval(compare(model[0, 0], brain[0]), 0.9).low > 0)
     found = {
         "one layer": p_of(one),
@@ -126,8 +126,8 @@ def corrections(simulations: int) -> Result:
         rng = np.random.default_rng(count)
         alarms, naive, found, alone = [], [], [], []
         for _ in range(0, simulations, 20):
-            model, brain = _experiments(rng, Design(animals=5, effect=0.0, layers=count), 20)
-            true, _ = _experiments(rng, Design(animals=5, effect=0.0), 20)
+            model, brain = _experiments(rng, ExperimentDesign(animals=5, effect=0.0, layers=count), 20)
+            true, _ = _experiments(rng, ExperimentDesign(animals=5, effect=0.0), 20)
             mean = features(brain, "pearson").mean(axis=1)
             null = np.einsum("slnp,sp->sln", features(model, "pearson")[:, :, PAIRS], mean, optimize=True)
             strong = features(brain, "pearson").mean(axis=1) + 0.15 * true[:, 0] / np.sqrt(15)
@@ -406,7 +406,7 @@ def equivalence(simulations: int) -> Result:
 
 def faults(simulations: int) -> Result:
     from brainbench.datasets.synthetic.animals import Design as Recordings
-    from brainbench.datasets.synthetic.animals import Geometry, simulate
+    from brainbench.datasets.synthetic.animals import ResponseGeometry, simulate
 
     rows = []
     for imbalance in (0.0, 0.5):
@@ -414,7 +414,7 @@ def faults(simulations: int) -> Result:
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
             values, reliable = [], []
             for study in range(simulations):
-                geometry = Geometry.from_features(np.random.default_rng(study).normal(size=(6, 4)))
+                geometry = ResponseGeometry.from_features(np.random.default_rng(study).normal(size=(6, 4)))
                 animals = simulate(geometry, design, seed=study, faults=given)
                 blocks = [[TrialBlock(b.responses[:, 0], b.labels, b.keys) for b in a.blocks] for a in animals]
                 score = score_animals([subject_rdm(str(i), block, 6, splits=50) for i, block in enumerate(blocks)])

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from benchmarks.results import table, write_section
-from robotics_bridge.physics import Geometry, HandState, Scene
+from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors import ElastomerTaxel, Layer, Probes, SensorSuite
 
 MILLIMETRES_PER_PIXEL = 0.0532
@@ -89,7 +89,7 @@ class Pad:
     def __init__(self, places: np.ndarray) -> None:
         ball = Geometry(name="ball", link="ball", kind="sphere", size=(BALL,))
         pad = Geometry(name="pad", link="pad", kind="box", size=(0.02, 0.02, 0.005), position=(0, 0, -0.005))
-        self.scene = Scene(("world", "pad", "ball"), (pad, ball))
+        self.scene = TouchScene(("world", "pad", "ball"), (pad, ball))
         flat = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
         # Sources on a fine lattice, since few of the camera's markers lie inside the contact.
         self.count = len(places)

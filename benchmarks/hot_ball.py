@@ -19,7 +19,7 @@ from benchmarks.results import table, write_section
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.tasks.hot_ball import CELLS, published
-from robotics_bridge.tasks.thermometers import Thermal, Thermometers
+from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 
 PUBLISHED = {(150.0, 0.5, 500.0), (150.0, 0.5, 5000.0)}
 """Cells with a check mark in figure 4.8."""
@@ -44,7 +44,7 @@ class TouchAndHold:
         self._step = 0
 
     def __call__(self, _: Any) -> torch.Tensor:
-        from robotics_bridge.tasks.rotations import rotate
+        from brainbench.core.rotations import rotate
 
         env = self.env
         rows = torch.arange(env.num_envs)
@@ -86,7 +86,7 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
     env.target.copy_(torch.arange(envs) % task.copies)
     grids = {
         (law, *cell): Thermometers(
-            env, Thermal(conductivity=cell[0], emissivity=cell[1], heat=cell[2], conduction=law), chooses=False
+            env, ThermalSettings(conductivity=cell[0], emissivity=cell[1], heat=cell[2], conduction=law), chooses=False
         )
         for law in ("thesis", "physical")
         for cell in CELLS

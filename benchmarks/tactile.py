@@ -46,7 +46,7 @@ from benchmarks.tactile_scene import (
 )
 from benchmarks.tactile_tables import plot_scaling, tables
 from brainbench.core.devices import pick_device, warp
-from robotics_bridge.physics import HandState, Scene
+from robotics_bridge.physics import HandState, TouchScene
 from robotics_bridge.sensors import ContactDepthProbe, ElastomerTaxel, KinematicTaxel, Probes, SensorSuite
 
 ROOFLINE = {False: 0.018e-3, True: 0.085e-3}
@@ -83,7 +83,7 @@ def measure(function: Callable[[], object], device: str, groups: int = 7) -> flo
     return statistics.median(run(repeats) for _ in range(groups))
 
 
-def timed(scene: Scene, config: dict, state: HandState, device: str) -> tuple[float, float, SensorSuite]:
+def timed(scene: TouchScene, config: dict, state: HandState, device: str) -> tuple[float, float, SensorSuite]:
     """Seconds of an update, seconds of the first one, and the suite."""
     suite = SensorSuite(scene, config, num_envs=state.num_envs, device=device)
     start = time.perf_counter()
@@ -196,7 +196,7 @@ def part_scaling(options: argparse.Namespace) -> Iterable[Row]:
     found, scene = settled(min(envs, 64), options.device, options.settle, options.brought), scene_of()
     state = restore(found, envs, options.device)
 
-    def case(axis: str, value: int, scene: Scene, config: dict, where: HandState) -> Row:
+    def case(axis: str, value: int, scene: TouchScene, config: dict, where: HandState) -> Row:
         seconds, _first, _suite = timed(scene, config, where, options.device)
         return {"case": axis, "value": value, "envs": where.num_envs, "ms": seconds * 1e3}
 

@@ -18,7 +18,7 @@ from scipy.integrate import dblquad
 from benchmarks.results import table, write_section
 from benchmarks.tactile_scene import bumpy_box
 from brainbench.cli.tactile.checks import CHECKS
-from robotics_bridge.physics import Geometry, HandState, Scene
+from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors import (
     ContactDepthProbe,
     ElastomerTaxel,
@@ -46,7 +46,7 @@ def read(
 ) -> tuple[dict[str, np.ndarray], SensorSuite]:
     """Readings of sensors on the pad that solids on links of their own touch from places [B, S, 3] (m)."""
     at = np.asarray(at, float).reshape(-1, len(solids), 3)
-    scene = Scene(("world", "hand", *(solid.link for solid in solids)), (PAD, *solids))
+    scene = TouchScene(("world", "hand", *(solid.link for solid in solids)), (PAD, *solids))
     suite = SensorSuite(scene, sensors, num_envs=len(at), device=device)
     pose = np.zeros((len(at), len(scene.links), 7))
     pose[..., 6] = 1
@@ -166,7 +166,7 @@ def steps(device: str) -> Row:
     cells = []
     for dt in (1e-5, 1e-3, 1e-2, 0.1):
         grid = TemperatureGrid(link="hand", cells=(4, 4, 4), convection=0.0, radiates=False)
-        scene = Scene(("world", "hand"), (PAD,))
+        scene = TouchScene(("world", "hand"), (PAD,))
         suite = SensorSuite(scene, {"t": grid}, num_envs=1, device=device)
         state = HandState.empty(1, 2, 0, device)
         suite.update(state, dt)
@@ -206,7 +206,7 @@ def crowd(device: str) -> Row:
 def empty(device: str) -> Row:
     """Nothing to touch."""
     sensors = {"d": ContactDepthProbe(link="hand", probes=GRID), "s": SurfaceDistanceProbe(link="hand", probes=GRID)}
-    scene = Scene(("world", "hand"), (PAD,))
+    scene = TouchScene(("world", "hand"), (PAD,))
     suite = SensorSuite(scene, sensors, num_envs=2, device=device)
     suite.update(HandState.empty(2, 2, 0, device))
     depth, far = (float(suite.read(name).abs().max()) for name in sensors)

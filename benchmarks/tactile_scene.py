@@ -18,7 +18,7 @@ from robotics_bridge.physics import (
     HandState,
     MujocoEngine,
     MujocoWarpEngine,
-    Scene,
+    TouchScene,
     initial_velocities,
     pyramid,
 )
@@ -125,9 +125,9 @@ def settled(envs: int, device: str, steps: int, brought: Mapping[str, np.ndarray
     return snapshot(engine.state)
 
 
-def scene_of() -> Scene:
+def scene_of() -> TouchScene:
     """The pyramid's geometries."""
-    return Scene.from_mujoco(pyramid())
+    return TouchScene.from_mujoco(pyramid())
 
 
 CHECKED = 8
@@ -220,7 +220,7 @@ def bumpy_box(edge: float, triangles: int) -> Mesh:
     return Mesh(merged, index.reshape(-1)[np.array(faces)])
 
 
-def with_mesh(scene: Scene, name: str, triangles: int) -> Scene:
+def with_mesh(scene: TouchScene, name: str, triangles: int) -> TouchScene:
     """The scene with one box replaced by triangles."""
     number = scene.geometry_index(name)
     old = scene.geometries[number]

@@ -13,14 +13,14 @@ import numpy as np
 from scipy.special import erf
 
 from benchmarks.results import table, write_section
-from robotics_bridge.physics import Geometry, HandState, MujocoEngine, Scene
+from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScene
 from robotics_bridge.sensors import (
-    Body,
     ContactAudio,
+    ElasticSolid,
     Noise,
     SensorSuite,
-    Solid,
     TemperatureGrid,
+    ThermalBody,
     ThermalMaterial,
     find_modes,
 )
@@ -40,18 +40,20 @@ def modes() -> list[list[str]]:
         rows.append([what, f"{cells}", f"{truth:.4g}", f"{found:.4g}", f"{abs(found / truth - 1):.2%}"])
 
     for cells in (8, 16, 32):
-        found = find_modes(Solid("box", (0.1, 0.005, 0.005)), STEEL, count=2, cells=cells, cache=False).frequency[0]
+        found = find_modes(
+            ElasticSolid("box", (0.1, 0.005, 0.005)), STEEL, count=2, cells=cells, cache=False
+        ).frequency[0]
         exact = 4.730041**2 / (2 * math.pi * 0.04) * math.sqrt(2e11 * 1e-4 / 12 / 7850)
         add("free beam 20:1, first bending (Hz; Euler-Bernoulli)", cells, exact, found)
     rigid = 2e11 * 0.002**3 / 12 / 0.91
     for cells in (6, 10, 14):
-        found = find_modes(Solid("box", (0.1, 0.1, 0.001)), STEEL, count=4, cells=cells, cache=False).frequency
+        found = find_modes(ElasticSolid("box", (0.1, 0.1, 0.001)), STEEL, count=4, cells=cells, cache=False).frequency
         for mode, exact in enumerate((13.49, 19.79, 24.43)):
             number = found[mode] * 2 * math.pi * 0.04 * math.sqrt(7850 * 0.002 / rigid)
             add(f"free square plate 100:1, mode {mode + 1} (Leissa)", cells, exact, number)
     shear = math.sqrt(2e11 / 2.6 / 7850)
     for cells in (4, 6):
-        found = find_modes(Solid("sphere", (0.05,)), STEEL, count=6, cells=cells, cache=False).frequency
+        found = find_modes(ElasticSolid("sphere", (0.05,)), STEEL, count=6, cells=cells, cache=False).frequency
         for mode, exact, name in ((0, 2.501, "torsional"), (5, 2.640, "spheroidal")):
             add(f"free ball, {name} (Lamb)", cells, exact, found[mode] * 2 * math.pi * 0.05 / shear)
     return rows
@@ -66,9 +68,12 @@ def half_spaces() -> list[list[str]]:
     for name in ("aluminium", "steel", "glass", "wood"):
         grid = TemperatureGrid(
             link="pad", cells=(1, 1, 240), material=PLAIN, convection=0.0, radiates=False, base_temperature=33.0,
-            bodies={"object": Body(name, 13.0)},
+            bodies={"object": ThermalBody(name, 13.0)},
         )  # fmt: skip
-        suite, state = SensorSuite(Scene(("pad", "object"), shapes), {"t": grid}, num_envs=1), HandState.empty(1, 2, 4)
+        suite, state = (
+            SensorSuite(TouchScene(("pad", "object"), shapes), {"t": grid}, num_envs=1),
+            HandState.empty(1, 2, 4),
+        )
         corners = [[x, y, 0.012] for x in (-1, 1) for y in (-1, 1)]
         state.set_contacts([0] * 4, [[0, 1]] * 4, distance=[0.0] * 4, position=corners, normal=[[0, 0, 1.0]] * 4)
         for _ in range(1000):
@@ -115,7 +120,7 @@ def classifier() -> list[list[str]]:
     </worldbody></mujoco>""")
     envs, rng = 96, np.random.default_rng(1)
     names = ("wood", "metal", "glass")
-    solid = Solid("box", (0.15, 0.1, 0.015))
+    solid = ElasticSolid("box", (0.15, 0.1, 0.015))
     sensors = {name: ContactAudio(link="slab", modes=find_modes(solid, name, cells=8)) for name in names}
     engine = MujocoEngine(model, envs, threads=1)
     suite = SensorSuite(engine.scene, sensors, num_envs=envs)

@@ -5,22 +5,11 @@ The public names are imported on first use, so that ``import brainbench`` stays 
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
 
 __version__ = "0.1.0"
-
-_LAZY = {
-    "list_models": "brainbench.models.registry",
-    "load_model": "brainbench.models.registry",
-    "register_model": "brainbench.models.registry",
-    "extract": "brainbench.models.activations",
-    "score": "brainbench.scoring",
-    "open_recordings": "brainbench.datasets",
-    "Score": "brainbench.core.records",
-    "ResultRecord": "brainbench.core.records",
-    "BrainbenchError": "brainbench.core.errors",
-}
 
 __all__ = [
     "BrainbenchError",
@@ -44,13 +33,17 @@ if TYPE_CHECKING:
     from brainbench.scoring.scores import score
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module 'brainbench' has no attribute {name!r}")
-    value = getattr(import_module(_LAZY[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "BrainbenchError": "brainbench.core.errors",
+        "ResultRecord": "brainbench.core.records",
+        "Score": "brainbench.core.records",
+        "extract": "brainbench.models.activations",
+        "list_models": "brainbench.models.registry",
+        "load_model": "brainbench.models.registry",
+        "open_recordings": "brainbench.datasets",
+        "register_model": "brainbench.models.registry",
+        "score": "brainbench.scoring",
+    },
+)

@@ -31,11 +31,11 @@ def power(
     Correlation, consistency and reliability of your own recordings: 'brainbench score' and
     'brainbench recordings rdm'.
     """
-    from brainbench.metrics.inference.power import Design, needed
+    from brainbench.metrics.inference.power import ExperimentDesign, needed
     from brainbench.metrics.inference.power import power as power_of
 
     effects = _EFFECTS if effect is None else (effect,)
-    designs = [Design(stimuli, animals, item, consistency, reliability, layers, alpha) for item in effects]
+    designs = [ExperimentDesign(stimuli, animals, item, consistency, reliability, layers, alpha) for item in effects]
     found = []
     with progress_bar() as progress:
         for index, design in enumerate(designs):

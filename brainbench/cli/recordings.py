@@ -49,10 +49,10 @@ def rdm(
     from dataclasses import replace
 
     from brainbench.datasets import pooled
-    from brainbench.scoring.neural_responses import brain_side
+    from brainbench.scoring.neural_responses import open_neural_responses
 
     with progress_bar() as progress:
-        brain = brain_side(source, conditions=conditions, select=select, window=window, progress=progress)
+        brain = open_neural_responses(source, conditions=conditions, select=select, window=window, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, time="mean", seed=seed)

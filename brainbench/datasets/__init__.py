@@ -9,7 +9,7 @@ from brainbench.datasets.exports import export
 from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import Inspection, inspect
-from brainbench.datasets.layouts.registry import Recipe, get_recipe, list_recipes, register_recipe
+from brainbench.datasets.layouts.registry import RecordingLayout, get_recipe, list_recipes, register_recipe
 from brainbench.datasets.recordings import open_recordings
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.trials.blocks import SessionBlock, block_covariates, blocks
@@ -23,7 +23,7 @@ __all__ = [
     "Checkup",
     "Conditions",
     "Inspection",
-    "Recipe",
+    "RecordingLayout",
     "Rule",
     "Selection",
     "Session",

@@ -21,7 +21,7 @@ from brainbench.core.files import atomic_path
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.layouts.registry import resolve_selection
 from brainbench.datasets.reading import Source, each_session, find_recordings
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, Table, as_labels, decode, ragged
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, decode, ragged
 from brainbench.datasets.sources import open_file
 from brainbench.datasets.synthetic.nwb_writer import NwbWriter
 from brainbench.datasets.trials.counting import has_units, read_spikes, recorded_span
@@ -101,10 +101,10 @@ def subset(session: Session, selection: Selection = EVERYTHING, table: str = "tr
     tables = {}
     for name, item in session.tables.items():
         rows = tally.select(item, selection.trials, "trials") if name == table else np.ones(len(item), dtype=bool)
-        tables[name] = Table(name, _plain(item, rows), item.where)
+        tables[name] = SessionTable(name, _plain(item, rows), item.where)
     if LICKS not in tables and (licks := lick_times(session)) is not None:
-        tables[LICKS] = Table(LICKS, {"start_time": licks, "stop_time": licks}, session.source)
-    return replace(session, units=Table("units", columns, units.where), tables=tables, series={})
+        tables[LICKS] = SessionTable(LICKS, {"start_time": licks, "stop_time": licks}, session.source)
+    return replace(session, units=SessionTable("units", columns, units.where), tables=tables, series={})
 
 
 def write_nwb(path: str | os.PathLike[str], session: Session) -> Path:
@@ -140,7 +140,7 @@ def write_nwb(path: str | os.PathLike[str], session: Session) -> Path:
     return Path(path)
 
 
-def _plain(table: Table, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
     """Columns that mean something outside their file, of the rows kept; references do not."""
     made: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
     for name in table.columns:
@@ -166,7 +166,7 @@ def _plain(table: Table, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
     return made
 
 
-def _columns(table: Table) -> Mapping[str, tuple[str, Any]]:
+def _columns(table: SessionTable) -> Mapping[str, tuple[str, Any]]:
     columns: dict[str, tuple[str, Any]] = {}
     for name in table.columns:
         values = np.asarray(table.data[name])
@@ -177,7 +177,7 @@ def _columns(table: Table) -> Mapping[str, tuple[str, Any]]:
     return columns
 
 
-def _ids(table: Table) -> NDArray[np.int64]:
+def _ids(table: SessionTable) -> NDArray[np.int64]:
     ids = as_labels(table.ids())
     try:
         return ids.astype(np.int64)

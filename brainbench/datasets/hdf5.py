@@ -39,7 +39,7 @@ import numpy as np
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, to_json
-from brainbench.datasets.sessions import SPIKES, Session, Table, decode, text
+from brainbench.datasets.sessions import SPIKES, Session, SessionTable, decode, text
 
 if TYPE_CHECKING:
     import h5py
@@ -103,10 +103,10 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
     sessions = []
     for name, group in _need(file, "sessions", path).items():
         tables = {
-            key: Table(key, dict(table.items()), f"{path}:{name}")
+            key: SessionTable(key, dict(table.items()), f"{path}:{name}")
             for key, table in _need(group, "tables", path).items()
         }
-        units = Table("units", dict(_need(group, "units", path).items()), f"{path}:{name}")
+        units = SessionTable("units", dict(_need(group, "units", path).items()), f"{path}:{name}")
         sessions.append(
             Session(
                 subject=text(group.attrs.get("subject", "")) or name,
@@ -181,7 +181,7 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
             _write_table(group.create_group(f"tables/{key.replace('/', '_')}"), table)
 
 
-def _write_table(group: h5py.Group, table: Table) -> None:
+def _write_table(group: h5py.Group, table: SessionTable) -> None:
     for name, values in table.data.items():
         array = decode(values[...])
         # References and compound types point into the source file and mean nothing outside it.

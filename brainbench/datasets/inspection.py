@@ -14,7 +14,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
 from brainbench.datasets import hdf5
 from brainbench.datasets.reading import each_session
-from brainbench.datasets.sessions import SPIKES, Session, Table, natural_order
+from brainbench.datasets.sessions import SPIKES, Session, SessionTable, natural_order
 from brainbench.datasets.sources import find_files, open_file
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
 from brainbench.datasets.trials.proposals import EXAMPLES, ColumnSummary, Proposal, propose, summarise_columns
@@ -204,7 +204,7 @@ def _units(session: Session) -> UnitsSummary | None:
     )
 
 
-def _table(table: Table) -> TableSummary:
+def _table(table: SessionTable) -> TableSummary:
     problem = "" if "start_time" in table else "it has no start_time"
     try:
         return TableSummary(table.name, len(table), tuple(summarise_columns(table)), problem)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError
-from brainbench.datasets.sessions import Series, Session, Table, decode, text
+from brainbench.datasets.sessions import Series, Session, SessionTable, decode, text
 from brainbench.datasets.trials.covariates import LICKS
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     )
 
 
-def _interval_tables(file: h5py.File, path: Path) -> dict[str, Table]:
+def _interval_tables(file: h5py.File, path: Path) -> dict[str, SessionTable]:
     tables = {name: _table(group, name, path) for name, group in _groups(file.get("intervals"))}
     for module_name, module in _groups(file.get("processing")):
         for name, group in _groups(module):
@@ -78,13 +78,13 @@ def _interval_tables(file: h5py.File, path: Path) -> dict[str, Table]:
     return tables
 
 
-def _table(group: h5py.Group, name: str, path: Path) -> Table:
+def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
     import h5py
 
     columns = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
     declared = [text(key) for key in group.attrs.get("colnames", ())]
     order = [key for key in declared if key in columns] + [key for key in columns if key not in declared]
-    return Table(name, {key: columns[key] for key in order}, str(path))
+    return SessionTable(name, {key: columns[key] for key in order}, str(path))
 
 
 def _intracellular(file: h5py.File) -> dict[str, int]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brainbench.datasets.layouts.registry import Recipe, detect_recipe, get_recipe, split_source
+from brainbench.datasets.layouts.registry import RecordingLayout, detect_recipe, get_recipe, split_source
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.sources import find_files, read_file
 
@@ -18,7 +18,7 @@ Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A file, a folder, a glob, a list of these, or ``RECIPE:PATH``."""
 
 
-def find_recordings(source: Source) -> tuple[Recipe | None, list[Path]]:
+def find_recordings(source: Source) -> tuple[RecordingLayout | None, list[Path]]:
     """Return the recipe that a source names, if any, and its files.
 
     Raises:
@@ -31,7 +31,9 @@ def find_recordings(source: Source) -> tuple[Recipe | None, list[Path]]:
     return (get_recipe(name) if name else None), find_files(rest)
 
 
-def each_session(file: h5py.File, path: Path, recipe: Recipe | None = None) -> Iterator[tuple[Session, Recipe | None]]:
+def each_session(
+    file: h5py.File, path: Path, recipe: RecordingLayout | None = None
+) -> Iterator[tuple[Session, RecordingLayout | None]]:
     """Yield the sessions of an open file with the recipe that fits each: the given one, else by its layout.
 
     A session comes as its recipe adapts it. Read it while the file is open, inside the block of

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.datasets import hdf5
-from brainbench.datasets.layouts.registry import Recipe, list_recipes, resolve_selection
+from brainbench.datasets.layouts.registry import RecordingLayout, list_recipes, resolve_selection
 from brainbench.datasets.reading import Source, each_session, find_recordings
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.sources import open_file
 from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import Part, Plan, extract, has_units, no_units
+from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, extract, has_units, no_units
 from brainbench.datasets.trials.joining import join
 from brainbench.datasets.trials.proposals import propose
 from brainbench.datasets.trials.selection import DEFAULT, Selection
@@ -83,7 +83,7 @@ class _Reader:
 
     def __init__(
         self,
-        recipe: Recipe | None,
+        recipe: RecordingLayout | None,
         conditions: Conditions | None,
         select: Selection | str | None,
         window: Window | str | None,
@@ -94,8 +94,8 @@ class _Reader:
         self.select = None if select is None else resolve_selection(select)
         self.window = None if window is None else resolve_window(window)
         self.bin = bin
-        self.plan: Plan | None = None
-        self.parts: list[Part] = []
+        self.plan: ReadingOptions | None = None
+        self.parts: list[SessionCounts] = []
         self.seen: dict[tuple[str, ...], str] = {}
         self.notes: list[str] = []
         self.skipped: list[str] = []
@@ -127,7 +127,7 @@ class _Reader:
                 )
             self.seen[key] = session.source
 
-    def _plan(self, session: Session, found: Recipe | None) -> Plan:
+    def _plan(self, session: Session, found: RecordingLayout | None) -> ReadingOptions:
         """Return the plan, made for the first session and checked against each later one."""
         if (
             not self.named
@@ -147,7 +147,7 @@ class _Reader:
             )
         return self.plan
 
-    def _make_plan(self, session: Session) -> Plan:
+    def _make_plan(self, session: Session) -> ReadingOptions:
         conditions = self.conditions or (self.recipe.conditions if self.recipe else None)
         if conditions is None:
             proposals = [item.conditions for item in propose([session])][:4]
@@ -161,7 +161,7 @@ class _Reader:
                 f"as {listing(proposals)}."
             )
         recipe = self.recipe
-        return Plan(
+        return ReadingOptions(
             conditions=conditions,
             vocabulary=recipe.vocabulary(conditions) if recipe else None,
             selection=self.select or (recipe.selection if recipe else DEFAULT),

@@ -22,7 +22,7 @@ OBSERVED = "obs_intervals"
 
 
 @dataclass(frozen=True)
-class Table:
+class SessionTable:
     """Columns of equal length, in the manner of NWB's DynamicTable.
 
     A ragged column ``x`` has its values in ``x`` and the end of each row in ``x_index``.
@@ -167,9 +167,9 @@ class Session:
 
     subject: str
     session: str
-    units: Table | None
+    units: SessionTable | None
     """``id``, ``spike_times`` (+ ``spike_times_index``), optionally ``obs_intervals``, ``depth`` …"""
-    tables: Mapping[str, Table]
+    tables: Mapping[str, SessionTable]
     """Interval tables by name; each has ``start_time`` and usually ``stop_time``."""
     source: str = ""
     identifier: str = ""
@@ -186,7 +186,7 @@ class Session:
     series: Mapping[str, Series] = field(default_factory=dict)
     """Acquired signals by path; their samples stay in the file."""
 
-    def table(self, name: str) -> Table:
+    def table(self, name: str) -> SessionTable:
         """Return one interval table.
 
         Raises:
@@ -229,10 +229,10 @@ def make_session(
     if observed is not None:
         data |= ragged(OBSERVED, [np.reshape(item, (-1, 2)) for item in observed])
     made = {
-        name: Table(name, {key: np.asarray(item) for key, item in table.items()}, session)
+        name: SessionTable(name, {key: np.asarray(item) for key, item in table.items()}, session)
         for name, table in tables.items()
     }
-    units = Table("units", data, session)
+    units = SessionTable("units", data, session)
     for table in (units, *made.values()):
         for name in table.columns:
             if f"{name}_index" not in table and len(table.data[name]) != len(table):

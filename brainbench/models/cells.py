@@ -25,7 +25,7 @@ from brainbench.models.graph.tnn_state import load_named
 from brainbench.models.ops.layers import Conv2d, pair
 
 if TYPE_CHECKING:
-    from brainbench.models.ops.gates import GateTape
+    from brainbench.models.ops.gates import DeferredNormGrad
 
 FORGET_BIAS = 1.0
 
@@ -270,7 +270,7 @@ class IntersectionRNN(GatedCell):
             )
         super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
 
-        self.tape: GateTape | None = None
+        self.tape: DeferredNormGrad | None = None
         """Where the steps of a pass leave the gradients of the norms; None outside of such a pass."""
 
     def forward(

@@ -34,15 +34,15 @@ _BLOCKS = {
 
 
 def graph_of(module: nn.Module) -> ModelGraph | None:
-    """Return the graph of one of our networks (:class:`brainbench.models.network.EAD`); None for any other module.
+    """Return the graph of an :class:`~brainbench.models.network.EncoderAttenderDecoder`; None for any other module.
 
     Node names are the names of the layers, so that scores can be shown beside them. A node's shape is that
     of its output at one time step, without the batch.
     """
     from brainbench.models.graph.temporal_graph import TemporalGraph
-    from brainbench.models.network import EAD
+    from brainbench.models.network import EncoderAttenderDecoder
 
-    if not isinstance(module, EAD):
+    if not isinstance(module, EncoderAttenderDecoder):
         return None
     nodes = [GraphNode("input", "input", "base forces and moments", shape=module.spec.input_shape)]
     edges: list[GraphEdge] = []

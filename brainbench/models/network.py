@@ -1,7 +1,7 @@
 """Encoder-attender-decoder networks of touch.
 
 A sweep [B, T, 30, 5, 7] in SI is normalised, encoded, optionally read by an attender, and decoded at the
-last step to [B, classes]. Everything is causal: :meth:`EAD.step` streams.
+last step to [B, classes]. Everything is causal: :meth:`EncoderAttenderDecoder.step` streams.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ModelSpec:
 
 
 @dataclass(frozen=True)
-class EADState:
+class NetworkState:
     """What a network carries from one step to the next."""
 
     encoder: Any
@@ -63,7 +63,7 @@ class EADState:
     """What an all-steps decoder remembers; None for others."""
 
 
-class EAD(nn.Module):
+class EncoderAttenderDecoder(nn.Module):
     """Normaliser → encoder → attender → decoder; [B, T, C, H, W] in SI → [B, classes].
 
     Args:
@@ -200,16 +200,16 @@ class EAD(nn.Module):
 
     def init_state(
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> EADState:
+    ) -> NetworkState:
         """Return the state before the first step."""
         attender, decoder = self.attender, self.decoder
-        return EADState(
+        return NetworkState(
             self.encoder.init_state(batch, device=device, dtype=dtype),
             attender.init_state(batch, device=device, dtype=dtype) if attender is not None else None,
             decoder.init_state(batch, device=device, dtype=dtype) if isinstance(decoder, AllStepsDecoder) else None,
         )
 
-    def step(self, x: torch.Tensor, state: EADState) -> tuple[torch.Tensor, EADState]:
+    def step(self, x: torch.Tensor, state: NetworkState) -> tuple[torch.Tensor, NetworkState]:
         """Advance by one time step [B, C, H, W] in SI; return the decoder's output [B, classes] and the state.
 
         After t steps the output equals :meth:`forward` of the sweep's first t steps.
@@ -217,15 +217,15 @@ class EAD(nn.Module):
         features, encoder, attender = self._stream(x, state)
         if isinstance(self.decoder, AllStepsDecoder):
             y, decoder = self.decoder.step(features, state.decoder)
-            return y, EADState(encoder, attender, decoder)
-        return self.decoder(features), EADState(encoder, attender)
+            return y, NetworkState(encoder, attender, decoder)
+        return self.decoder(features), NetworkState(encoder, attender)
 
-    def encode_step(self, x: torch.Tensor, state: EADState) -> tuple[torch.Tensor, EADState]:
+    def encode_step(self, x: torch.Tensor, state: NetworkState) -> tuple[torch.Tensor, NetworkState]:
         """Advance as :meth:`step` does, without the decoder; return the features [B, F] and the state."""
         features, encoder, attender = self._stream(x, state)
-        return features, EADState(encoder, attender, state.decoder)
+        return features, NetworkState(encoder, attender, state.decoder)
 
-    def _stream(self, x: torch.Tensor, state: EADState) -> tuple[torch.Tensor, Any, Any]:
+    def _stream(self, x: torch.Tensor, state: NetworkState) -> tuple[torch.Tensor, Any, Any]:
         if x.ndim != 4 or tuple(x.shape[1:]) != self.spec.input_shape:
             raise UsageError(f"A step expects {self._expected('batch')}; received {list(x.shape)}.")
         features, encoder = self.encoder.step(self.normaliser(x), state.encoder, **self._unroll)

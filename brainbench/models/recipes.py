@@ -24,7 +24,7 @@ _RATES = (1e-1, 1e-2, 1e-3, 1e-4)
 
 
 @dataclass(frozen=True)
-class Setting:
+class TrainingSetting:
     """One point of a search space."""
 
     optimizer: str
@@ -42,15 +42,15 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class PublishedTraining:
     """How one architecture is trained with one objective."""
 
     architecture: str
     """Registry name."""
     objective: str
     """``supervised``, ``simclr``, ``simsiam`` or ``ae``."""
-    setting: Setting
-    search: tuple[Setting, ...]
+    setting: TrainingSetting
+    search: tuple[TrainingSetting, ...]
     variant: str = ""
     """``warmup`` for SimSiam with a warmed-up schedule."""
     decoder: str = "linear"
@@ -65,7 +65,7 @@ class Recipe:
         return f"{self.architecture}.{self.objective}" + (f"-{self.variant}" if self.variant else "")
 
 
-PROBE = Setting("sgd", "step", 0.1)
+PROBE = TrainingSetting("sgd", "step", 0.1)
 """The linear probe on a frozen network: 100 epochs, batch 256."""
 
 
@@ -74,7 +74,7 @@ def list_recipes(pattern: str = "*") -> list[str]:
     return [name for name in _recipes() if fnmatchcase(name, pattern)]
 
 
-def find_recipe(name: str) -> Recipe:
+def find_recipe(name: str) -> PublishedTraining:
     """Return the recipe ``architecture.objective[-warmup]``.
 
     Raises:
@@ -85,7 +85,7 @@ def find_recipe(name: str) -> Recipe:
     return _recipes()[name]
 
 
-def recipe_for(architecture: str, objective: str) -> Recipe:
+def recipe_for(architecture: str, objective: str) -> PublishedTraining:
     """Return the published recipe, or for an architecture without one that of its nearest published relative.
 
     A ``-small`` model is trained like the full one. Other architectures follow the row of their attender.
@@ -108,44 +108,46 @@ def recipe_for(architecture: str, objective: str) -> Recipe:
 
 
 @cache
-def _recipes() -> dict[str, Recipe]:
+def _recipes() -> dict[str, PublishedTraining]:
     return {recipe.name: recipe for recipe in (*_supervised(), *_self_supervised())}
 
 
-def _grid(optimizers: tuple[str, ...], schedule: str, rates: tuple[float, ...], warmup: int = 0) -> tuple[Setting, ...]:
-    return tuple(Setting(optimizer, schedule, rate, warmup) for optimizer, rate in product(optimizers, rates))
+def _grid(
+    optimizers: tuple[str, ...], schedule: str, rates: tuple[float, ...], warmup: int = 0
+) -> tuple[TrainingSetting, ...]:
+    return tuple(TrainingSetting(optimizer, schedule, rate, warmup) for optimizer, rate in product(optimizers, rates))
 
 
-def _supervised() -> Iterator[Recipe]:
+def _supervised() -> Iterator[PublishedTraining]:
     """Table 3.3, row by row."""
-    sgd = Setting("sgd", "step", 1e-2)
-    yield Recipe("resnet18", "supervised", sgd, _grid(("sgd",), "step", _RATES[:3]), decoder="all-steps")
+    sgd = TrainingSetting("sgd", "step", 1e-2)
+    yield PublishedTraining("resnet18", "supervised", sgd, _grid(("sgd",), "step", _RATES[:3]), decoder="all-steps")
     search = (*_grid(("sgd",), "step", _RATES), *_grid(("sgd",), "constant", (1e-2, 5e-3)))
-    yield Recipe("zhuang", "supervised", sgd, search)
-    adamw = Setting("adamw", "step", 1e-3)
+    yield PublishedTraining("zhuang", "supervised", sgd, search)
+    adamw = TrainingSetting("adamw", "step", 1e-3)
     for cell in ("ugrnn", "intersection", "gru", "lstm"):
         search = _grid(("sgd", "adam", "adamw"), "step", _RATES)
-        yield Recipe(f"zhuang-{cell}", "supervised", adamw, search)
-        yield Recipe(f"zhuang-{cell}-ln", "supervised", adamw, _grid(("adamw",), "step", _RATES))
-    cosine = Setting("adamw", "cosine", 1e-4, 10)
+        yield PublishedTraining(f"zhuang-{cell}", "supervised", adamw, search)
+        yield PublishedTraining(f"zhuang-{cell}-ln", "supervised", adamw, _grid(("adamw",), "step", _RATES))
+    cosine = TrainingSetting("adamw", "cosine", 1e-4, 10)
     search = (cosine, *_grid(("sgd", "adamw"), "step", _RATES[:3]))
     encoders = ("resnet18", "zhuang", "zhuang-ugrnn", "zhuang-intersection-ln", "zhuang-gru", "zhuang-lstm", "s4")
     for encoder in encoders:
-        yield Recipe(f"{encoder}+gpt", "supervised", cosine, search)
+        yield PublishedTraining(f"{encoder}+gpt", "supervised", cosine, search)
     for encoder in ("resnet18", "zhuang", "s4"):
-        yield Recipe(f"{encoder}+mamba", "supervised", cosine, search)
+        yield PublishedTraining(f"{encoder}+mamba", "supervised", cosine, search)
 
 
-def _self_supervised() -> Iterator[Recipe]:
+def _self_supervised() -> Iterator[PublishedTraining]:
     """Table 3.4 for every architecture of table 3.5."""
     names = ["zhuang", "zhuang-ugrnn", "zhuang-intersection-ln", "zhuang-gru", "zhuang-lstm"]
     names += [f"{encoder}+gpt" for encoder in ("resnet18", "zhuang-intersection-ln", "zhuang", "s4")]
     names += [f"{encoder}+mamba" for encoder in ("resnet18", "zhuang", "s4")]
     for name in names:
         warm = _grid(("lars",), "cosine", _RATES, 10)
-        yield Recipe(name, "simclr", warm[0], warm)
+        yield PublishedTraining(name, "simclr", warm[0], warm)
         for variant, warmup in (("", 0), ("warmup", 10)):
             search = _grid(("sgd",), "cosine", _RATES, warmup)
-            yield Recipe(name, "simsiam", search[1], search, variant, batch_size=SIMSIAM_BATCH_SIZE)
+            yield PublishedTraining(name, "simsiam", search[1], search, variant, batch_size=SIMSIAM_BATCH_SIZE)
         search = _grid(("sgd",), "step", _RATES)
-        yield Recipe(name, "ae", search[1], search)
+        yield PublishedTraining(name, "ae", search[1], search)

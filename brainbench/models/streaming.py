@@ -19,7 +19,7 @@ from brainbench.models.attenders.gpt import GPTAttender, GPTBlock
 from brainbench.models.attenders.mamba import MambaAttender, MambaMemory
 from brainbench.models.encoders.s4 import S4Encoder
 from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
-from brainbench.models.network import EAD
+from brainbench.models.network import EncoderAttenderDecoder
 
 
 class StreamingStep(nn.Module):
@@ -37,7 +37,7 @@ class StreamingStep(nn.Module):
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
-        if not isinstance(model, EAD):
+        if not isinstance(model, EncoderAttenderDecoder):
             raise UsageError(
                 f"Streaming and export need an encoder-attender-decoder network (brainbench.models.network.EAD); "
                 f"received {type(model).__name__}."
@@ -182,7 +182,7 @@ class _GPTPart(nn.Module):
         return torch.where(full, torch.full_like(y, torch.nan), y), after
 
 
-def _encoder_part(model: EAD) -> Any:
+def _encoder_part(model: EncoderAttenderDecoder) -> Any:
     if isinstance(model.encoder, TemporalGraph):
         return _GraphPart(model.encoder, model.unroll)
     return _S4Part(model.encoder) if isinstance(model.encoder, S4Encoder) else _Stateless(model.encoder)

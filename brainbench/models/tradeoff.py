@@ -19,7 +19,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.tradeoffs import TradeoffPoint
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.network import EAD
+from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.registry import load_model
 
 PRECISIONS = ("float32", "bf16", "int8")
@@ -28,7 +28,7 @@ computes in float32."""
 
 
 @dataclass(frozen=True)
-class Setting:
+class ModelSetting:
     """One way to run a network.
 
     Raises:
@@ -61,10 +61,10 @@ class Reduced(nn.Module):
         UsageError: the network is no encoder-attender-decoder, or cannot be unrolled that way.
     """
 
-    def __init__(self, name: str, setting: Setting, *, seed: int = 0) -> None:
+    def __init__(self, name: str, setting: ModelSetting, *, seed: int = 0) -> None:
         super().__init__()
         model = load_model(name, seed=seed)
-        if not isinstance(model, EAD):
+        if not isinstance(model, EncoderAttenderDecoder):
             raise UsageError(f"{name!r} is no encoder-attender-decoder network, so its settings cannot be changed.")
         if setting.unroll != "biological":
             if not isinstance(model.encoder, TemporalGraph):
@@ -109,12 +109,12 @@ def settings(
     precisions: Iterable[str] = PRECISIONS,
     unrolls: Iterable[str] = ("biological",),
     steps: Iterable[int] = (22,),
-) -> list[Setting]:
+) -> list[ModelSetting]:
     """Return every combination of the choices."""
-    return [Setting(p, u, s) for p, u, s in product(precisions, unrolls, steps)]  # pyright: ignore[reportArgumentType]
+    return [ModelSetting(p, u, s) for p, u, s in product(precisions, unrolls, steps)]  # pyright: ignore[reportArgumentType]
 
 
-def measure(name: str, setting: Setting, sweeps: Any, *, seed: int = 0, repeats: int = 5) -> TradeoffPoint:
+def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0, repeats: int = 5) -> TradeoffPoint:
     """Measure one setting on sweeps [K, T, C, H, W] in SI.
 
     Returns:

@@ -10,7 +10,7 @@ from brainbench.models.registry import register_model
 
 if TYPE_CHECKING:
     from brainbench.models.graph.spec import Unroll
-    from brainbench.models.network import EAD
+    from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.parts import Attender, Encoder
 
 LICENCE = "MIT"
@@ -83,7 +83,9 @@ class Architecture:
         """Papers of the encoder and the attender."""
         return "; ".join(CITATIONS[part] for part in (self.encoder, self.attender) if part)
 
-    def build(self, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological") -> EAD:
+    def build(
+        self, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological"
+    ) -> EncoderAttenderDecoder:
         """Build the network with new random weights.
 
         Args:
@@ -95,12 +97,12 @@ class Architecture:
             UsageError: an option does not exist or does not fit.
         """
         from brainbench.models.heads.decoders import make_decoder
-        from brainbench.models.network import EAD
+        from brainbench.models.network import EncoderAttenderDecoder
 
         encoder = self._encoder()
         attender = self._attender(encoder.features)
         features = encoder.features if attender is None else attender.features
-        return EAD(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
+        return EncoderAttenderDecoder(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
 
     def _encoder(self) -> Encoder:
         if self.encoder == "resnet18":

@@ -28,7 +28,7 @@ _ELSEWHERE = "features computed elsewhere"
 
 
 @dataclass(frozen=True)
-class ModelSide:
+class ModelResponses:
     """Activations of one model, with the labels of their rows."""
 
     card: ModelCard
@@ -58,7 +58,7 @@ class ModelSide:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class ResolvedModel:
     """A model that was found, before any stimulus is simulated for it."""
 
     card: ModelCard
@@ -79,10 +79,10 @@ class Candidate:
         normalize: bool,
         time: str,
         progress: Progress | None,
-    ) -> ModelSide:
+    ) -> ModelResponses:
         """Run the model on the stimuli; see :func:`brainbench.scoring.scores.score_record` for the arguments."""
         if self.activations is not None and self.labels is not None:
-            return ModelSide(self.card, self.labels, _chosen(self.activations, layers), time, origin=self.origin)
+            return ModelResponses(self.card, self.labels, _chosen(self.activations, layers), time, origin=self.origin)
         from brainbench.stimuli import load_stimuli
 
         shown = load_stimuli(stimuli or DEFAULT_STIMULI, whiskers=whiskers, fidelity=fidelity, progress=progress)
@@ -95,16 +95,16 @@ class Candidate:
             given = {
                 layer: _as_steps(layer, item, len(shown.labels)) for layer, item in (self.activations or {}).items()
             }
-            return ModelSide(self.card, shown.labels, _chosen(given, layers), time, origin=origin)
+            return ModelResponses(self.card, shown.labels, _chosen(given, layers), time, origin=origin)
         from brainbench.models.activations import extract
 
         values, note = _network_input(self.module, shown, normalize)
         activations = extract(self.module, values, layers=layers)
         card = replace(self.card, input=note)
-        return ModelSide(card, shown.labels, activations, time, _baseline_input(shown), origin)
+        return ModelResponses(card, shown.labels, activations, time, _baseline_input(shown), origin)
 
 
-def find_model(model: Any, *, seed: int = 0) -> Candidate:
+def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     """Find what ``model`` names, and load it; see :func:`brainbench.scoring.scores.score`.
 
     Raises:
@@ -112,7 +112,7 @@ def find_model(model: Any, *, seed: int = 0) -> Candidate:
         DataError: a file was found but cannot be used.
     """
     if isinstance(model, Mapping):
-        return Candidate(ModelCard("features", family=_ELSEWHERE), activations=model)
+        return ResolvedModel(ModelCard("features", family=_ELSEWHERE), activations=model)
     if isinstance(model, (str, os.PathLike)) and Path(model).suffix.lower() in (".h5", ".hdf5"):
         return _features(Path(model))
     import torch
@@ -178,13 +178,13 @@ def _training(config: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in {**options, **stated}.items() if value is not None}
 
 
-def _features(path: Path) -> Candidate:
+def _features(path: Path) -> ResolvedModel:
     from brainbench.core.files import file_hash
     from brainbench.models.features import read_features
 
     features = read_features(path)
     card = ModelCard(path.stem, family=_ELSEWHERE, weights=file_hash(path))
-    return Candidate(card, None, features.activations, features.labels, {"features": path.name})
+    return ResolvedModel(card, None, features.activations, features.labels, {"features": path.name})
 
 
 def _chosen(activations: Mapping[str, Any], layers: tuple[str, ...] | None) -> Mapping[str, Any]:
@@ -230,7 +230,7 @@ def _baseline_input(stimuli: Stimuli) -> NDArray[np.floating]:
     return steps.reshape(*steps.shape[:2], -1)
 
 
-def _with_weights(module: torch.nn.Module, card: ModelCard) -> Candidate:
+def _with_weights(module: torch.nn.Module, card: ModelCard) -> ResolvedModel:
     """Fill in the card what the weights tell."""
     import torch
 
@@ -246,7 +246,7 @@ def _with_weights(module: torch.nn.Module, card: ModelCard) -> Candidate:
     state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
     digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
     count = sum(parameter.numel() for parameter in module.parameters())
-    return Candidate(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
+    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
 
 
 def _features_of(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

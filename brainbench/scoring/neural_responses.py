@@ -22,7 +22,7 @@ DEMO_STIMULI = "rodgers"
 
 
 @dataclass(frozen=True)
-class BrainSide:
+class NeuralResponses:
     """Opened recordings."""
 
     dataset: xr.Dataset
@@ -73,7 +73,7 @@ class BrainSide:
         return tuple(animals)
 
 
-def brain_side(recordings: Any, *, progress: Progress | None, **selection: Any) -> BrainSide:
+def open_neural_responses(recordings: Any, *, progress: Progress | None, **selection: Any) -> NeuralResponses:
     """Open recordings; ``"demo"`` is made from the simulated ``rodgers`` stimuli on first use."""
     import xarray as xr
 
@@ -82,12 +82,12 @@ def brain_side(recordings: Any, *, progress: Progress | None, **selection: Any) 
     if isinstance(recordings, xr.Dataset):
         from brainbench.core.contracts import check_recordings
 
-        return BrainSide(check_recordings(recordings), "data set")
+        return NeuralResponses(check_recordings(recordings), "data set")
     if recordings == "demo":
-        return BrainSide(open_recordings(demo_recordings(progress=progress), **selection), "demo")
+        return NeuralResponses(open_recordings(demo_recordings(progress=progress), **selection), "demo")
     several = not isinstance(recordings, (str, os.PathLike))
     name = ", ".join(Path(item).name for item in recordings) if several else Path(recordings).name
-    return BrainSide(open_recordings(recordings, **selection), name)
+    return NeuralResponses(open_recordings(recordings, **selection), name)
 
 
 def demo_recordings(*, progress: Progress | None = None) -> Path:

@@ -115,8 +115,8 @@ def score_record(
     """
     from brainbench import metrics
     from brainbench.core.labels import join_labels
-    from brainbench.scoring.model_responses import find_model
-    from brainbench.scoring.neural_responses import brain_side
+    from brainbench.scoring.model_responses import resolve_model
+    from brainbench.scoring.neural_responses import open_neural_responses
 
     started = clock.perf_counter()
     if time not in ("mean", "concatenate"):
@@ -127,8 +127,10 @@ def score_record(
     metrics.check_metric(chosen)
     if explain and chosen.name != "rsa":
         raise UsageError(f"The published estimator is one of RSA; the metric {chosen.name!r} has none to explain.")
-    candidate = find_model(model, seed=seed if weights_seed is None else weights_seed)
-    brain = brain_side(recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress)
+    candidate = resolve_model(model, seed=seed if weights_seed is None else weights_seed)
+    brain = open_neural_responses(
+        recordings, conditions=conditions, select=select, window=window, bin=bin, progress=progress
+    )
     network = candidate.respond(
         stimuli,
         whiskers=whiskers,

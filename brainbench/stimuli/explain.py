@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.job_schedule import Plan
+    from brainbench.stimuli.engines.job_schedule import JobSchedule
     from brainbench.stimuli.engines.protocol import Trace
     from brainbench.stimuli.objects.placed_object import Solid
     from brainbench.stimuli.scenes.scene import Scene
@@ -139,7 +139,7 @@ class Explanation:
 
 def explain(
     scenes: Sequence[Scene],
-    plan: Plan,
+    plan: JobSchedule,
     traces: Sequence[Trace],
     fidelity: Fidelity,
 ) -> Explanation:

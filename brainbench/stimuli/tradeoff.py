@@ -69,7 +69,7 @@ PARTS = ("static_error", "ring_error", "dynamic_error", "sliding_error", "flick_
 
 
 @dataclass(frozen=True)
-class Setting:
+class SimulationSetting:
     """One point of the trade-off."""
 
     fidelity: Fidelity
@@ -82,7 +82,7 @@ class Setting:
             _collision(self.collision)
 
 
-REFERENCE = Setting(Fidelity(links=40, time_step=1e-5), "rod")
+REFERENCE = SimulationSetting(Fidelity(links=40, time_step=1e-5), "rod")
 """The converged simulation of the dynamic tests: with friction ``rod`` is within some tenths of a per cent of a
 differential equation that no engine shares (``benchmarks/friction_truth.py``), ``mujoco`` within some per cent."""
 
@@ -94,7 +94,7 @@ def settings(
     backends: Sequence[str] = (DEFAULT_BACKEND,),
     collisions: Sequence[str] = (),
     solvers: Sequence[str] = ("dynamic",),
-) -> list[Setting]:
+) -> list[SimulationSetting]:
     """Return every combination (``time_steps`` pairs a step [s] with steps per period), after the presets.
 
     Args:
@@ -118,16 +118,21 @@ def settings(
         if solver not in SOLVERS:
             raise unknown_name("solver", solver, SOLVERS)
     plain = [
-        Setting(fidelity, name)
+        SimulationSetting(fidelity, name)
         for name in backends
         for fidelity in dict.fromkeys([*presets, *grid] if "dynamic" in solvers else [])
     ]
-    plain += [Setting(item, name) for name in backends if name == "rod" and "quasistatic" in solvers for item in still]
-    return plain + [Setting(*point) for point in itertools.product(presets, backends, collisions)]
+    plain += [
+        SimulationSetting(item, name)
+        for name in backends
+        if name == "rod" and "quasistatic" in solvers
+        for item in still
+    ]
+    return plain + [SimulationSetting(*point) for point in itertools.product(presets, backends, collisions)]
 
 
 def measure_tradeoff(
-    path: str | os.PathLike[str], chosen: Iterable[Setting] | None = None, *, progress: Progress | None = None
+    path: str | os.PathLike[str], chosen: Iterable[SimulationSetting] | None = None, *, progress: Progress | None = None
 ) -> list[dict[str, Any]]:
     """Measure the settings that the table at ``path`` lacks, writing it (atomically) after each.
 
@@ -217,7 +222,7 @@ def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]
     hollow = [point for point in collision_points(chosen) if point["error"] is not None]
     figure = Figure(figsize=(11 if hollow else 7, 4.5), layout="constrained")
     axes = figure.subplots(1, 2 if hollow else 1, squeeze=False)[0]
-    presets = {_key(_fields(Setting(Fidelity.preset(name))))[: len(_NAMES)]: name for name in list_presets()}
+    presets = {_key(_fields(SimulationSetting(Fidelity.preset(name))))[: len(_NAMES)]: name for name in list_presets()}
     groups = sorted({(point["backend"], _moves(point)) for point in chosen if not point.get("collision")}, reverse=True)
     for number, (backend, moves) in enumerate(sorted(groups, key=lambda group: (not group[1], group[0]))):
         some = [point for point in chosen if (point["backend"], _moves(point)) == (backend, moves)]
@@ -234,7 +239,7 @@ def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]
 _NAMES = ("links", "links_per_mm", "time_step", "steps_per_period")
 
 
-def _fields(setting: Setting) -> dict[str, Any]:
+def _fields(setting: SimulationSetting) -> dict[str, Any]:
     fields = {**asdict(setting.fidelity), "backend": setting.backend}
     return fields if setting.collision is None else {**fields, "collision": setting.collision}
 
@@ -262,7 +267,7 @@ def _header() -> dict[str, Any]:
     }
 
 
-def _measure(setting: Setting, reference: Sequence[Trace]) -> dict[str, Any]:
+def _measure(setting: SimulationSetting, reference: Sequence[Trace]) -> dict[str, Any]:
     fidelity, backend = setting.fidelity, setting.backend
     values: dict[str, Any] = {**_fields(setting), **dict.fromkeys((*PARTS, "error", "cost")), "note": ""}
     whisker = _straight("C2")
@@ -284,7 +289,7 @@ def _measure(setting: Setting, reference: Sequence[Trace]) -> dict[str, Any]:
     return values
 
 
-def _measure_collision(setting: Setting, reference: Trace) -> dict[str, Any]:
+def _measure_collision(setting: SimulationSetting, reference: Trace) -> dict[str, Any]:
     values: dict[str, Any] = {**_fields(setting), **dict.fromkeys(("concave_error", "error", "cost")), "note": ""}
     try:
         trace, values["pieces"] = _into_hollow(setting)
@@ -307,7 +312,7 @@ def _collision(text: str) -> tuple[str, DecompositionSettings | None]:
     return kind, settings
 
 
-def _into_hollow(setting: Setting) -> tuple[Trace, int]:
+def _into_hollow(setting: SimulationSetting) -> tuple[Trace, int]:
     """Run C2 whisking into the hollow of the Rodgers solid; return the trace and of how much the solid consists.
 
     Raises:
@@ -331,7 +336,7 @@ def _into_hollow(setting: Setting) -> tuple[Trace, int]:
     return trace, pieces
 
 
-def _ring_error(whisker: Whisker, setting: Setting) -> float:
+def _ring_error(whisker: Whisker, setting: SimulationSetting) -> float:
     ring = ringdown(whisker, modes=1, backend=setting.backend, fidelity=setting.fidelity)
     return max(abs(ring.frequency_error), abs(ring.damping_ratio / whisker.damping_ratio - 1))
 
@@ -357,7 +362,7 @@ class _Whisk:
         return np.zeros((len(times), 3)), euler
 
 
-def _whisking(setting: Setting) -> list[Trace]:
+def _whisking(setting: SimulationSetting) -> list[Trace]:
     """Run smooth, sliding and flicking contact.
 
     Raises:

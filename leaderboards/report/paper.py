@@ -32,7 +32,7 @@ _WORDY = ("model", "baseline", "animal", "statement", "value", "layer", "status"
 
 
 @dataclass(frozen=True)
-class Table:
+class PaperTable:
     """A table of texts."""
 
     caption: str
@@ -51,7 +51,7 @@ class Section:
 
     title: str
     methods: str
-    tables: tuple[Table, ...]
+    tables: tuple[PaperTable, ...]
     figures: tuple[Figure, ...]
     absent: tuple[Figure, ...]
     """Figures that the records cannot fill."""
@@ -192,7 +192,7 @@ def _single(entry: Entry) -> list[Figure]:
     return found
 
 
-def _models(entries: Sequence[Entry]) -> Table:
+def _models(entries: Sequence[Entry]) -> PaperTable:
     columns = ("model", "rank", "score", "interval", "spread", "p", "raw r", "layer", "parameters", "top-1", "status")
     rows = [
         (
@@ -212,18 +212,18 @@ def _models(entries: Sequence[Entry]) -> Table:
     ]
     used = [i for i in range(len(columns)) if any(row[i] for row in rows)]
     kept = tuple(tuple(row[i] for i in used) for row in rows)
-    return Table("Models, best first.", tuple(columns[i] for i in used), kept)
+    return PaperTable("Models, best first.", tuple(columns[i] for i in used), kept)
 
 
-def _baselines(board: Board) -> Table:
+def _baselines(board: Board) -> PaperTable:
     rows = [
         (item.name, _words.number(item.score.value), _words.span(item.score.interval), item.score.status)
         for item in board.baselines
     ]
-    return Table("Baselines and animal-to-animal.", ("baseline", "score", "interval", "status"), tuple(rows))
+    return PaperTable("Baselines and animal-to-animal.", ("baseline", "score", "interval", "status"), tuple(rows))
 
 
-def _animals(entry: Entry) -> Table:
+def _animals(entry: Entry) -> PaperTable:
     columns = ("animal", "score", "raw r", "reliability", "units", "trials", "layer", "status")
     rows = [
         (
@@ -232,12 +232,12 @@ def _animals(entry: Entry) -> Table:
         )
         for item in entry.score.subjects
     ]  # fmt: skip
-    return Table("Animals, each at the layer chosen on the others.", columns, tuple(rows))
+    return PaperTable("Animals, each at the layer chosen on the others.", columns, tuple(rows))
 
 
-def _card(entry: Entry) -> Table:
+def _card(entry: Entry) -> PaperTable:
     rows = (*_words.card_rows(entry.card), *_words.training_rows(entry.card))
-    return Table("The model.", ("statement", "value"), tuple(rows))
+    return PaperTable("The model.", ("statement", "value"), tuple(rows))
 
 
 def _inline(figure: Figure) -> str:
@@ -299,7 +299,7 @@ def _markdown(paper: Paper, path: Path) -> str:
     return "\n".join([*lines, f"BibTeX entries: `{path.with_suffix('.bib').name}`.", ""])
 
 
-def _rows(table: Table) -> list[str]:
+def _rows(table: PaperTable) -> list[str]:
     ends = ["---:" if number else "---" for number in table.numbers]
     lines = [table.columns, ends, *([_escape(cell) for cell in row] for row in table.rows)]
     return ["| " + " | ".join(line) + " |" for line in lines]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.devices import warp
-from robotics_bridge.tasks.rotations import conjugate, from_xyzw, rotate
+from brainbench.core.rotations import conjugate, from_xyzw, rotate
 
 if TYPE_CHECKING:
     import torch

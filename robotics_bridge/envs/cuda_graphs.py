@@ -82,7 +82,7 @@ class Captured:
             if self._required:
                 raise UsageError(
                     f"The control step cannot be recorded as a CUDA graph: {self.failed}. Terms and watches of a task "
-                    "may not copy from the processor or wait for it (robotics_bridge.tasks.rotations.constant keeps "
+                    "may not copy from the processor or wait for it (brainbench.core.rotations.constant keeps "
                     "constants on the device); change them, or make the environment with graphs=False."
                 ) from error
             _LOG.warning(

@@ -13,6 +13,7 @@ import numpy as np
 
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.rotations import conjugate, from_xyzw, multiply, rotate
 from robotics_bridge.envs.actions import ActionMap
 from robotics_bridge.envs.actuators import Drives
 from robotics_bridge.envs.checkpoint import restore, saved
@@ -23,9 +24,8 @@ from robotics_bridge.envs.observations import observe, shapes_of
 from robotics_bridge.envs.reset import Resets
 from robotics_bridge.envs.simulation import World
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.tasks.rotations import conjugate, from_xyzw, multiply, rotate
 from robotics_bridge.tasks.scenes import build
-from robotics_bridge.tasks.step_context import Moment
+from robotics_bridge.tasks.step_context import StepContext
 
 if TYPE_CHECKING:
     import torch
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from robotics_bridge.envs.tactile import TactileLayout
     from robotics_bridge.hands import Hand
     from robotics_bridge.tasks.task import Task
-    from robotics_bridge.tasks.task_state import Watch
+    from robotics_bridge.tasks.task_state import TaskState
 
 ENGINES = ("mujoco", "warp")
 _WILD = 1e4
@@ -111,9 +111,9 @@ class Env:
         self.goals = GoalState(task, num_envs, self.device)
         self.touch = None
         if observe != "none":
-            from robotics_bridge.envs.tactile import Touch
+            from robotics_bridge.envs.tactile import TactileObservation
 
-            self.touch = Touch(
+            self.touch = TactileObservation(
                 self.model, hand, self.world.engine.scene, observe=observe, placement=placement,
                 resolution=resolution, noisy=noisy, num_envs=num_envs, substeps=self.decimation,
                 device=self.world.warp_device, seed=seed, knobs=knobs or {},
@@ -123,7 +123,7 @@ class Env:
         self._with_link_pose = link_pose
         self._buffers()
         self.contacts = Contacts(self.world, self.model, step_dt=self.step_dt, seed=seed)
-        self.watch: Watch | None = None if task.watch is None else task.watch(self)
+        self.watch: TaskState | None = None if task.watch is None else task.watch(self)
         """The part of the task with a state of its own."""
         self._resets = Resets(self)
         # Functions, not bound methods: an environment that refers to itself would outlive its use.
@@ -401,14 +401,14 @@ class Env:
         self.contacts.forces.masked_fill_(column.unsqueeze(2), 0.0)
         return diverged
 
-    def _moment(self) -> Moment:
+    def _moment(self) -> StepContext:
         quat = self._object_quat()
         force = self.contacts.on_object(self.rows, self.target)
         self.goals.update(quat, force > 0)
         goals, world = self.goals, self.world
         pose, rows = self.object_pose, self.rows
         speed = world.qvel[:, self._object_speeds].unflatten(1, (-1, 6))[rows, self.target]
-        return Moment(
+        return StepContext(
             dt=self.step_dt, joint_names=self.model.joints, joint_position=world.qpos[:, self.drives.positions],
             joint_velocity=world.qvel[:, self.drives.speeds], joint_low=self._low, joint_high=self._high,
             start_joints=self._start_joints, power=self.drives.power.sum(dim=1), action=self.action,
@@ -435,7 +435,7 @@ class Env:
     def _object_quat(self) -> torch.Tensor:
         return self.object_pose[self.rows, self.target, 3:]
 
-    def _reward(self, moment: Moment, diverged: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _reward(self, moment: StepContext, diverged: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the reward [B] and its terms [B, terms], zero where diverged."""
         import torch
 

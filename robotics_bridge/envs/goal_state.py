@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from robotics_bridge.tasks.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing
+from brainbench.core.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing
 
 if TYPE_CHECKING:
     import torch

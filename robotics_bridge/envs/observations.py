@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from robotics_bridge.tasks.rotations import conjugate, constant, multiply, rotate, six_numbers
+from brainbench.core.rotations import conjugate, constant, multiply, rotate, six_numbers
 
 if TYPE_CHECKING:
     import torch

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotics_bridge.tasks.rotations import about, constant, multiply
+from brainbench.core.rotations import about, constant, multiply
 
 if TYPE_CHECKING:
     import torch

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robotics_bridge.hands import Hand
-    from robotics_bridge.physics.scene import Scene
+    from robotics_bridge.physics.scene import TouchScene
     from robotics_bridge.physics.state import HandState
     from robotics_bridge.tasks.scenes import TaskModel
 
@@ -60,7 +60,7 @@ class TactileLayout:
     """[N, 3]."""
 
 
-class Touch:
+class TactileObservation:
     """The tactile sensors of an environment, read after every physics step.
 
     Args:
@@ -85,7 +85,7 @@ class Touch:
         self,
         model: TaskModel,
         hand: Hand,
-        scene: Scene,
+        scene: TouchScene,
         *,
         observe: str,
         placement: str,

@@ -10,7 +10,7 @@ import numpy as np
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import read_json, write_json
-from robotics_bridge.hands.spec import Box, Capsule, Grid, Link
+from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link
 from robotics_bridge.sensors.probes.placement import Probes
 
 if TYPE_CHECKING:
@@ -35,9 +35,9 @@ def pad_probes(link: Link, grid: Grid) -> Probes:
     if link.pad is None or not link.solids:
         raise UsageError(f"Link {link.name!r} has no sensing pad.")
     solid = link.solids[0]
-    if isinstance(solid, Capsule):
+    if isinstance(solid, CapsuleGeometry):
         position, normal = _on_capsule(solid, link.pad.facing, link.pad.along, link.pad.around, grid)
-    elif isinstance(solid, Box):
+    elif isinstance(solid, BoxGeometry):
         position, normal = _on_box(solid, link.pad.facing, link.pad.along, grid)
     else:
         raise UsageError(f"The pad of link {link.name!r} lies on a sphere; use a capsule or a box.")
@@ -62,7 +62,9 @@ def _centred(count: int, half: float) -> NDArray[np.float64]:
     return np.linspace(-half, half, count) if count > 1 else np.zeros(1)
 
 
-def _on_capsule(solid: Capsule, facing: Any, along: tuple[float, float], around: float, grid: Grid) -> tuple[Any, Any]:
+def _on_capsule(
+    solid: CapsuleGeometry, facing: Any, along: tuple[float, float], around: float, grid: Grid
+) -> tuple[Any, Any]:
     start, end = np.array(solid.start), np.array(solid.end)
     length = np.linalg.norm(end - start)
     axis = (end - start) / length
@@ -80,7 +82,7 @@ def _on_capsule(solid: Capsule, facing: Any, along: tuple[float, float], around:
     return start + np.minimum(arc, length)[:, None] * axis + solid.radius * normal, normal
 
 
-def _on_box(solid: Box, facing: Any, extent: tuple[float, float], grid: Grid) -> tuple[Any, Any]:
+def _on_box(solid: BoxGeometry, facing: Any, extent: tuple[float, float], grid: Grid) -> tuple[Any, Any]:
     normal = np.array(facing, dtype=float)
     face = int(np.argmax(np.abs(normal)))
     # Columns run along z where the face has one, rows across.

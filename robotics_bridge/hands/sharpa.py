@@ -9,7 +9,17 @@ from __future__ import annotations
 
 import math
 
-from robotics_bridge.hands.spec import Box, Capsule, Grid, HandSpec, Joint, Link, Pad, Sphere, Vector
+from robotics_bridge.hands.spec import (
+    BoxGeometry,
+    CapsuleGeometry,
+    Grid,
+    HandSpec,
+    Joint,
+    Link,
+    Pad,
+    SphereGeometry,
+    Vector,
+)
 
 _HALF = math.pi / 2
 _AXIS = (0.0, 0.0, 1.0)
@@ -49,19 +59,19 @@ def _finger_links(name: str, tip: int) -> tuple[Link, ...]:
     """Return the four links; ``tip`` is the number of active probes of the finger tip at high resolution."""
     cap = 0.0075 * _HALF
     return (
-        Link(f"right_{name}_MCP_VL", 1e-6, (Sphere(_NONE, 0.008),)),
+        Link(f"right_{name}_MCP_VL", 1e-6, (SphereGeometry(_NONE, 0.008),)),
         Link(
-            f"right_{name}_PP", 0.04138, (Capsule((0.014, 0.0, 0.0), (0.0445, 0.0, 0.0), 0.0095),),
+            f"right_{name}_PP", 0.04138, (CapsuleGeometry((0.014, 0.0, 0.0), (0.0445, 0.0, 0.0), 0.0095),),
             Pad((0.0, 0.0, 1.0), (0.002, 0.028), 0.9),
             {"low": Grid(2, 2, 0.004), "med": Grid(3, 4, 0.004), "high": Grid(6, 7, 0.003)},
         ),
         Link(
-            f"right_{name}_MP", 0.02509, (Capsule((0.008, 0.0, 0.0), (0.0275, 0.0, 0.0), 0.0087),),
+            f"right_{name}_MP", 0.02509, (CapsuleGeometry((0.008, 0.0, 0.0), (0.0275, 0.0, 0.0), 0.0087),),
             Pad((0.0, 1.0, 0.0), (0.002, 0.018), 0.9),
             {"low": Grid(2, 2, 0.004), "med": Grid(4, 3, 0.004), "high": Grid(6, 6, 0.003)},
         ),
         Link(
-            f"right_{name}_DP", 0.0041, (Capsule((0.0065, -0.001, 0.0), (0.0182, -0.001, 0.0), 0.0075),),
+            f"right_{name}_DP", 0.0041, (CapsuleGeometry((0.0065, -0.001, 0.0), (0.0182, -0.001, 0.0), 0.0075),),
             Pad((0.0, 1.0, 0.0), (0.001, 0.0117 + 0.6 * cap), 0.9),
             {"low": Grid(3, 3, 0.004), "med": Grid(4, 4, 0.004, 14), "high": Grid(7, 7, 0.003, tip)},
         ),
@@ -73,18 +83,18 @@ def _thumb() -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
     links = (
         Link("right_thumb_CMC_VL", 1e-6),
         Link(
-            "right_thumb_MC", 0.116, (Capsule((0.014, -0.004, 0.008), (0.056, -0.005, 0.010), 0.0125),),
+            "right_thumb_MC", 0.116, (CapsuleGeometry((0.014, -0.004, 0.008), (0.056, -0.005, 0.010), 0.0125),),
             Pad((0.0, 0.85, 0.53), (0.012, 0.034), 0.7),
             {"low": Grid(2, 2, 0.004), "med": Grid(3, 3, 0.004), "high": Grid(5, 6, 0.003)},
         ),
-        Link("right_thumb_MCP_VL", 1e-6, (Sphere(_NONE, 0.009),)),
+        Link("right_thumb_MCP_VL", 1e-6, (SphereGeometry(_NONE, 0.009),)),
         Link(
-            "right_thumb_PP", 0.04955, (Capsule((0.0125, 0.0, 0.0), (0.035, 0.0, 0.0), 0.0098),),
+            "right_thumb_PP", 0.04955, (CapsuleGeometry((0.0125, 0.0, 0.0), (0.035, 0.0, 0.0), 0.0098),),
             Pad((0.0, 0.0, 1.0), (0.002, 0.020), 0.8),
             {"low": Grid(2, 2, 0.004), "med": Grid(3, 3, 0.004), "high": Grid(5, 4, 0.003)},
         ),
         Link(
-            "right_thumb_DP", 0.00599, (Capsule((0.0075, -0.001, 0.0), (0.0206, -0.001, 0.0), 0.0083),),
+            "right_thumb_DP", 0.00599, (CapsuleGeometry((0.0075, -0.001, 0.0), (0.0206, -0.001, 0.0), 0.0083),),
             Pad((0.0, 1.0, 0.0), (0.001, 0.0131 + 0.6 * cap), 0.9),
             {"low": Grid(3, 3, 0.004), "med": Grid(4, 4, 0.004, 14), "high": Grid(8, 8, 0.003, 59)},
         ),
@@ -111,12 +121,15 @@ def _thumb() -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
 
 _PALM = Link(
     "right_hand_C_MC", 0.72045,
-    (Box((0.0, 0.0115, 0.044), (0.0215, 0.0315, 0.042)), Box((0.0, -0.031, 0.013), (0.019, 0.011, 0.013))),
+    (
+        BoxGeometry((0.0, 0.0115, 0.044), (0.0215, 0.0315, 0.042)),
+        BoxGeometry((0.0, -0.031, 0.013), (0.019, 0.011, 0.013)),
+    ),
     Pad((1.0, 0.0, 0.0), (0.026, 0.033)),
     {"low": Grid(3, 3, 0.004), "med": Grid(4, 4, 0.004), "high": Grid(11, 11, 0.003)},
 )  # fmt: skip
 _PINKY_PALM = Link(
-    "right_pinky_MC", 0.12541, (Box((0.010, 0.0085, -0.033), (0.019, 0.0105, 0.021)),),
+    "right_pinky_MC", 0.12541, (BoxGeometry((0.010, 0.0085, -0.033), (0.019, 0.0105, 0.021)),),
     Pad((-1.0, 0.0, 0.0), (0.008, 0.017)),
     {"low": Grid(2, 2, 0.004), "med": Grid(2, 3, 0.004), "high": Grid(7, 8, 0.003, 53)},
 )  # fmt: skip

@@ -21,7 +21,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Capsule:
+class CapsuleGeometry:
     """A cylinder with round ends."""
 
     start: Vector
@@ -33,7 +33,7 @@ class Capsule:
 
 
 @dataclass(frozen=True)
-class Box:
+class BoxGeometry:
     """A box along the axes of its link."""
 
     center: Vector
@@ -43,7 +43,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Sphere:
+class SphereGeometry:
     """A ball."""
 
     center: Vector
@@ -52,7 +52,7 @@ class Sphere:
     """[m]."""
 
 
-Solid = Capsule | Box | Sphere
+Solid = CapsuleGeometry | BoxGeometry | SphereGeometry
 
 
 @dataclass(frozen=True)
@@ -232,23 +232,23 @@ def _add_solids(body: Any, link: Link) -> None:
         body.mass, body.inertia = link.mass, (1e-8, 1e-8, 1e-8)
     for index, solid in enumerate(link.solids):
         common = {"name": f"{link.name}_{index}", "mass": float(link.mass * volumes[index] / volumes.sum())}
-        if isinstance(solid, Capsule):
+        if isinstance(solid, CapsuleGeometry):
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
                 fromto=(*solid.start, *solid.end),
                 size=(solid.radius, 0, 0),
                 **common,
             )
-        elif isinstance(solid, Box):
+        elif isinstance(solid, BoxGeometry):
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=solid.center, size=solid.half, **common)
         else:
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=solid.center, size=(solid.radius, 0, 0), **common)
 
 
 def _volume(solid: Solid) -> float:
-    if isinstance(solid, Box):
+    if isinstance(solid, BoxGeometry):
         return 8 * math.prod(solid.half)
     ball = 4 / 3 * math.pi * solid.radius**3
-    if isinstance(solid, Sphere):
+    if isinstance(solid, SphereGeometry):
         return ball
     return ball + math.pi * solid.radius**2 * math.dist(solid.start, solid.end)

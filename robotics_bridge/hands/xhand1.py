@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from robotics_bridge.hands.spec import Box, Capsule, Grid, HandSpec, Joint, Link, Pad, Vector
+from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, HandSpec, Joint, Link, Pad, Vector
 
 _NEAR, _FAR = (6.6, 8.63), (10.0, 14.38)
 """Effort [N·m] and speed [rad/s] of the drives at the base and at the tip of a finger."""
@@ -29,8 +29,8 @@ def _joint(
 
 
 def _phalanges(first: str, second: str) -> tuple[Link, Link]:
-    near = Capsule((0.0015, 0.0, 0.014), (0.0015, 0.0, 0.050), 0.0092)
-    far = Capsule((0.0015, 0.0, 0.008), (0.0015, 0.0, 0.0336), 0.0088)
+    near = CapsuleGeometry((0.0015, 0.0, 0.014), (0.0015, 0.0, 0.050), 0.0092)
+    far = CapsuleGeometry((0.0015, 0.0, 0.008), (0.0015, 0.0, 0.0336), 0.0088)
     cap = 0.0088 * math.pi / 2
     return (
         Link(
@@ -47,14 +47,14 @@ def _phalanges(first: str, second: str) -> tuple[Link, Link]:
 def _thumb() -> tuple[Link, ...]:
     cap = 0.0112 * math.pi / 2
     return (
-        Link("right_hand_thumb_bend_link", 0.01151, (Capsule((0.0, 0.002, 0.0), (0.0, 0.024, 0.0), 0.0085),)),
+        Link("right_hand_thumb_bend_link", 0.01151, (CapsuleGeometry((0.0, 0.002, 0.0), (0.0, 0.024, 0.0), 0.0085),)),
         Link(
-            "right_hand_thumb_rota_link1", 0.1323, (Capsule((0.0, 0.012, 0.0), (0.0, 0.0515, 0.0), 0.0118),),
+            "right_hand_thumb_rota_link1", 0.1323, (CapsuleGeometry((0.0, 0.012, 0.0), (0.0, 0.0515, 0.0), 0.0118),),
             Pad((0.0, 0.0, 1.0), (0.002, 0.036), 0.9),
             {"low": Grid(3, 3, 0.004), "med": Grid(4, 4, 0.004), "high": Grid(7, 8, 0.003)},
         ),
         Link(
-            "right_hand_thumb_rota_link2", 0.03517, (Capsule((0.0, 0.008, 0.0), (0.0, 0.040, 0.0), 0.0112),),
+            "right_hand_thumb_rota_link2", 0.03517, (CapsuleGeometry((0.0, 0.008, 0.0), (0.0, 0.040, 0.0), 0.0112),),
             Pad((0.0, 0.0, 1.0), (0.008, 0.032 + 0.6 * cap), 0.9),
             {"low": Grid(3, 3, 0.004), "med": Grid(4, 5, 0.004), "high": Grid(7, 6, 0.003, 40)},
         ),
@@ -76,11 +76,13 @@ _FINGERS = {
     "pinky": ("pinky_link1", "pinky_link2"),
 }
 _PALM = Link(
-    "right_hand_link", 0.5385, (Box((0.0, -0.0035, 0.051), (0.0225, 0.0455, 0.048)),),
+    "right_hand_link", 0.5385, (BoxGeometry((0.0, -0.0035, 0.051), (0.0225, 0.0455, 0.048)),),
     Pad((1.0, 0.0, 0.0), (0.040, 0.042)),
     {"low": Grid(4, 3, 0.004), "med": Grid(7, 5, 0.004), "high": Grid(20, 11, 0.0016, 219)},
 )  # fmt: skip
-_INDEX_BASE = Link("right_hand_index_bend_link", 0.06872, (Capsule((0.0, 0.0, 0.002), (0.0, 0.0, 0.012), 0.008),))
+_INDEX_BASE = Link(
+    "right_hand_index_bend_link", 0.06872, (CapsuleGeometry((0.0, 0.0, 0.002), (0.0, 0.0, 0.012), 0.008),)
+)
 
 
 def xhand1() -> HandSpec:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from robotics_bridge.physics.benchmark_scene import initial_velocities, pyramid
 from robotics_bridge.physics.cpu import MujocoEngine
 from robotics_bridge.physics.gpu import MujocoWarpEngine
-from robotics_bridge.physics.scene import KINDS, Geometry, Scene, Variants
+from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene, Variants
 from robotics_bridge.physics.state import CROWDED, DIVERGED, HandState
 from robotics_bridge.physics.variants import compile_variants
 
@@ -17,7 +17,7 @@ __all__ = [
     "HandState",
     "MujocoEngine",
     "MujocoWarpEngine",
-    "Scene",
+    "TouchScene",
     "Variants",
     "compile_variants",
     "initial_velocities",

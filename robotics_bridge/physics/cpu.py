@@ -12,7 +12,7 @@ import numpy as np
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.model_fields import check_fields
-from robotics_bridge.physics.scene import Scene
+from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class MujocoEngine:
         self.model: Any = models[0]
         """The model, or the first of its variants."""
         order = list(assignment) or list(range(len(models)))
-        self.scene: Scene = Scene.from_mujoco(models[0], models[1:], assignment)
+        self.scene: TouchScene = TouchScene.from_mujoco(models[0], models[1:], assignment)
         self.num_envs = num_envs
         varied = check_fields(models[0], fields or {}, num_envs)
         self._models = [models[order[env % len(order)]] for env in range(num_envs)]

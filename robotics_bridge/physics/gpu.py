@@ -11,7 +11,7 @@ from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
 from robotics_bridge.physics.kernels.state import mujoco_kernels
 from robotics_bridge.physics.model_fields import check_fields, differing_fields
-from robotics_bridge.physics.scene import Scene
+from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class MujocoWarpEngine:
         models = list(model) if isinstance(model, (list, tuple)) else [model]
         self.model: Any = models[0]
         self.num_envs = num_envs
-        self.scene: Scene = Scene.from_mujoco(models[0], models[1:], assignment)
+        self.scene: TouchScene = TouchScene.from_mujoco(models[0], models[1:], assignment)
         order = list(assignment) or list(range(len(models)))
         varied = differing_fields(models, order, num_envs) if len(models) > 1 else {}
         varied |= check_fields(self.model, fields or {}, num_envs)

@@ -102,7 +102,7 @@ class Variants:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class TouchScene:
     """Links, their geometries and the pairs that may touch; says nothing about motion.
 
     Raises:
@@ -181,7 +181,7 @@ class Scene:
         return tuple(sorted(found))
 
     @classmethod
-    def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> Scene:
+    def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> TouchScene:
         """Read the scene out of a compiled ``mujoco.MjModel``; link 0 is the world.
 
         Args:

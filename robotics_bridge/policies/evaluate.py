@@ -23,7 +23,7 @@ _Z = 1.959964
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class PolicyEvaluation:
     """Episodes of one agent. The episodes of one evaluation are independent given the agent."""
 
     agent: str
@@ -114,7 +114,7 @@ def evaluate(
     seed: int | Sequence[int] = (0, 1, 2),
     name: str = "policy",
     progress: Callable[[int, int, str], None] | None = None,
-) -> Evaluation:
+) -> PolicyEvaluation:
     """Run whole episodes and return how they went.
 
     Each environment contributes equally many episodes, so that short ones are not counted more often.
@@ -166,7 +166,7 @@ def evaluate(
             progress(index + 1, len(seeds), f"evaluating {name}")
     metric, returns, lengths, diverged, goals, turned, dropped = zip(*rows, strict=True)
     seconds = tuple(n * env.step_dt for n in lengths)
-    return Evaluation(
+    return PolicyEvaluation(
         agent=name, task=env.task.name, seeds=seeds, success=tuple(m >= env.task.success.threshold for m in metric),
         metric=metric, returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
         per_seed=tuple(rates), goals=goals, seconds=seconds, dropped=tuple(map(bool, dropped)),

@@ -20,7 +20,7 @@ TABLE = Path(__file__).with_name("fidelity_table.json")
 
 
 @dataclass(frozen=True)
-class Fidelity:
+class SensorFidelity:
     """Settings that trade exactness for speed; the rest of a sensor is its own.
 
     Raises:
@@ -44,14 +44,14 @@ class Fidelity:
             )
 
     @classmethod
-    def preset(cls, name: str) -> Fidelity:
+    def preset(cls, name: str) -> SensorFidelity:
         """Return ``fast``, ``balanced`` or ``accurate``; an unknown name raises UsageError."""
         if name not in PRESETS:
             raise unknown_name("tactile fidelity", name, PRESETS)
         return PRESETS[name]
 
     @classmethod
-    def auto(cls, error: float) -> Fidelity:
+    def auto(cls, error: float) -> SensorFidelity:
         """Return the cheapest measured settings whose relative force errors are at most ``error``.
 
         Raises:
@@ -73,10 +73,10 @@ class Fidelity:
         return out
 
 
-PRESETS: dict[str, Fidelity] = {
-    "fast": Fidelity("sdf", 32, 500),
-    "balanced": Fidelity("sdf", 64, 2000),
-    "accurate": Fidelity("raycast", 128, 16_000),
+PRESETS: dict[str, SensorFidelity] = {
+    "fast": SensorFidelity("sdf", 32, 500),
+    "balanced": SensorFidelity("sdf", 64, 2000),
+    "accurate": SensorFidelity("raycast", 128, 16_000),
 }
 """Named settings; the table says what each costs and errs."""
 

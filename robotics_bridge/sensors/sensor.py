@@ -21,7 +21,7 @@ from robotics_bridge.sensors.noise.stages import DelayLine, NoisePart, NoiseStag
 from robotics_bridge.sensors.probes.placement import Probes
 
 if TYPE_CHECKING:
-    from robotics_bridge.physics.scene import Scene
+    from robotics_bridge.physics.scene import TouchScene
     from robotics_bridge.physics.state import HandState
     from robotics_bridge.sensors.queries.pairs import PairTable
     from robotics_bridge.sensors.queries.solids import Solids
@@ -30,7 +30,7 @@ Convention = Literal["physical", "thesis"]
 
 
 @dataclass(frozen=True)
-class Asks:
+class QueryRequirements:
     """What a sensor needs built for it."""
 
     fields: frozenset[int] = frozenset()
@@ -69,10 +69,10 @@ class Sensor(abc.ABC):
         """Sensors of one class and equal group share one runtime and its kernels."""
         return ()
 
-    def asks(self, scene: Scene) -> Asks:
+    def asks(self, scene: TouchScene) -> QueryRequirements:
         """Return what must be built for it."""
         del scene
-        return Asks()
+        return QueryRequirements()
 
     @classmethod
     @abc.abstractmethod
@@ -96,7 +96,7 @@ class Clock:
 class Context:
     """What a suite lends to the runtimes of its sensors."""
 
-    scene: Scene
+    scene: TouchScene
     num_envs: int
     device: Any
     seed: int
@@ -106,7 +106,7 @@ class Context:
 
 
 @dataclass(frozen=True)
-class Place:
+class ReadoutSlice:
     """Where the reading of one sensor lies in planar storage."""
 
     start: int
@@ -123,7 +123,7 @@ class Place:
 class Runtime(abc.ABC):
     """Serves the sensors of one group. Updates launch kernels and do nothing else, so that they can be recorded."""
 
-    places: Mapping[str, Place]
+    places: Mapping[str, ReadoutSlice]
     recordable: bool = True
     """Whether its updates can become part of a CUDA graph."""
 
@@ -180,7 +180,7 @@ class ReadoutRuntime(Runtime):
         self.places = {}
         parts, start = [], 0
         for name, sensor in sensors.items():
-            place = Place(start, sensor.layout(), sensor.channels == 0)
+            place = ReadoutSlice(start, sensor.layout(), sensor.channels == 0)
             mask = None if active is None else active[start : start + place.count]
             parts.append(NoisePart(name, sensor.noise, start, place.layout, mask))
             self.places[name] = place
@@ -263,7 +263,7 @@ class ProbeSensor(Sensor):
         """Shape (N,) or (rows, columns) of the reading of one environment, without channels."""
         return self.probes.shape
 
-    def tracked(self, scene: Scene) -> tuple[int, ...]:
+    def tracked(self, scene: TouchScene) -> tuple[int, ...]:
         """Return the numbers of the geometries it looks at."""
         scene.link_index(self.link)
         if not self.track:
@@ -292,10 +292,10 @@ class QuerySensor(ProbeSensor):
         """Sensors of one class and equal group share one runtime and its kernels."""
         return (self.query,)
 
-    def asks(self, scene: Scene) -> Asks:
+    def asks(self, scene: TouchScene) -> QueryRequirements:
         """Return what must be built for it."""
         tracked = frozenset(self.tracked(scene))
-        return Asks(fields=tracked) if self.query == "sdf" else Asks(trees=tracked)
+        return QueryRequirements(fields=tracked) if self.query == "sdf" else QueryRequirements(trees=tracked)
 
 
 class ProbeRuntime(ReadoutRuntime):
@@ -362,7 +362,7 @@ _SHARED_CUDA = {CLEAN: (8, 3072), FUSED: (4, 6144), STAGED: (8, 3072)}
 """The same on a GPU by mode: at most, and probes of a multiprocessor for each of them (measured on an H200)."""
 
 
-def probe_rows(places: Iterable[Place], context: Context, mode: int) -> np.ndarray:
+def probe_rows(places: Iterable[ReadoutSlice], context: Context, mode: int) -> np.ndarray:
     """Return rows (first, end, step, number of the sensor) [R, 4] of probes that one thread takes in turn.
 
     What all probes of an environment share is then read less often. On a GPU the rows of neighbouring threads are
@@ -402,7 +402,7 @@ def enclosing_sphere(probes: Probes) -> tuple[np.ndarray, float]:
 class History:
     """The last readings of one sensor, ready as one contiguous window."""
 
-    def __init__(self, place: Place, channels: int, length: int, context: Context) -> None:
+    def __init__(self, place: ReadoutSlice, channels: int, length: int, context: Context) -> None:
         wp = warp()
         self.place, self.length, self._context = place, length, context
         shape = (2 * length, channels, context.num_envs, place.count)

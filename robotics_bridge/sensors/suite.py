@@ -15,13 +15,13 @@ from robotics_bridge.sensors.probes.sensors import DistanceRuntime
 from robotics_bridge.sensors.queries.kernels.pairs import begin_kernel
 from robotics_bridge.sensors.queries.pairs import PairTable
 from robotics_bridge.sensors.queries.solids import Solids
-from robotics_bridge.sensors.sensor import Clock, Context, History, Place, Runtime, Sensor
+from robotics_bridge.sensors.sensor import Clock, Context, History, ReadoutSlice, Runtime, Sensor
 
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.physics.scene import Scene
-    from robotics_bridge.sensors.fidelity import Fidelity
+    from robotics_bridge.physics.scene import TouchScene
+    from robotics_bridge.sensors.fidelity import SensorFidelity
 
 
 class SensorSuite:
@@ -56,7 +56,7 @@ class SensorSuite:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: TouchScene,
         sensors: Mapping[str, Sensor],
         *,
         num_envs: int,
@@ -64,7 +64,7 @@ class SensorSuite:
         seed: int = 0,
         env_offset: int = 0,
         resolution: int | None = None,
-        fidelity: Fidelity | None = None,
+        fidelity: SensorFidelity | None = None,
     ) -> None:
         wp = warp()
         if fidelity is not None:
@@ -252,7 +252,7 @@ class SensorSuite:
             raise unknown_name("sensor", name, tuple(self._owner))
         return self._owner[name]
 
-    def _place(self, name: str) -> Place:
+    def _place(self, name: str) -> ReadoutSlice:
         return self._owner[name].places[name]
 
     def _view(self, name: str, planes: Any) -> torch.Tensor:

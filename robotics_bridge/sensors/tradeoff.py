@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from brainbench.core.files import write_json
-from robotics_bridge.physics import Geometry, HandState, Scene
-from robotics_bridge.sensors.fidelity import Fidelity
+from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.surface_points import surface_points
 from robotics_bridge.sensors.sensor import Sensor
@@ -121,7 +120,7 @@ def _closest(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray:
 
 def _run(solid: Geometry, sensor: Sensor, places: NDArray, resolution: int = 64) -> tuple[NDArray, float]:
     """Readings over places [n, 3] of an object, and the cost of an update per environment (µs)."""
-    scene = Scene(("world", "hand", "object"), (_PAD, solid))
+    scene = TouchScene(("world", "hand", "object"), (_PAD, solid))
     count = len(places)
     suite = SensorSuite(scene, {"s": sensor}, num_envs=count, resolution=resolution)
     state = HandState.empty(count, 3, count)
@@ -274,4 +273,4 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
     figure.savefig(path)
 
 
-__all__ = ["Fidelity", "measure_tradeoff", "plot_tradeoff", "triangle_distance"]
+__all__ = ["measure_tradeoff", "plot_tradeoff", "triangle_distance"]

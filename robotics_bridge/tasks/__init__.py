@@ -9,7 +9,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from robotics_bridge.tasks.registry import forget, list_tasks, load, register
-from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
+from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import (
     ActuatorRandomisation,
     Ending,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ActuatorRandomisation",
-    "Decoder",
+    "AuxiliaryDecoder",
     "Ending",
     "ObjectRandomisation",
     "Placement",

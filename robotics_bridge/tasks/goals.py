@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.tasks.rotations import about, constant, multiply, tilted
+from brainbench.core.rotations import about, constant, multiply, tilted
 
 if TYPE_CHECKING:
     import torch

@@ -15,14 +15,14 @@ from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import ball
 from robotics_bridge.tasks.registry import register
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import ACTION_LIMIT, Noise, Placement, Reward, Success, Task
-from robotics_bridge.tasks.thermometers import Thermal, Thermometers
+from robotics_bridge.tasks.task import ACTION_LIMIT, ObservationNoise, Placement, Reward, Success, Task
+from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 
 if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.envs.env import Env
-    from robotics_bridge.tasks.step_context import Moment
+    from robotics_bridge.tasks.step_context import StepContext
 
 SIDE, WALL, HEIGHT, TILT = 0.5, 0.0125, 0.25, math.radians(10)
 """Outer edge of the bin, thickness of its walls and floor, its height [m], and how far it leans about y [rad]."""
@@ -54,17 +54,17 @@ def bin_walls(spec: Any) -> None:
         body.add_geom(name=f"bin_{index}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=position, size=size)
 
 
-def thermometers(thermal: Thermal) -> Callable[[Env], Thermometers]:
+def thermometers(thermal: ThermalSettings) -> Callable[[Env], Thermometers]:
     """Return what makes the thermometers of this material."""
     return lambda env: Thermometers(env, thermal)
 
 
-def extra(m: Moment, *, name: str) -> torch.Tensor:
+def extra(m: StepContext, *, name: str) -> torch.Tensor:
     """Return what the thermometers add to a moment: ``progress``, ``latched`` or ``holding`` [B]."""
     return m.extras[name]
 
 
-def reach(m: Moment, *, sigma: float) -> torch.Tensor:
+def reach(m: StepContext, *, sigma: float) -> torch.Tensor:
     """Return exp(−d/σ) of the distance d (m) from the nearest finger tip to the hot ball's centre."""
     return (-m.extras["reach"] / sigma).exp()
 
@@ -72,10 +72,10 @@ def reach(m: Moment, *, sigma: float) -> torch.Tensor:
 @register("hot_ball", "published")
 def published() -> Task:
     """Return the task of section 4.6.3 at the cell of figure 4.8 that succeeds (150 W/(m·K), 0.5, 500 W/m²)."""
-    return with_thermal(Thermal())
+    return with_thermal(ThermalSettings())
 
 
-def with_thermal(thermal: Thermal) -> Task:
+def with_thermal(thermal: ThermalSettings) -> Task:
     """Return the task for fingers and balls of other materials."""
     # The palm faces uphill, so that the thumb stays within the bin.
     down = ((0.0, 0.0, 0.42), (0.0, 0.0, 1.0, 0.0))
@@ -101,7 +101,7 @@ def with_thermal(thermal: Thermal) -> Task:
         # Success is S > 0: one control step of latched contact.
         success=Success(metric="contact", threshold=0.025),
         episode=20.0,
-        noise=Noise(position=0.005, velocity=0.005),
+        noise=ObservationNoise(position=0.005, velocity=0.005),
         groups={
             "actor": ("priv_proprio", "priv_obj_state", "priv_thermal"),
             "critic": ("priv_proprio", "priv_obj_state", "priv_thermal"),

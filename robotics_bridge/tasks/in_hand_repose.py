@@ -17,8 +17,8 @@ from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import (
     ACTION_LIMIT,
     Ending,
-    Noise,
     ObjectRandomisation,
+    ObservationNoise,
     Placement,
     Push,
     Reward,
@@ -55,7 +55,7 @@ def published() -> Task:
         episode=20.0,
         object_changes=ObjectRandomisation(friction=(0.3, 2.0), mass_offset=(0.0, 0.1), each_reset=False),
         push=Push(x=(-1.0, 1.0), y=(-1.0, 1.0), z=(-1.0, 1.0), interval=(2.0, 4.0)),
-        noise=Noise(position=0.005, velocity=0.01),
+        noise=ObservationNoise(position=0.005, velocity=0.01),
         goal_terms=("orientation", "difference", "angle"),
         groups={
             "actor": ("goal", "priv_proprio", "priv_obj_state"),

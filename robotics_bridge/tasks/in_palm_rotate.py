@@ -12,12 +12,12 @@ from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.objects import PRIMITIVES
 from robotics_bridge.tasks.registry import register
-from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
+from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import (
     ACTION_LIMIT,
     Ending,
-    Noise,
     ObjectRandomisation,
+    ObservationNoise,
     Placement,
     Push,
     Reward,
@@ -66,7 +66,7 @@ def published() -> Task:
         episode=10.0,
         object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1)),
         push=Push(x=(-1.0, 1.0), y=(-1.0, 1.0), z=(-1.0, 1.0), interval=(2.0, 4.0)),
-        noise=Noise(position=0.005, velocity=0.005),
+        noise=ObservationNoise(position=0.005, velocity=0.005),
         goal_terms=("angle",),
         auxiliary=("aux_obj_size", "aux_goal_dist"),
         groups={
@@ -77,7 +77,10 @@ def published() -> Task:
             # Table 4.7 gives the student the goal; the released settings of this task leave it out.
             "student": ("proprio", "goal"),
         },
-        decoders=(Decoder("aux_obj_size", 1.0, 20.0, (128, 64)), Decoder("aux_goal_dist", 1.0, 1.0, (128, 64))),
+        decoders=(
+            AuxiliaryDecoder("aux_obj_size", 1.0, 20.0, (128, 64)),
+            AuxiliaryDecoder("aux_goal_dist", 1.0, 1.0, (128, 64)),
+        ),
         teacher=TeacherSettings(iterations=6000),
         student=StudentSettings(iterations=6000, learning_rate=1e-4, gradient_length=2, max_grad_norm=2.0),
     )

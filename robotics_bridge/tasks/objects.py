@@ -20,7 +20,7 @@ _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
 
 
 @dataclass(frozen=True)
-class Solid:
+class ObjectPrimitive:
     """A primitive in the body's frame.
 
     Raises:
@@ -43,17 +43,17 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class Shape:
+class ObjectShape:
     """One object: its solids and its outer measures."""
 
     name: str
-    solids: tuple[Solid, ...]
+    solids: tuple[ObjectPrimitive, ...]
     extent: tuple[float, float, float]
     """Edges of the box around it, along the body's axes [m]."""
     bottom: float
     """How far below the body's origin it reaches when upright [m]."""
 
-    def scaled(self, factor: float) -> Shape:
+    def scaled(self, factor: float) -> ObjectShape:
         """Return the shape with all lengths multiplied."""
         solids = tuple(
             replace(
@@ -65,30 +65,32 @@ class Shape:
         )
         x, y, z = self.extent
         name = f"{self.name}×{factor:.3g}"
-        return Shape(name, solids, (factor * x, factor * y, factor * z), factor * self.bottom)
+        return ObjectShape(name, solids, (factor * x, factor * y, factor * z), factor * self.bottom)
 
 
-def box(x: float, y: float, z: float) -> Shape:
+def box(x: float, y: float, z: float) -> ObjectShape:
     """Return a block with these edges [m]."""
-    return Shape(f"box {x:g} {y:g} {z:g}", (Solid("box", (x / 2, y / 2, z / 2)),), (x, y, z), z / 2)
+    return ObjectShape(f"box {x:g} {y:g} {z:g}", (ObjectPrimitive("box", (x / 2, y / 2, z / 2)),), (x, y, z), z / 2)
 
 
-def cylinder(radius: float, height: float) -> Shape:
+def cylinder(radius: float, height: float) -> ObjectShape:
     """Return an upright cylinder [m]."""
-    solid = Solid("cylinder", (radius, height / 2))
-    return Shape(f"cylinder {radius:g} {height:g}", (solid,), (2 * radius, 2 * radius, height), height / 2)
+    solid = ObjectPrimitive("cylinder", (radius, height / 2))
+    return ObjectShape(f"cylinder {radius:g} {height:g}", (solid,), (2 * radius, 2 * radius, height), height / 2)
 
 
-def ball(radius: float) -> Shape:
+def ball(radius: float) -> ObjectShape:
     """Return a ball [m]."""
-    return Shape(f"ball {radius:g}", (Solid("sphere", (radius,)),), (2 * radius, 2 * radius, 2 * radius), radius)
+    return ObjectShape(
+        f"ball {radius:g}", (ObjectPrimitive("sphere", (radius,)),), (2 * radius, 2 * radius, 2 * radius), radius
+    )
 
 
 _UPRIGHT_Y = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 """Turns the z axis of a primitive onto the body's y axis."""
 
 
-def screwdriver(length: float, handle_length: float, handle_radius: float, shaft_radius: float) -> Shape:
+def screwdriver(length: float, handle_length: float, handle_radius: float, shaft_radius: float) -> ObjectShape:
     """Return a screwdriver along the body's y axis, tip at the origin, handle above [m].
 
     The handle is a cylinder, the shaft a capsule that ends in the tip.
@@ -104,16 +106,18 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
     """
     if not 0 < handle_length < length:
         raise UsageError(f"The handle is shorter than the tool; received {handle_length} m of {length} m.")
-    handle = Solid("cylinder", (handle_radius, handle_length / 2), (0.0, length - handle_length / 2, 0.0), _UPRIGHT_Y)
+    handle = ObjectPrimitive(
+        "cylinder", (handle_radius, handle_length / 2), (0.0, length - handle_length / 2, 0.0), _UPRIGHT_Y
+    )
     free = length - handle_length
-    shaft = Solid(
+    shaft = ObjectPrimitive(
         "capsule", (shaft_radius, (free - shaft_radius) / 2), (0.0, (free + shaft_radius) / 2, 0.0), _UPRIGHT_Y
     )
     wide = 2 * max(handle_radius, shaft_radius)
-    return Shape(f"screwdriver {handle_radius:g}", (handle, shaft), (wide, length, wide), 0.0)
+    return ObjectShape(f"screwdriver {handle_radius:g}", (handle, shaft), (wide, length, wide), 0.0)
 
 
-def with_sizes(shapes: Sequence[Shape], span: tuple[float, float], steps: int = 8) -> tuple[Shape, ...]:
+def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float], steps: int = 8) -> tuple[ObjectShape, ...]:
     """Return every shape at several sizes, evenly over a range of factors; (1, 1) leaves them as they are.
 
     Args:
@@ -132,14 +136,16 @@ def with_sizes(shapes: Sequence[Shape], span: tuple[float, float], steps: int = 
     return tuple(shape.scaled(factor) for factor in factors for shape in shapes)
 
 
-def slots(shapes: Sequence[Shape]) -> tuple[str, ...]:
+def slots(shapes: Sequence[ObjectShape]) -> tuple[str, ...]:
     """Return the kinds of solids that hold every shape: as many of each kind as any shape has."""
     kinds = sorted({solid.kind for shape in shapes for solid in shape.solids})
     most = {kind: max(sum(s.kind == kind for s in shape.solids) for shape in shapes) for kind in kinds}
     return tuple(kind for kind in kinds for _ in range(most[kind]))
 
 
-def add_object(spec: Any, name: str, shape: Shape, kinds: Sequence[str], *, density: float, **contact: Any) -> None:
+def add_object(
+    spec: Any, name: str, shape: ObjectShape, kinds: Sequence[str], *, density: float, **contact: Any
+) -> None:
     """Add a free body with the solids of a shape to a ``mujoco.MjSpec``.
 
     Args:
@@ -165,7 +171,7 @@ def add_object(spec: Any, name: str, shape: Shape, kinds: Sequence[str], *, dens
         solid = next((s for s in waiting if s.kind == kind), None)
         if solid is not None:
             waiting.remove(solid)
-        used = solid or Solid(kind, (GRAIN,) * _SIZES[kind], middle.position)
+        used = solid or ObjectPrimitive(kind, (GRAIN,) * _SIZES[kind], middle.position)
         # What the shape takes part in decides: friction of the object alone, whatever the hand is made of.
         body.add_geom(
             name=f"{name}_{index}", type=types[kind], size=[*used.size, 0.0, 0.0][:3], pos=used.position,

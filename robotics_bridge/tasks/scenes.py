@@ -11,7 +11,7 @@ import numpy as np
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from robotics_bridge.hands.hand import Hand, palmar_directions
-from robotics_bridge.tasks.objects import Shape, add_object, slots, with_sizes
+from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,7 +38,7 @@ class TaskModel:
 
     models: Sequence[Any]
     """``mujoco.MjModel`` per shape; they differ in numbers only."""
-    shapes: tuple[Shape, ...]
+    shapes: tuple[ObjectShape, ...]
     """Of the objects, one per model."""
     objects: tuple[str, ...]
     """Names of the free bodies."""

@@ -13,12 +13,12 @@ from typing import Any
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import SCREWDRIVERS
 from robotics_bridge.tasks.registry import register
-from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
+from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import (
     ACTION_LIMIT,
     Ending,
-    Noise,
     ObjectRandomisation,
+    ObservationNoise,
     Placement,
     Push,
     Reward,
@@ -88,7 +88,7 @@ def published() -> Task:
         episode=20.0,
         object_changes=ObjectRandomisation(friction=(0.2, 1.2), mass_offset=(0.0, 0.2)),
         push=Push(x=(-5.0, 5.0), y=(-5.0, 5.0), z=(-5.0, 0.0), interval=(2.0, 4.0)),
-        noise=Noise(position=0.001, velocity=0.001),
+        noise=ObservationNoise(position=0.001, velocity=0.001),
         distances_in="priv_obj_state",
         auxiliary=("aux_obj_tilt", "aux_rotation_progress"),
         groups={
@@ -99,8 +99,8 @@ def published() -> Task:
             "student": ("proprio",),
         },
         decoders=(
-            Decoder("aux_obj_tilt", 0.5, 1.0, (512, 128)),
-            Decoder("aux_rotation_progress", 0.5, 1.0, (512, 128)),
+            AuxiliaryDecoder("aux_obj_tilt", 0.5, 1.0, (512, 128)),
+            AuxiliaryDecoder("aux_rotation_progress", 0.5, 1.0, (512, 128)),
         ),
         # Table 4.4 states a desired KL of 0.01; the released teacher has 0.02.
         teacher=TeacherSettings(iterations=5000, steps_per_env=12, discount=0.99, entropy=0.0),

@@ -153,7 +153,7 @@ class StudentSettings:
 
 
 @dataclass(frozen=True)
-class Decoder:
+class AuxiliaryDecoder:
     """A head that predicts an observation group from the student's latent (table 4.5)."""
 
     target: str

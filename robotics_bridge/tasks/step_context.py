@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class Moment:
+class StepContext:
     """Tensors at the end of a control step, before any environment is reset. World axes, SI units."""
 
     dt: float

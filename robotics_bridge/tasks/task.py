@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.tasks.goals import Goal
-from robotics_bridge.tasks.objects import PRIMITIVES, Shape
-from robotics_bridge.tasks.settings import Decoder, StudentSettings, TeacherSettings
+from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
+from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
 
 if TYPE_CHECKING:
-    from robotics_bridge.tasks.task_state import Watch
+    from robotics_bridge.tasks.task_state import TaskState
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""
@@ -126,7 +126,7 @@ class Solver:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Noise:
+class ObservationNoise:
     """Gaussian noise of the measured proprioception (released settings)."""
 
     position: float = 0.005
@@ -162,7 +162,7 @@ class Task:
     episode: float = 10.0
     """Longest duration [s]."""
     # --- scene ---
-    objects: tuple[Shape, ...] = PRIMITIVES
+    objects: tuple[ObjectShape, ...] = PRIMITIVES
     """Shapes of the object, spread over environments in turn."""
     copies: int = 1
     """Objects in the scene; more than one are equal but for what ``watch`` makes of them."""
@@ -197,14 +197,14 @@ class Task:
     actuators: ActuatorRandomisation | None = ActuatorRandomisation()
     object_changes: ObjectRandomisation = ObjectRandomisation()
     push: Push | None = None
-    noise: Noise = Noise()
+    noise: ObservationNoise = ObservationNoise()
     # --- what is to be reached ---
     goal: Goal | None = None
     turn_axis: tuple[float, float, float] | None = None
     """Axis of the object whose rotation is counted (its own frame)."""
     turn_window: int = 60
     """Steps over which stagnation is judged."""
-    watch: Callable[..., Watch] | None = None
+    watch: Callable[..., TaskState] | None = None
     """Makes the part of the task that keeps a state of its own (hot_ball's thermometers)."""
     # --- learning ---
     goal_terms: tuple[str, ...] = ()
@@ -215,7 +215,7 @@ class Task:
     """Further groups for decoders: ``aux_obj_size``, ``aux_goal_dist``, ``aux_obj_tilt``, ``aux_rotation_progress``."""
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Observation set (actor, critic, rnd_state, teacher, student) → groups."""
-    decoders: tuple[Decoder, ...] = ()
+    decoders: tuple[AuxiliaryDecoder, ...] = ()
     teacher: TeacherSettings = field(default_factory=TeacherSettings)
     student: StudentSettings = field(default_factory=StudentSettings)
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.tasks.step_context import Moment
+    from robotics_bridge.tasks.step_context import StepContext
 
 
-class Watch(Protocol):
+class TaskState(Protocol):
     """Made by ``task.watch(env)`` once; B environments."""
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -22,7 +22,7 @@ class Watch(Protocol):
         """Look at the state after a physics step of duration dt (s)."""
         ...
 
-    def after(self, moment: Moment) -> None:
+    def after(self, moment: StepContext) -> None:
         """Add to the moment at the end of a control step."""
         ...
 

@@ -1,12 +1,12 @@
 """Reward terms and conditions that end an episode: small functions of one moment of all environments.
 
-A term takes a :class:`~robotics_bridge.tasks.step_context.Moment` and its parameters and returns one number per
+A term takes a :class:`~robotics_bridge.tasks.step_context.StepContext` and its parameters and returns one number per
 environment
 [B]. Weights are per second: the environment multiplies by its weight and by the time of a control step, as
 manager-based environments do. Formulas behind the names of table 4.8 are not published; those here are ours.
 
 On CUDA the environment records terms into a graph: they run once as Python, later only as what they launched. A term
-that copies numbers to the device takes them from :func:`~robotics_bridge.tasks.rotations.constant`; one that waits for
+that copies numbers to the device takes them from :func:`~brainbench.core.rotations.constant`; one that waits for
 the device, or counts in Python, needs ``graphs=False``.
 """
 
@@ -14,30 +14,30 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from robotics_bridge.tasks.rotations import constant, rotate
+from brainbench.core.rotations import constant, rotate
 
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.tasks.step_context import Moment
+    from robotics_bridge.tasks.step_context import StepContext
 
 
-def goal_reached(m: Moment) -> torch.Tensor:
+def goal_reached(m: StepContext) -> torch.Tensor:
     """Return 1 in the step in which the goal is reached."""
     return m.reached.float()
 
 
-def orientation_gaussian(m: Moment, *, sigma: float) -> torch.Tensor:
+def orientation_gaussian(m: StepContext, *, sigma: float) -> torch.Tensor:
     """Return exp(−(θ/σ)²) of the angle θ to the goal."""
     return (-((m.goal_angle / sigma) ** 2)).exp()
 
 
-def orientation_inverse(m: Moment, *, rot_eps: float) -> torch.Tensor:
+def orientation_inverse(m: StepContext, *, rot_eps: float) -> torch.Tensor:
     """Return 1 / (θ + ε) of the angle θ to the goal (1/rad)."""
     return 1 / (m.goal_angle + rot_eps)
 
 
-def rotation_progress(m: Moment, *, clip: float, penalty_scale: float) -> torch.Tensor:
+def rotation_progress(m: StepContext, *, clip: float, penalty_scale: float) -> torch.Tensor:
     """Return the rate about the commanded axis (rad/s), at most ``clip``, while the goal allows the tilt.
 
     Beyond that, the excess tilt (rad) costs ``penalty_scale`` times. Backward rotation counts in full: were it limited
@@ -47,19 +47,19 @@ def rotation_progress(m: Moment, *, clip: float, penalty_scale: float) -> torch.
     return m.axis_rate.clamp(max=clip) * (excess <= 0).float() - penalty_scale * excess
 
 
-def approach(m: Moment, *, clip: tuple[float, float], negative_scale: float) -> torch.Tensor:
+def approach(m: StepContext, *, clip: tuple[float, float], negative_scale: float) -> torch.Tensor:
     """Return how fast the angle to the goal shrinks (rad/s), within bounds; growth counts ``negative_scale`` times."""
     rate = ((m.previous_goal_angle - m.goal_angle) / m.dt).clamp(*clip)
     return rate.clamp(min=0) + abs(negative_scale) * rate.clamp(max=0)
 
 
-def near_surface(m: Moment, *, nearest_k: int, sigma: float) -> torch.Tensor:
+def near_surface(m: StepContext, *, nearest_k: int, sigma: float) -> torch.Tensor:
     """Return the mean of exp(−d/σ) over the k finger tips that are nearest to the object."""
     nearest = m.surface_distance.clamp(min=0).topk(nearest_k, dim=1, largest=False).values
     return (-nearest / sigma).exp().mean(dim=1)
 
 
-def ended(m: Moment, *, names: tuple[str, ...]) -> torch.Tensor:
+def ended(m: StepContext, *, names: tuple[str, ...]) -> torch.Tensor:
     """Return 1 where the episode ended for one of these reasons; per second, as all terms."""
     total = m.endings[names[0]]
     for name in names[1:]:
@@ -67,80 +67,80 @@ def ended(m: Moment, *, names: tuple[str, ...]) -> torch.Tensor:
     return total.float()
 
 
-def off_axis(m: Moment) -> torch.Tensor:
+def off_axis(m: StepContext) -> torch.Tensor:
     """Return the tilt against the commanded axis (rad)."""
     return m.off_axis
 
 
-def far_from(m: Moment, *, target: tuple[float, float, float] | None, margin: float) -> torch.Tensor:
+def far_from(m: StepContext, *, target: tuple[float, float, float] | None, margin: float) -> torch.Tensor:
     """Return the distance (m) of the object from a place (or from where its episode began) beyond a margin."""
     home = m.start_position if target is None else constant(target, m.object_position)
     return ((m.object_position - home).norm(dim=1) - margin).clamp(min=0)
 
 
-def squeezed(m: Moment, *, threshold: float, clip: float) -> torch.Tensor:
+def squeezed(m: StepContext, *, threshold: float, clip: float) -> torch.Tensor:
     """Return the contact force on the object (N) beyond a threshold, at most ``clip``."""
     return (m.object_force - threshold).clamp(0, clip)
 
 
-def goal_missed(m: Moment) -> torch.Tensor:
+def goal_missed(m: StepContext) -> torch.Tensor:
     """Return 1 in the step in which the deadline of a goal passes."""
     return m.missed.float()
 
 
-def action_rate(m: Moment) -> torch.Tensor:
+def action_rate(m: StepContext) -> torch.Tensor:
     """Return the squared change of the action."""
     return ((m.action - m.last_action) ** 2).sum(dim=1)
 
 
-def beyond_limits(m: Moment) -> torch.Tensor:
+def beyond_limits(m: StepContext) -> torch.Tensor:
     """Return by how much joints lie beyond their limits, summed (rad)."""
     over = (m.joint_position - m.joint_high).clamp(min=0) + (m.joint_low - m.joint_position).clamp(min=0)
     return over.sum(dim=1)
 
 
-def work(m: Moment) -> torch.Tensor:
+def work(m: StepContext) -> torch.Tensor:
     """Return the mean mechanical power of the joints, Σ|τ ω| (W)."""
     return m.power
 
 
-def spin(m: Moment, *, local_axis: tuple[float, float, float], low: float, high: float) -> torch.Tensor:
+def spin(m: StepContext, *, local_axis: tuple[float, float, float], low: float, high: float) -> torch.Tensor:
     """Return the object's angular velocity about its own axis (rad/s), within bounds."""
     axis = rotate(m.object_quat, constant(local_axis, m.object_quat))
     return (m.object_spin * axis).sum(dim=1).clamp(low, high)
 
 
-def alignment(m: Moment, local_up: tuple[float, float, float]) -> torch.Tensor:
+def alignment(m: StepContext, local_up: tuple[float, float, float]) -> torch.Tensor:
     """Return the cosine [B] between an axis of the object and the vertical."""
     return rotate(m.object_quat, constant(local_up, m.object_quat))[:, 2]
 
 
-def leaning(m: Moment, *, local_up: tuple[float, float, float], margin: float) -> torch.Tensor:
+def leaning(m: StepContext, *, local_up: tuple[float, float, float], margin: float) -> torch.Tensor:
     """Return 1 − cosine of the tilt of an axis of the object against the vertical, beyond a margin."""
     return (1 - alignment(m, local_up) - margin).clamp(min=0)
 
 
-def pose_change(m: Moment, *, excluded: str) -> torch.Tensor:
+def pose_change(m: StepContext, *, excluded: str) -> torch.Tensor:
     """Return the squared deviation (rad²) of joints from their start; those named ``excluded`` are free."""
     keep = constant([float(excluded not in name) for name in m.joint_names], m.joint_position)
     return (((m.joint_position - m.start_joints) ** 2) * keep).sum(dim=1)
 
 
-def below(m: Moment, *, height: float) -> torch.Tensor:
+def below(m: StepContext, *, height: float) -> torch.Tensor:
     """Return where [B] the object's origin lies lower than a height (m)."""
     return m.object_position[:, 2] < height
 
 
-def enough_goals(m: Moment, *, count: int) -> torch.Tensor:
+def enough_goals(m: StepContext, *, count: int) -> torch.Tensor:
     """Return where [B] so many goals were reached."""
     return m.goals_reached >= count
 
 
-def fallen(m: Moment, *, local_up: tuple[float, float, float], min_alignment: float) -> torch.Tensor:
+def fallen(m: StepContext, *, local_up: tuple[float, float, float], min_alignment: float) -> torch.Tensor:
     """Return where [B] an axis of the object is no longer upright."""
     return alignment(m, local_up) < min_alignment
 
 
-def stagnant(m: Moment, *, angle: float) -> torch.Tensor:
+def stagnant(m: StepContext, *, angle: float) -> torch.Tensor:
     """Return where [B] the object turned by less than an angle (rad) during the last ``task.turn_window`` steps."""
     return (m.turned - m.turned_before).abs() < angle

@@ -13,18 +13,18 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from robotics_bridge.sensors import Body, SensorSuite, TemperatureGrid, ThermalMaterial
+from robotics_bridge.sensors import SensorSuite, TemperatureGrid, ThermalBody, ThermalMaterial
 from robotics_bridge.sensors.temperature.grid import link_temperature
 
 if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.envs.env import Env
-    from robotics_bridge.tasks.step_context import Moment
+    from robotics_bridge.tasks.step_context import StepContext
 
 
 @dataclass(frozen=True, kw_only=True)
-class Thermal:
+class ThermalSettings:
     """What fingers and balls are made of. The first four numbers are the axes of figure 4.8 and section 4.6.3.
 
     Raises:
@@ -72,7 +72,7 @@ class Thermal:
         return self.ambient + (1 - self.margin) * (self.hot - self.ambient)
 
 
-def progress(temperature: torch.Tensor, thermal: Thermal) -> torch.Tensor:
+def progress(temperature: torch.Tensor, thermal: ThermalSettings) -> torch.Tensor:
     """Return the normalised progress of readings (°C), 0 at ambient to 1 at the target's temperature (4.41)."""
     return ((temperature - thermal.ambient) / (thermal.hot - thermal.ambient)).clamp(0.0, 1.0)
 
@@ -86,14 +86,14 @@ class Thermometers:
         chooses: draw the hot ball anew at every reset; otherwise follow ``env.target``.
     """
 
-    def __init__(self, env: Env, thermal: Thermal, *, chooses: bool = True) -> None:
+    def __init__(self, env: Env, thermal: ThermalSettings, *, chooses: bool = True) -> None:
         import torch
 
         wp, scene = warp(), env.world.engine.scene
         self._env, self.thermal, self._chooses = env, thermal, chooses
         links = [link for link in env.hand.links("fingers") if scene.geometries_of(link)]
         balls = env.model.objects
-        bodies = {name: Body(thermal.ball, thermal.ambient) for name in balls}
+        bodies = {name: ThermalBody(thermal.ball, thermal.ambient) for name in balls}
         sensors = {}
         for link in links:
             plain = TemperatureGrid(link=link, cells=thermal.cells)
@@ -103,7 +103,8 @@ class Thermometers:
             sensors[link] = TemperatureGrid(
                 link=link, cells=thermal.cells, material=thermal.material, base_temperature=thermal.ambient,
                 ambient_temperature=thermal.ambient, source=source, bodies=bodies,
-                other=Body("plastic", thermal.ambient), conduction=thermal.conduction, convection=thermal.convection,
+                other=ThermalBody("plastic", thermal.ambient),
+                conduction=thermal.conduction, convection=thermal.convection,
             )  # fmt: skip
         self.suite = SensorSuite(scene, sensors, num_envs=env.num_envs, device=env.world.warp_device)
         self._cells = [self.suite.read(link) for link in links]
@@ -161,7 +162,7 @@ class Thermometers:
         """Let heat flow for a physics step of dt (s)."""
         self.suite.update(self._env.world.state, dt)
 
-    def after(self, moment: Moment) -> None:
+    def after(self, moment: StepContext) -> None:
         """Read the thermometers at the end of a control step, and tell the rewards."""
         self.judge(moment.dt)
         tips = self._env.world.pose[:, self._env.contacts.tip_links, :3]

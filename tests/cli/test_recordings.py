@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from brainbench.datasets.synthetic.animals import Design, Geometry, write_files
+from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, write_files
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("synthetic")
-    geometry = Geometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
+    geometry = ResponseGeometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
     write_files(folder, geometry, Design(animals=2, sessions=2, units=15, trials=12))
     return folder
 

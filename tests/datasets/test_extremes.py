@@ -9,14 +9,14 @@ import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.datasets import blocks, check, inspect, make_session, open_recordings, pooled, write_recordings
-from brainbench.datasets.sessions import Table
-from brainbench.datasets.synthetic.animals import Design, Geometry, as_recordings, simulate
+from brainbench.datasets.sessions import SessionTable
+from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, as_recordings, simulate
 from brainbench.metrics import TrialBlock, subject_rdm
 from tests.factories.recordings import make_simple_session
 
 
 def make_geometry(stimuli):
-    return Geometry.from_features(np.random.default_rng(0).normal(size=(stimuli, 8)))
+    return ResponseGeometry.from_features(np.random.default_rng(0).normal(size=(stimuli, 8)))
 
 
 def result(dataset, subject):
@@ -104,7 +104,7 @@ def hundred_thousand(tmp_path):
         "spike_times": times[np.lexsort((times, np.repeat(np.arange(units), counts)))],
         "spike_times_index": np.cumsum(counts),
     }
-    session = replace(make_simple_session(trials=trials), units=Table("units", data))
+    session = replace(make_simple_session(trials=trials), units=SessionTable("units", data))
     return write_recordings(tmp_path / "a.h5", session), counts
 
 

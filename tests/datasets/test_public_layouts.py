@@ -8,7 +8,7 @@ import xarray as xr
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.datasets import (
     Conditions,
-    Recipe,
+    RecordingLayout,
     Selection,
     Window,
     check,
@@ -144,7 +144,7 @@ def test_the_test_trials_of_the_benchmark_are_refused_in_words(tmp_path):
 
 
 def my_recipe(name="my-lab", **changes):
-    return Recipe(
+    return RecordingLayout(
         name=name,
         title="my experiment",
         citation="me",

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets.sessions import Table, as_labels, decode, make_session, natural_key, natural_order
+from brainbench.datasets.sessions import SessionTable, as_labels, decode, make_session, natural_key, natural_order
 
 
 def test_numbers_become_the_text_a_person_would_write():
@@ -35,13 +35,13 @@ def test_natural_order_does_not_depend_on_appearance(labels, random):
 
 
 def test_a_column_of_another_length_is_refused():
-    table = Table("trials", {"id": np.arange(3), "stimulus": np.array(["a", "b"])}, "file.nwb")
+    table = SessionTable("trials", {"id": np.arange(3), "stimulus": np.array(["a", "b"])}, "file.nwb")
     with pytest.raises(DataError, match=r"Column 'stimulus' of table 'trials' of file.nwb has 2 values for 3 rows"):
         table.column("stimulus")
 
 
 def test_a_list_column_cannot_be_a_label():
-    table = Table("trials", {"tags": np.array(["a", "b", "c"]), "tags_index": np.array([1, 3])}, "f")
+    table = SessionTable("trials", {"tags": np.array(["a", "b", "c"]), "tags_index": np.array([1, 3])}, "f")
     assert len(table) == 2
     with pytest.raises(DataError, match="holds a list per row"):
         table.column("tags")
@@ -51,13 +51,13 @@ def test_a_list_column_cannot_be_a_label():
     ("ends", "reason"), [([2, 1, 5], "decreasing"), ([1, 2, 4], "the last at 4 of 5"), ([5], "1 ends for 3 rows")]
 )
 def test_an_inconsistent_ragged_index_is_refused(ends, reason):
-    table = Table("units", {"id": np.arange(3), "x": np.zeros(5), "x_index": np.array(ends)}, "f.nwb")
+    table = SessionTable("units", {"id": np.arange(3), "x": np.zeros(5), "x_index": np.array(ends)}, "f.nwb")
     with pytest.raises(DataError, match=reason):
         table.ends("x")
 
 
 def test_an_unknown_column_suggests_the_nearest():
-    table = Table("trials", {"start_time": np.zeros(1), "stimulus": np.array(["a"])}, "f.nwb")
+    table = SessionTable("trials", {"start_time": np.zeros(1), "stimulus": np.array(["a"])}, "f.nwb")
     with pytest.raises(UsageError, match="did you mean 'stimulus'"):
         table.column("stimulis")
 

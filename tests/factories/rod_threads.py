@@ -17,8 +17,8 @@ import numpy as np
 
 WARP = 32
 _MODULES = (
-    "algebra", "compliance", "contacts", "coulomb", "grasp", "groups", "looks", "memory", "relax", "search", "shapes",
-    "structs", "tracks",
+    "algebra", "compliance", "contacts", "single_contact", "contact_memory", "thread_groups", "narrow_phase", "state",
+    "contact_solver", "mesh_search", "distances", "inputs", "motion",
 )  # fmt: skip
 
 
@@ -145,7 +145,7 @@ def _language() -> ModuleType:
 @contextmanager
 def thread_warp():
     """Give a :class:`ThreadWarp` and the modules of the solver, made anew on it; the real ones come back after."""
-    package = "brainbench.stimuli.engines.rod._"
+    package = "brainbench.stimuli.engines.rod.kernels."
     kept = {name: module for name, module in sys.modules.items() if name == "warp" or name.startswith(package)}
     threads = ThreadWarp()
     try:
@@ -163,7 +163,7 @@ def thread_warp():
         for name in [name for name in sys.modules if name == "warp" or name.startswith(package)]:
             del sys.modules[name]
         sys.modules.update(kept)
-        parent = importlib.import_module("brainbench.stimuli.engines.rod")
+        parent = importlib.import_module("brainbench.stimuli.engines.rod.kernels")
         for name, module in kept.items():
             if name.startswith(package):
                 setattr(parent, name.rsplit(".", 1)[1], module)

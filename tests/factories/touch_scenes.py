@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robotics_bridge.physics import Geometry, HandState, Scene
+from robotics_bridge.physics import Geometry, HandState, TouchScene
 
 PAD = Geometry(name="pad", link="hand", kind="box", size=(0.02, 0.02, 0.005))
 
 
-def pad_scene(*objects: Geometry, pad: Geometry = PAD) -> Scene:
+def pad_scene(*objects: Geometry, pad: Geometry = PAD) -> TouchScene:
     """A pad on link ``hand`` (its top at z = 5 mm), and objects on links of their own."""
     links = ("world", "hand", *dict.fromkeys(g.link for g in objects))
-    return Scene(links, (pad, *objects))
+    return TouchScene(links, (pad, *objects))
 
 
 def random_pose(rng: np.random.Generator, reach: float = 0.05) -> np.ndarray:
@@ -23,7 +23,9 @@ def random_pose(rng: np.random.Generator, reach: float = 0.05) -> np.ndarray:
     return np.concatenate([rng.uniform(-reach, reach, 3), Rotation.random(rng=rng).as_quat()])
 
 
-def state_of(scene: Scene, poses: np.ndarray, velocities: np.ndarray | None = None, *, touch: bool = True) -> HandState:
+def state_of(
+    scene: TouchScene, poses: np.ndarray, velocities: np.ndarray | None = None, *, touch: bool = True
+) -> HandState:
     """A state [B, L, 7]; with ``touch``, geometry 0 is in contact with every other one."""
     poses = np.asarray(poses, dtype=float)
     others = range(1, len(scene.geometries))

@@ -9,12 +9,12 @@ from brainbench.models.attenders.gpt import GPTAttender
 from brainbench.models.encoders.zhuang import ZhuangEncoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import mlp_decoder
-from brainbench.models.network import EAD
+from brainbench.models.network import EncoderAttenderDecoder
 
 
 def _network(*, gpt=False, **options):
     encoder = TemporalGraph(ZhuangEncoder("intersection", layer_norm=True, small=True).spec())
-    return EAD(encoder, GPTAttender(96, 32, blocks=2) if gpt else None, **options).eval()
+    return EncoderAttenderDecoder(encoder, GPTAttender(96, 32, blocks=2) if gpt else None, **options).eval()
 
 
 def _sweep(batch=2, steps=6):

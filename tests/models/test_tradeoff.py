@@ -3,7 +3,7 @@ import torch
 
 from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
-from brainbench.models.tradeoff import Reduced, Setting, measure, round_weights, settings
+from brainbench.models.tradeoff import ModelSetting, Reduced, measure, round_weights, settings
 
 SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
 NAME = "zhuang-ugrnn-ln-small"
@@ -14,7 +14,7 @@ def _sweeps(count=3, steps=10):
 
 
 def test_the_reference_setting_has_no_error():
-    point = measure(NAME, Setting(steps=10), _sweeps())
+    point = measure(NAME, ModelSetting(steps=10), _sweeps())
     assert point.error == pytest.approx(0.0, abs=1e-6)
     assert 0 < point.cost <= point.settings["p99_ms"]
 
@@ -41,12 +41,12 @@ def test_rounding_to_eight_bits_moves_no_weight_by_more_than_half_a_level():
 
 
 def test_fewer_steps_and_another_unrolling_change_the_answer():
-    assert measure(NAME, Setting(steps=5), _sweeps()).error > 0.01
-    assert measure(NAME, Setting(unroll="full", steps=10), _sweeps()).error > 0.01
+    assert measure(NAME, ModelSetting(steps=5), _sweeps()).error > 0.01
+    assert measure(NAME, ModelSetting(unroll="full", steps=10), _sweeps()).error > 0.01
 
 
 def test_a_reduced_network_is_scored_like_the_network():
-    reduced, x = Reduced(NAME, Setting("bf16", steps=6)), _sweeps()
+    reduced, x = Reduced(NAME, ModelSetting("bf16", steps=6)), _sweeps()
     assert reduced.layers == load_model(NAME).layers
     with torch.no_grad():
         assert reduced.activations(x, ["decoder"])["decoder"].shape == (3, 6, 117)
@@ -54,10 +54,10 @@ def test_a_reduced_network_is_scored_like_the_network():
 
 def test_wrong_settings_are_refused():
     with pytest.raises(UsageError, match="Unknown precision 'int4'"):
-        Setting("int4")
+        ModelSetting("int4")
     with pytest.raises(UsageError, match="at least 1 step; received 0"):
-        Setting(steps=0)
+        ModelSetting(steps=0)
     with pytest.raises(UsageError, match="knows one unrolling only"):
-        Reduced("s4-small", Setting(unroll="full"))
+        Reduced("s4-small", ModelSetting(unroll="full"))
     with pytest.raises(UsageError, match="22 steps cannot be taken"):
-        measure(NAME, Setting(), _sweeps())
+        measure(NAME, ModelSetting(), _sweeps())

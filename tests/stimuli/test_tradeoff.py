@@ -10,19 +10,19 @@ import pytest
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.stimuli import tradeoff
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.tradeoff import Setting
+from brainbench.stimuli.tradeoff import SimulationSetting
 
 
 @pytest.fixture
 def quick(monkeypatch):
     """A coarse reference and one peg, so that a point takes a moment."""
-    coarse = Setting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
+    coarse = SimulationSetting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
     monkeypatch.setattr(tradeoff, "REFERENCE", coarse)
     monkeypatch.setattr(tradeoff, "PEGS", ((0.5, 0.1),))
 
 
-COARSE = Setting(Fidelity(links=6, time_step=2e-4, steps_per_period=10), "mujoco")
-FINE = Setting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
+COARSE = SimulationSetting(Fidelity(links=6, time_step=2e-4, steps_per_period=10), "mujoco")
+FINE = SimulationSetting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
 
 
 def test_a_setting_is_measured_once_and_the_reference_differs_from_itself_by_nothing(quick, tmp_path):
@@ -54,7 +54,7 @@ def test_a_table_of_other_experiments_is_refused(tmp_path):
 
 def test_an_unknown_backend_is_refused_before_anything_is_measured(tmp_path):
     with pytest.raises(UsageError, match="did you mean 'mujoco'"):
-        tradeoff.measure_tradeoff(tmp_path / "table.json", [Setting(COARSE.fidelity, "mujocco")])
+        tradeoff.measure_tradeoff(tmp_path / "table.json", [SimulationSetting(COARSE.fidelity, "mujocco")])
 
 
 def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_tests(quick, tmp_path):
@@ -78,7 +78,7 @@ def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_
 @pytest.mark.parametrize("text", ["hul", "decomposition", "decomposition-fine", "hull-0.1"])
 def test_an_unknown_collision_geometry_is_refused(text):
     with pytest.raises(UsageError, match=f"Unknown collision geometry '{text}'.*'decomposition-0.02'"):
-        Setting(COARSE.fidelity, collision=text)
+        SimulationSetting(COARSE.fidelity, collision=text)
 
 
 def test_every_backend_and_collision_geometry_that_is_asked_for_is_in_the_grid():
@@ -103,7 +103,7 @@ def test_the_front_leaves_out_failed_and_beaten_settings():
 def test_the_grid_holds_the_presets_and_no_setting_twice():
     chosen = tradeoff.settings()
     assert len(set(chosen)) == len(chosen)
-    assert Setting(Fidelity.preset("balanced")) in chosen
+    assert SimulationSetting(Fidelity.preset("balanced")) in chosen
 
 
 def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_presets():

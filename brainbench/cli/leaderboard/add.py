@@ -10,7 +10,7 @@ import typer
 from brainbench.cli.output import JsonOption, SelectOption, WindowOption, emit, progress_bar
 
 if TYPE_CHECKING:
-    from brainbench.cli.leaderboard.scoring import Job
+    from brainbench.cli.leaderboard.scoring import ScoringJob
     from brainbench.core.records import ResultRecord
 
 
@@ -49,18 +49,20 @@ def add(
     states other numbers for the same computation. Scores that are there already are not computed again, so an
     interrupted batch goes on where it stopped, and a stale one is renewed.
     """
-    from brainbench.cli.leaderboard.scoring import Job, find_models, parse_seeds, read_batch
+    from brainbench.cli.leaderboard.scoring import ScoringJob, find_models, parse_seeds, read_batch
     from brainbench.core.errors import UsageError
 
     given = {"recordings": recordings, "stimuli": stimuli, "fidelity": fidelity, "whiskers": whiskers}
     given |= {"conditions": conditions, "select": select, "window": window}
     given |= {"metric": metric, "estimator": estimator, "time": time}
     options = {name: value for name, value in given.items() if value is not None}
-    jobs: list[Job] = []
+    jobs: list[ScoringJob] = []
     if model:
         names, counts = find_models(model), parse_seeds(seeds)
         # Trained weights do not depend on a seed.
-        jobs = [Job(name, seed, options) for name in names for seed in (counts if "." not in name else counts[:1])]
+        jobs = [
+            ScoringJob(name, seed, options) for name in names for seed in (counts if "." not in name else counts[:1])
+        ]
         if not jobs:
             raise UsageError(f"No model matches {', '.join(map(repr, model))}; see them with: brainbench models list")
     if batch is not None:
@@ -147,7 +149,7 @@ def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
     return question(new) == question(old)
 
 
-def _score(jobs: list[Job], to: Path, *, prune: bool) -> list[dict[str, Any]]:
+def _score(jobs: list[ScoringJob], to: Path, *, prune: bool) -> list[dict[str, Any]]:
     from brainbench.cli.leaderboard.scoring import missing
     from brainbench.scoring.scores import score_record
     from leaderboards.store import write_record

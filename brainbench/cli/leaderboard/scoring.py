@@ -18,7 +18,7 @@ REPEATED = ("estimator", "metric", "whiskers", "fidelity", "normalize", "time", 
 
 
 @dataclass(frozen=True)
-class Job:
+class ScoringJob:
     """One score to compute."""
 
     model: str
@@ -106,19 +106,21 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     return list(found)
 
 
-def missing(jobs: Iterable[Job], records: Iterable[ResultRecord], *, options: dict[str, Any]) -> list[Job]:
+def missing(
+    jobs: Iterable[ScoringJob], records: Iterable[ResultRecord], *, options: dict[str, Any]
+) -> list[ScoringJob]:
     """Return the jobs whose score is not among the records.
 
     A record counts only if made by this version of the package and of the estimator from the same weights,
     recordings, stimuli and settings, so that a batch also renews what has become stale.
     """
     from brainbench import __version__
-    from brainbench.scoring.model_responses import DEFAULT_STIMULI, find_model
-    from brainbench.scoring.neural_responses import brain_side
+    from brainbench.scoring.model_responses import DEFAULT_STIMULI, resolve_model
+    from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.stimuli import load_stimuli
 
     selection = {name: options.get(name) for name in ("conditions", "select", "window")}
-    brain = brain_side(options.get("recordings", "demo"), progress=None, **selection).origin["content_hash"]
+    brain = open_neural_responses(options.get("recordings", "demo"), progress=None, **selection).origin["content_hash"]
     shown = load_stimuli(
         options.get("stimuli", DEFAULT_STIMULI),
         whiskers=options.get("whiskers", "all"),
@@ -150,7 +152,7 @@ def missing(jobs: Iterable[Job], records: Iterable[ResultRecord], *, options: di
         if (
             job.model,
             job.weights_seed,
-            find_model(job.model, seed=job.weights_seed).card.weights,
+            resolve_model(job.model, seed=job.weights_seed).card.weights,
             __version__,
             brain,
             stimuli,
@@ -183,7 +185,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(seeds))
 
 
-def read_batch(path: Path) -> list[Job]:
+def read_batch(path: Path) -> list[ScoringJob]:
     """Read the scores that a batch file asks for: TOML with ``[[entries]]`` of ``models`` and ``seeds``.
 
     ``[options]`` are those of ``brainbench score`` that hold for all: recordings, stimuli, fidelity, whiskers, …
@@ -207,7 +209,7 @@ def read_batch(path: Path) -> list[Job]:
         if set(entry) - {"models", "seeds"} or "models" not in entry:
             raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {sorted(entry)}.")
         for model in find_models(entry["models"]):
-            jobs += [Job(model, seed, options) for seed in entry.get("seeds", [0])]
+            jobs += [ScoringJob(model, seed, options) for seed in entry.get("seeds", [0])]
     return jobs
 
 

@@ -12,14 +12,14 @@ Result = tuple[float, float, float]
 
 def _ball(device: str, sensors: dict[str, Any], *, depth: float = 2e-3, steps: int = 1) -> Any:
     """Return a suite that has read a pad at the origin and a ball of 20 mm above it, overlapping by a depth."""
-    from robotics_bridge.physics import Geometry, HandState, Scene
+    from robotics_bridge.physics import Geometry, HandState, TouchScene
     from robotics_bridge.sensors import SensorSuite
 
     shapes = (
         Geometry(name="pad", link="pad", kind="box", size=(0.02, 0.02, 0.005), position=(0, 0, -0.005)),
         Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
     )
-    suite = SensorSuite(Scene(("pad", "ball"), shapes), sensors, num_envs=1, device=device)
+    suite = SensorSuite(TouchScene(("pad", "ball"), shapes), sensors, num_envs=1, device=device)
     state = HandState.empty(1, 2, 4, device)
     pose = np.zeros((2, 7))
     pose[:, 6] = 1
@@ -101,11 +101,11 @@ def _tone(device: str) -> Result:
 
 def _beam(device: str) -> Result:
     del device
-    from robotics_bridge.sensors import Solid, find_modes
+    from robotics_bridge.sensors import ElasticSolid, find_modes
     from robotics_bridge.sensors.audio.materials import ElasticMaterial
 
     steel = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
-    found = find_modes(Solid("box", (0.1, 0.005, 0.005)), steel, count=2, cells=16, cache=False).frequency[0]
+    found = find_modes(ElasticSolid("box", (0.1, 0.005, 0.005)), steel, count=2, cells=16, cache=False).frequency[0]
     return found, 4.730041**2 / (2 * math.pi * 0.2**2) * math.sqrt(2e11 * 1e-4 / 12 / 7850), 0.02
 
 

@@ -36,7 +36,7 @@ def forces(path: Path, hand: str, resolution: str, *, noisy: bool) -> dict[str, 
 
 def markers(path: Path, *, noisy: bool) -> dict[str, float]:
     """Draw the markers of an elastomer pad that a ball presses, drags and twists."""
-    from robotics_bridge.physics import Geometry, HandState, Scene
+    from robotics_bridge.physics import Geometry, HandState, TouchScene
     from robotics_bridge.sensors import ElastomerTaxel, Noise, Probes, SensorSuite
 
     probes = Probes.grid(15, 15, size=(0.018, 0.018), radius=0.001)
@@ -56,7 +56,7 @@ def markers(path: Path, *, noisy: bool) -> dict[str, float]:
         shear_scale=8.0,
         shear_spread=1e5,
     )
-    suite = SensorSuite(Scene(("pad", "ball"), shapes), {"pad": sensor}, num_envs=1)
+    suite = SensorSuite(TouchScene(("pad", "ball"), shapes), {"pad": sensor}, num_envs=1)
     state = HandState.empty(1, 2, 1)
     state.set_contacts([0], [[0, 1]])
     moves = {"pressed": (0.0, 0.0), "dragged": (0.0015, 0.0), "twisted": (0.0, 0.6)}
@@ -78,13 +78,13 @@ def markers(path: Path, *, noisy: bool) -> dict[str, float]:
 
 def temperature(path: Path, hand: str) -> dict[str, float]:
     """Draw the warming of the finger tips by a ball of 45 °C, for three materials."""
-    from robotics_bridge.sensors import Body, SensorSuite, TemperatureGrid
+    from robotics_bridge.sensors import SensorSuite, TemperatureGrid, ThermalBody
 
     grip = Grip(hand)
     tips = grip.hand.tips
     members = {
         f"{name}/{link}": TemperatureGrid(
-            link=link, cells=(12, 12, 12), material="steel", bodies={"object": Body(name, 45.0)}
+            link=link, cells=(12, 12, 12), material="steel", bodies={"object": ThermalBody(name, 45.0)}
         )
         for name in ("aluminium", "glass", "wood")
         for link in tips
@@ -110,7 +110,7 @@ def sound(path: Path) -> dict[str, float]:
     """Draw spectrograms of a ball that bounces on plates of wood, metal and glass."""
     from brainbench.core.devices import mujoco_module as mujoco
     from robotics_bridge.physics import MujocoEngine
-    from robotics_bridge.sensors import ContactAudio, SensorSuite, Solid, find_modes
+    from robotics_bridge.sensors import ContactAudio, ElasticSolid, SensorSuite, find_modes
 
     model = mujoco().MjModel.from_xml_string("""
     <mujoco><option timestep="0.005"/><worldbody>
@@ -118,7 +118,7 @@ def sound(path: Path) -> dict[str, float]:
       <body name="ball" pos="0.03 0.02 0.12"><freejoint/>
         <geom size="0.02" mass="0.05" solref="0.004 0.3"/></body>
     </worldbody></mujoco>""")
-    solid = Solid("box", (0.15, 0.1, 0.01))
+    solid = ElasticSolid("box", (0.15, 0.1, 0.01))
     sensors = {
         name: ContactAudio(link="slab", samples=160, modes=find_modes(solid, name, count=24, cells=10))
         for name in ("wood", "metal", "glass")

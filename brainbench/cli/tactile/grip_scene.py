@@ -57,7 +57,7 @@ class Grip:
         layout = self.hand.layout(resolution, placement)
         common = {"noise": sensors.Noise.preset(CLASSES[name])} if noisy else {}
         if name == "TemperatureGrid":
-            body = {"object": sensors.Body("steel", 45.0)}
+            body = {"object": sensors.ThermalBody("steel", 45.0)}
             return {link: kind(link=link, cells=(3, 3, 3), bodies=body, **common) for link in layout}
         if name == "ContactAudio":
             modes = sensors.Modes(tuple(np.geomspace(300, 9000, 16).tolist()), (30.0,) * 16, (1.0,) * 16)

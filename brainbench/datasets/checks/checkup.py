@@ -20,7 +20,7 @@ from brainbench.datasets.checks.findings import SEVERITIES, Finding, repeats
 from brainbench.datasets.checks.labels import check_labels
 from brainbench.datasets.checks.spikes import check_spikes
 from brainbench.datasets.checks.tables import check_coverage, check_tables
-from brainbench.datasets.layouts.registry import Recipe
+from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.reading import Source, each_session, find_recordings
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.sources import open_file
@@ -92,7 +92,7 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
 
 
 def _check_file(
-    path: Path, recipe: Recipe | None, conditions: Conditions | None, names: list[str]
+    path: Path, recipe: RecordingLayout | None, conditions: Conditions | None, names: list[str]
 ) -> Iterator[Finding]:
     with open_file(path) as file:
         if hdf5.is_ours(file) and hdf5.read_kind(file, path) == "counts":
@@ -107,7 +107,7 @@ def _check_file(
 
 
 def check_session(
-    session: Session, recipe: Recipe | None = None, conditions: Conditions | None = None, where: str = ""
+    session: Session, recipe: RecordingLayout | None = None, conditions: Conditions | None = None, where: str = ""
 ) -> Iterator[Finding]:
     """Yield the findings about one session, which must still be open."""
     where = where or f"{session.subject} / {session.session}"

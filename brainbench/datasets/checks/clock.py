@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError
 from brainbench.datasets.checks.findings import Finding
-from brainbench.datasets.layouts.registry import Recipe
+from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, Window
 
@@ -42,7 +42,7 @@ _LONGEST = 12 * 3600.0
 
 
 def check_clock(
-    session: Session, spikes: list[NDArray[np.float64]], recipe: Recipe | None, where: str
+    session: Session, spikes: list[NDArray[np.float64]], recipe: RecordingLayout | None, where: str
 ) -> Iterator[Finding]:
     """Yield what can be said about the clock of one session."""
     found = touches(session, recipe)
@@ -108,7 +108,7 @@ def _other_lag(lags: NDArray[np.float64], size: NDArray[np.float64], at_touch: f
     return float(lags[np.flatnonzero(before)[0]]), float(size[best])
 
 
-def touches(session: Session, recipe: Recipe | None) -> tuple[NDArray[np.float64], str] | None:
+def touches(session: Session, recipe: RecordingLayout | None) -> tuple[NDArray[np.float64], str] | None:
     """Return touch times (s) of a session and what they are, or None where it has none.
 
     First contacts of the trials if there are contact tables, else the event that the recipe names.

@@ -9,8 +9,8 @@ import numpy as np
 
 from brainbench.core.errors import BrainbenchError, nearest
 from brainbench.datasets.checks.findings import Finding, share, some
-from brainbench.datasets.layouts.registry import Recipe
-from brainbench.datasets.sessions import Session, Table, as_labels
+from brainbench.datasets.layouts.registry import RecordingLayout
+from brainbench.datasets.sessions import Session, SessionTable, as_labels
 from brainbench.datasets.trials.conditions import Conditions, join
 from brainbench.datasets.trials.proposals import propose
 
@@ -19,7 +19,7 @@ _FEW = 2
 
 
 def check_labels(
-    session: Session, recipe: Recipe | None, conditions: Conditions | None, where: str
+    session: Session, recipe: RecordingLayout | None, conditions: Conditions | None, where: str
 ) -> Iterator[Finding]:
     """Yield the findings about the condition labels of one session."""
     if conditions is None:
@@ -61,7 +61,7 @@ def _spelling(counts: Counter[str], where: str) -> Iterator[Finding]:
 
 
 def _strangers(
-    counts: Counter[str], vocabulary: tuple[str, ...], recipe: Recipe | None, where: str
+    counts: Counter[str], vocabulary: tuple[str, ...], recipe: RecordingLayout | None, where: str
 ) -> Iterator[Finding]:
     # What the recipe refuses by rule (such as "nothing") is known and no misspelling.
     refused = {value for rule in recipe.selection.trials for value in rule.refuse} if recipe else set()
@@ -94,7 +94,7 @@ def _balance(counts: Counter[str], vocabulary: tuple[str, ...] | None, where: st
         yield Finding("note", "labels", where, message, "Distances to the rarest label are the noisiest.")
 
 
-def _answers(table: Table, where: str) -> Iterator[Finding]:
+def _answers(table: SessionTable, where: str) -> Iterator[Finding]:
     """A correct trial is one where the choice was the rewarded side, in either task."""
     try:
         outcome, choice, side = (as_labels(table.column(name)) for name in ("outcome", "choice", "rewarded_side"))

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.datasets.checks.findings import Finding, Severity, repeats, share, some
-from brainbench.datasets.layouts.registry import Recipe
-from brainbench.datasets.sessions import OBSERVED, Session, Table, as_labels
+from brainbench.datasets.layouts.registry import RecordingLayout
+from brainbench.datasets.sessions import OBSERVED, Session, SessionTable, as_labels
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import merged_spans, recorded_span
 from brainbench.datasets.trials.windows import CONTACTS, WHOLE, Window
@@ -43,7 +43,7 @@ def check_tables(session: Session, where: str) -> Iterator[Finding]:
             return  # The damaged column has been told already.
 
 
-def _damaged(table: Table, where: str) -> Iterator[Finding]:
+def _damaged(table: SessionTable, where: str) -> Iterator[Finding]:
     for name in table.columns:
         try:
             if f"{name}_index" in table.data:
@@ -57,7 +57,7 @@ def _damaged(table: Table, where: str) -> Iterator[Finding]:
         yield Finding("warning", "tables", where, f"table {table.name!r} has ids more than once ({some(repeated)})")
 
 
-def _times(table: Table, where: str) -> Iterator[Finding]:
+def _times(table: SessionTable, where: str) -> Iterator[Finding]:
     try:
         start = table.times("start_time")
         stop = table.times("stop_time") if "stop_time" in table else start
@@ -87,7 +87,7 @@ def _times(table: Table, where: str) -> Iterator[Finding]:
         yield Finding("note", "tables", where, message, "Trials are sorted when they are read; nothing is lost.")
 
 
-def _events(trials: Table, where: str) -> Iterator[Finding]:
+def _events(trials: SessionTable, where: str) -> Iterator[Finding]:
     """Event times must lie in their own trial; if they fit another row, the column has slipped."""
     start, stop = trials.times("start_time"), trials.times("stop_time")
     for name in trials.columns:
@@ -134,7 +134,7 @@ def _inside(events: NDArray[np.float64], start: NDArray[np.float64], stop: NDArr
     return float(np.mean((events[fits] >= low) & (events[fits] <= high)))
 
 
-def _contacts(session: Session, trials: Table, where: str) -> Iterator[Finding]:
+def _contacts(session: Session, trials: SessionTable, where: str) -> Iterator[Finding]:
     start, stop = np.sort(trials.times("start_time")), np.sort(trials.times("stop_time"))
     brief, every = 0, 0
     for name, table in session.tables.items():
@@ -155,7 +155,7 @@ def _contacts(session: Session, trials: Table, where: str) -> Iterator[Finding]:
 def check_coverage(
     session: Session,
     spikes: list[NDArray[np.float64]],
-    recipe: Recipe | None,
+    recipe: RecordingLayout | None,
     conditions: Conditions | None,
     where: str,
 ) -> Iterator[Finding]:
@@ -205,7 +205,7 @@ def check_coverage(
         yield Finding("warning" if hit else "note", "coverage", where, message, advice, {"gaps": gaps})
 
 
-def _observed(units: Table, start: NDArray[np.float64], stop: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _observed(units: SessionTable, start: NDArray[np.float64], stop: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which trials [rows] at least one unit was observed in from begin to end."""
     ends = units.ends(OBSERVED)
     spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)

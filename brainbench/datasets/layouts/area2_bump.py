@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from brainbench.datasets.layouts.layout import Recipe
+from brainbench.datasets.layouts.layout import RecordingLayout
 from brainbench.datasets.sessions import Session, as_labels
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Rule, Selection
@@ -33,7 +33,7 @@ def adapt(session: Session) -> Session:
     return replace(session, tables={**session.tables, "trials": replace(table, data={**table.data, **made})})
 
 
-RECIPE = Recipe(
+RECIPE = RecordingLayout(
     name="area2-bump",
     title="reaches and bumps of the arm, units of macaque area 2 (DANDI 000127)",
     citation="Chowdhury R. H., Glaser J. I., Miller L. E., eLife 9:e48198 (2020), doi:10.7554/eLife.48198",

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets.layouts.layout import Recipe
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, Table, ragged
+from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, ragged
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Rule, Selection
 from brainbench.datasets.trials.windows import Window
@@ -51,17 +51,19 @@ def with_contacts(session: Session, prefix: str, whisker: str) -> Session:
     # A touch ends at the next offset; one that is cut off by the end of the recording ends at once.
     after = np.searchsorted(end, begin, side="left")
     stop = np.append(end, np.nan)[after]
-    table = Table(name, {"start_time": begin, "stop_time": np.where(np.isnan(stop), begin, stop)}, session.source)
+    table = SessionTable(
+        name, {"start_time": begin, "stop_time": np.where(np.isnan(stop), begin, stop)}, session.source
+    )
     return replace(session, tables={**session.tables, name: table})
 
 
-def _unit(train: Series, source: str) -> Table:
+def _unit(train: Series, source: str) -> SessionTable:
     times = train.active_times()
     columns: dict[str, NDArray[np.generic]] = {"id": np.arange(1), **ragged(SPIKES, [times])}
     if train.timestamps is not None and len(train.timestamps):
         stamps = np.asarray(train.timestamps[...], dtype=np.float64)
         columns |= ragged(OBSERVED, [recorded_runs(np.sort(stamps))])
-    return Table("units", columns, source)
+    return SessionTable("units", columns, source)
 
 
 def recorded_runs(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,7 +77,7 @@ def recorded_runs(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([stamps[np.append(0, breaks + 1)], stamps[np.append(breaks, len(stamps) - 1)] + step], axis=1)
 
 
-RECIPE = Recipe(
+RECIPE = RecordingLayout(
     name="hires",
     title="pole localisation with one whisker, single neurons of layer 4 (DANDI 000013)",
     citation="Hires S. A., Gutnisky D. A. et al., eLife 4:e06619 (2015), doi:10.7554/eLife.06619",

@@ -13,7 +13,7 @@ from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 
 
 @dataclass(frozen=True)
-class Recipe:
+class RecordingLayout:
     """How one published data set is read. Every part can be overridden by an argument."""
 
     name: str
@@ -71,6 +71,6 @@ class Recipe:
         yield from self.remarks
 
 
-def variant(recipe: Recipe, **changes: object) -> Recipe:
+def variant(recipe: RecordingLayout, **changes: object) -> RecordingLayout:
     """Return a recipe that differs in some parts and is used only when named."""
     return replace(recipe, layout=(), **changes)  # pyright: ignore[reportArgumentType]

@@ -1,7 +1,7 @@
 """The registry of recipes: named ways to read a data set.
 
 Other packages add theirs through the entry point group ``brainbench.recordings``: an entry point names a
-:class:`~brainbench.datasets.Recipe`, or a module whose import runs :func:`register_recipe`.
+:class:`~brainbench.datasets.RecordingLayout`, or a module whose import runs :func:`register_recipe`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.datasets.layouts import area2_bump, hires, rodgers, yu
-from brainbench.datasets.layouts.layout import Recipe
+from brainbench.datasets.layouts.layout import RecordingLayout
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
 
@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 ENTRY_POINTS = "brainbench.recordings"
 
-_RECIPES: dict[str, Recipe] = {
+_RECIPES: dict[str, RecordingLayout] = {
     recipe.name: recipe
     for recipe in (
         rodgers.RECIPE,
@@ -35,7 +35,7 @@ _loaded: list[str] = []
 """Groups of entry points that were loaded: once, on first use."""
 
 
-def register_recipe(recipe: Recipe) -> Recipe:
+def register_recipe(recipe: RecordingLayout) -> RecordingLayout:
     """Make a recipe known by its name and its layout for the rest of this process; returns it.
 
     On the command line ``FILE.py:PATH`` registers the ``RECIPE`` that a file defines.
@@ -55,7 +55,7 @@ def register_recipe(recipe: Recipe) -> Recipe:
     return recipe
 
 
-def get_recipe(name: str) -> Recipe:
+def get_recipe(name: str) -> RecordingLayout:
     """Return a recipe by name.
 
     Raises:
@@ -71,7 +71,7 @@ def list_recipes() -> list[str]:
     return sorted(_known())
 
 
-def detect_recipe(session: Session) -> Recipe | None:
+def detect_recipe(session: Session) -> RecordingLayout | None:
     """Return the recipe whose layout a session has, if any; of several the most specific one."""
     found = [recipe for recipe in _known().values() if recipe.matches(session)]
     return max(found, key=lambda recipe: len(recipe.layout), default=None)
@@ -116,7 +116,7 @@ def split_source(source: str) -> tuple[str | None, str]:
     return (recipe or get_recipe(prefix)).name, rest
 
 
-def load_recipe(path: str) -> Recipe:
+def load_recipe(path: str) -> RecordingLayout:
     """Run a Python file and register the recipe that it calls ``RECIPE``.
 
     Raises:
@@ -130,14 +130,14 @@ def load_recipe(path: str) -> Recipe:
         found = runpy.run_path(path).get("RECIPE")
     except Exception as error:
         raise UsageError(f"The recipe file {path!r} fails: {type(error).__name__}: {error}.") from error
-    if not isinstance(found, Recipe):
+    if not isinstance(found, RecordingLayout):
         raise UsageError(
             f"The recipe file {path!r} defines no RECIPE = brainbench.datasets.Recipe(…); docs/recordings.md shows one."
         )
     return register_recipe(found)
 
 
-def _known() -> dict[str, Recipe]:
+def _known() -> dict[str, RecordingLayout]:
     """Return the registry with the recipes of other packages."""
     if ENTRY_POINTS not in _loaded:
         _loaded.append(ENTRY_POINTS)
@@ -151,7 +151,7 @@ def _load_entry_points() -> None:
     for entry in entry_points(group=ENTRY_POINTS):
         try:
             found = entry.load()
-            if isinstance(found, Recipe):
+            if isinstance(found, RecordingLayout):
                 register_recipe(found)
         except Exception as error:  # noqa: BLE001 - another package's fault must not take our recipes away
             _log.warning("The recipe of entry point %r (%s) could not be loaded: %s", entry.name, entry.value, error)

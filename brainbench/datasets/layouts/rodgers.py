@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from brainbench.core.errors import listing
-from brainbench.datasets.layouts.layout import Recipe, variant
+from brainbench.datasets.layouts.layout import RecordingLayout, variant
 from brainbench.datasets.sessions import Session, as_labels
 from brainbench.datasets.trials.conditions import Conditions, join
 from brainbench.datasets.trials.selection import Rule, Selection
@@ -87,7 +87,7 @@ def adapt(session: Session) -> Session:
     return replace(session, tables=tables, notes=(*session.notes, note) if have and lost else session.notes)
 
 
-RECIPE = Recipe(
+RECIPE = RecordingLayout(
     name="rodgers",
     title=TITLE,
     citation=CITATION,

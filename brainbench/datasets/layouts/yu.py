@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 
 from brainbench.datasets.layouts.hires import ONSET, SELECTION, with_contacts
-from brainbench.datasets.layouts.layout import Recipe
+from brainbench.datasets.layouts.layout import RecordingLayout
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Selection
@@ -26,7 +26,7 @@ def adapt(session: Session) -> Session:
     return session
 
 
-RECIPE = Recipe(
+RECIPE = RecordingLayout(
     name="yu",
     title="pole localisation with a few whiskers, units of thalamus (VPM) and layer 4 (DANDI 000005)",
     citation="Yu J., Gutnisky D. A. et al., Nature Neuroscience 19:1647 (2016), doi:10.1038/nn.4412",

@@ -2,7 +2,7 @@
 
 Every unit has a mean rate b (log-normal over units) and a random direction w in tuning space. Its
 expected rate for stimulus k is b · max(0, 1 + m (√(1−ι) x_k·w + √ι y_k·w′)): x_k is the shared
-direction of the stimulus (:class:`Geometry`), y_k the animal's own random one, m the ``modulation``
+direction of the stimulus (:class:`ResponseGeometry`), y_k the animal's own random one, m the ``modulation``
 and ι the ``individual`` share. Over many units the correlation distance between stimuli is then
 proportional to 1 − x_k·x_l, so RDMs compared by any correlation have the geometry as their truth
 (rectification touches less than 0.7 % of rates at the largest modulation).
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.datasets.synthetic.design import MODULATION, Design, draw_session, entropy, stimulus_means, subject_name
-from brainbench.datasets.synthetic.geometry import Geometry
+from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
 from brainbench.datasets.synthetic.truth import correlation_rdm
 from brainbench.datasets.trials.blocks import SessionBlock
@@ -32,7 +32,7 @@ from brainbench.datasets.trials.blocks import SessionBlock
 __all__ = [
     "FAULTS",
     "Design",
-    "Geometry",
+    "ResponseGeometry",
     "SyntheticAnimal",
     "as_recordings",
     "calibrate",
@@ -60,7 +60,11 @@ class SyntheticAnimal:
 
 
 def simulate(
-    geometry: Geometry, design: Design | None = None, *, seed: int | Sequence[int] = 0, faults: Sequence[str] = ()
+    geometry: ResponseGeometry,
+    design: Design | None = None,
+    *,
+    seed: int | Sequence[int] = 0,
+    faults: Sequence[str] = (),
 ) -> tuple[SyntheticAnimal, ...]:
     """Draw animals that share a geometry.
 
@@ -94,7 +98,7 @@ def simulate(
 
 
 def measure_ceiling(
-    geometry: Geometry, design: Design, *, simulations: int = 50, seed: int | Sequence[int] = 0
+    geometry: ResponseGeometry, design: Design, *, simulations: int = 50, seed: int | Sequence[int] = 0
 ) -> tuple[float, float]:
     """Measure the noise ceiling of a design: what the true geometry itself scores.
 
@@ -126,7 +130,7 @@ def measure_ceiling(
 
 
 def calibrate(
-    geometry: Geometry,
+    geometry: ResponseGeometry,
     design: Design,
     *,
     ceiling: float,

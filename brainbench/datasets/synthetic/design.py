@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.datasets.synthetic.geometry import Geometry
+from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.trials.blocks import SessionBlock
 
 MODULATION = 0.4
@@ -82,7 +82,7 @@ class DrawnSession:
 
 
 def draw_session(
-    geometry: Geometry, design: Design, animal: int, session: int, seed: int | Sequence[int]
+    geometry: ResponseGeometry, design: Design, animal: int, session: int, seed: int | Sequence[int]
 ) -> DrawnSession:
     """Draw one session's trials and counts; a pure function of its arguments."""
     stimuli = len(geometry.labels)

@@ -12,7 +12,7 @@ from brainbench.core.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
-class Geometry:
+class ResponseGeometry:
     """Directions of K stimuli in tuning space; their angles are the truth of synthetic recordings."""
 
     directions: NDArray[np.float64]
@@ -23,7 +23,7 @@ class Geometry:
     """Largest difference between the RDM asked for and the one that unit vectors can have."""
 
     @classmethod
-    def from_features(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> Geometry:
+    def from_features(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
         """Take the correlations between the rows of features [K, F], such as a model's activations.
 
         The truth is then 1 − Pearson between rows, the model's own correlation-distance RDM.
@@ -48,7 +48,7 @@ class Geometry:
         return cls(directions, _labels(labels, len(directions)))
 
     @classmethod
-    def from_rdm(cls, rdm: ArrayLike, labels: Sequence[str] | None = None) -> Geometry:
+    def from_rdm(cls, rdm: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
         """Embed a correlation-distance RDM, an upper triangle [P] with values from 0 to 2.
 
         Distances that no set of unit vectors has are replaced by the nearest ones in the sense of

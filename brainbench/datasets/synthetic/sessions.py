@@ -19,10 +19,10 @@ from brainbench.datasets.exports import write_nwb
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic.design import Design, draw_session, entropy, session_name, subject_name
-from brainbench.datasets.synthetic.geometry import Geometry
+from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.truth import TRUTH, correlation_rdm
 from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import Part, Plan
+from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts
 from brainbench.datasets.trials.joining import join
 from brainbench.datasets.trials.selection import EVERYTHING, Tally
 from brainbench.datasets.trials.windows import Window
@@ -48,14 +48,16 @@ _TOUCH = 0.05
 """Duration of a contact, s."""
 
 
-def as_recordings(geometry: Geometry, design: Design | None = None, *, seed: int | Sequence[int] = 0) -> xr.Dataset:
+def as_recordings(
+    geometry: ResponseGeometry, design: Design | None = None, *, seed: int | Sequence[int] = 0
+) -> xr.Dataset:
     """Draw synthetic animals as a recordings data set, ready for ``blocks`` and ``score``.
 
     Raises:
         DataError: the design leaves no trial or one condition only.
     """
     design = design or Design()
-    plan = Plan(
+    plan = ReadingOptions(
         CONDITIONS, geometry.labels, EVERYTHING, Window("choice", offset=-design.window, length=design.window), None
     )
     parts = []
@@ -65,7 +67,7 @@ def as_recordings(geometry: Geometry, design: Design | None = None, *, seed: int
             begin, _ = _times(design, len(drawn.labels), (*entropy(seed), animal, number))
             labels = tuple(geometry.labels[index] for index in drawn.labels)
             parts.append(
-                Part(
+                SessionCounts(
                     subject=subject_name(animal),
                     session=session_name(number),
                     source=f"{subject_name(animal)}-{session_name(number)}",
@@ -91,7 +93,9 @@ def as_recordings(geometry: Geometry, design: Design | None = None, *, seed: int
     return join(parts, plan, source="synthetic", recipe="", notes=[])
 
 
-def make_sessions(geometry: Geometry, design: Design | None = None, *, seed: int | Sequence[int] = 0) -> list[Session]:
+def make_sessions(
+    geometry: ResponseGeometry, design: Design | None = None, *, seed: int | Sequence[int] = 0
+) -> list[Session]:
     """Draw synthetic animals as sessions of spike times.
 
     A trial begins 0.5 s before a whisker touches (table ``contacts_by_whisker_C1``); 15 % of the spikes
@@ -109,7 +113,7 @@ def make_sessions(geometry: Geometry, design: Design | None = None, *, seed: int
 
 def write_files(
     folder: str | os.PathLike[str],
-    geometry: Geometry,
+    geometry: ResponseGeometry,
     design: Design | None = None,
     *,
     seed: int | Sequence[int] = 0,
@@ -194,7 +198,9 @@ def _times(design: Design, trials: int, stream: tuple[int, ...]) -> tuple[NDArra
     return stop - pause - design.window, stop
 
 
-def _session(geometry: Geometry, design: Design, animal: int, number: int, seed: int | Sequence[int]) -> Session:
+def _session(
+    geometry: ResponseGeometry, design: Design, animal: int, number: int, seed: int | Sequence[int]
+) -> Session:
     drawn = draw_session(geometry, design, animal, number, seed)
     stream = (*entropy(seed), animal, number)
     random = np.random.default_rng([*stream, 1])

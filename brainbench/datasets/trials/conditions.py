@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets.sessions import Table, as_labels, natural_key
+from brainbench.datasets.sessions import SessionTable, as_labels, natural_key
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Conditions:
     def __str__(self) -> str:
         return f"{self.table}:{','.join(self.columns)}"
 
-    def values(self, table: Table) -> NDArray[np.str_]:
+    def values(self, table: SessionTable) -> NDArray[np.str_]:
         """Return the condition values of every row as text [rows, columns]; "" where missing.
 
         Raises:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, Table, as_labels, natural_key
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, natural_key
 from brainbench.datasets.trials.conditions import Conditions, join
 from brainbench.datasets.trials.covariates import trial_covariates
 from brainbench.datasets.trials.selection import Selection, Tally
@@ -24,7 +24,7 @@ _MOST_COUNTS = 1 << 32
 
 
 @dataclass(frozen=True)
-class Plan:
+class ReadingOptions:
     """How sessions are read; equal for all of them."""
 
     conditions: Conditions
@@ -35,7 +35,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Part:
+class SessionCounts:
     """The kept trials [R] and units [U] of one session, in canonical order."""
 
     subject: str
@@ -65,7 +65,7 @@ class Part:
     synthetic: bool
 
 
-def extract(session: Session, plan: Plan) -> Part:
+def extract(session: Session, plan: ReadingOptions) -> SessionCounts:
     """Read one session by a plan.
 
     Raises:
@@ -102,7 +102,7 @@ def extract(session: Session, plan: Plan) -> Part:
         [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], plan.bin, plan.window.length
     )
     ids, unit_ids = as_labels(table.ids()), as_labels(session.units.ids())
-    return Part(
+    return SessionCounts(
         subject=session.subject,
         session=session.session,
         source=session.source,
@@ -140,7 +140,7 @@ def no_units(session: Session) -> str:
     return f"{session.source} has no units table with spike_times (it holds {holds}); there is nothing to score."
 
 
-def read_spikes(units: Table, notes: list[str]) -> list[NDArray[np.float64]]:
+def read_spikes(units: SessionTable, notes: list[str]) -> list[NDArray[np.float64]]:
     """Read the spike times (s, ascending) of every unit.
 
     Raises:
@@ -224,7 +224,11 @@ def count(
 
 
 def _coverage(
-    units: Table, spikes: list[NDArray[np.float64]], edges: NDArray[np.float64], selection: Selection, tally: Tally
+    units: SessionTable,
+    spikes: list[NDArray[np.float64]],
+    edges: NDArray[np.float64],
+    selection: Selection,
+    tally: Tally,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which windows each unit was recorded in [rows, units] and which units pass [units]."""
     kept = tally.select(units, selection.units, "units")
@@ -260,18 +264,20 @@ def merged_spans(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
     return merged
 
 
-def _overlaps(edges: NDArray[np.float64], invalid: Table) -> NDArray[np.bool_]:
+def _overlaps(edges: NDArray[np.float64], invalid: SessionTable) -> NDArray[np.bool_]:
     begin, end = invalid.times("start_time"), invalid.times("stop_time")
     return np.asarray(((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1))
 
 
-def _rows_in_order(rows: NDArray[np.int64], table: Table) -> NDArray[np.int64]:
+def _rows_in_order(rows: NDArray[np.int64], table: SessionTable) -> NDArray[np.int64]:
     """Sort trials by start time, then id, so that the order of rows in the file changes nothing."""
     starts, ids = table.times("start_time"), as_labels(table.ids()).tolist()
     return np.array(sorted(rows.tolist(), key=lambda row: (starts[row], natural_key(ids[row]))), dtype=np.int64)
 
 
-def _units_in_order(rows: NDArray[np.int64], units: Table, spikes: list[NDArray[np.float64]]) -> NDArray[np.int64]:
+def _units_in_order(
+    rows: NDArray[np.int64], units: SessionTable, spikes: list[NDArray[np.float64]]
+) -> NDArray[np.int64]:
     """Sort units by id; equal ids (several probes) by their spikes."""
     ids = as_labels(units.ids()).tolist()
 
@@ -281,7 +287,7 @@ def _units_in_order(rows: NDArray[np.int64], units: Table, spikes: list[NDArray[
     return np.array(sorted(rows.tolist(), key=key), dtype=np.int64)
 
 
-def _unit_column(units: Table, name: str, kind: type, rows: NDArray[np.int64]) -> NDArray[Any]:
+def _unit_column(units: SessionTable, name: str, kind: type, rows: NDArray[np.int64]) -> NDArray[Any]:
     if name not in units:
         return np.full(len(rows), np.nan) if kind is float else np.full(len(rows), "", dtype="U1")
     values = units.column(name)[rows]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets.sessions import Session, Table, as_labels
+from brainbench.datasets.sessions import Session, SessionTable, as_labels
 from brainbench.datasets.trials.windows import CONTACTS
 
 COVARIATES = ("contacts", "licks", "choice")
@@ -20,7 +20,7 @@ _NO_CHOICE = ("", "nogo", "none", "miss", "nan")
 
 
 def trial_covariates(
-    session: Session, table: Table, rows: NDArray[np.int64], edges: NDArray[np.float64]
+    session: Session, table: SessionTable, rows: NDArray[np.int64], edges: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
     """Return what the session tells of the trials ``rows`` [R] with windows ``edges`` [R, 2] (s): name → [R]."""
     found = {}

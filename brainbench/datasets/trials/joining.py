@@ -12,14 +12,14 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash
 from brainbench.datasets.sessions import natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
-from brainbench.datasets.trials.counting import UNIT_COLUMNS, Part, Plan
+from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts
 from brainbench.datasets.trials.covariates import COVARIATES
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-def join(parts: list[Part], plan: Plan, *, source: str, recipe: str, notes: list[str]) -> xr.Dataset:
+def join(parts: list[SessionCounts], plan: ReadingOptions, *, source: str, recipe: str, notes: list[str]) -> xr.Dataset:
     """Join the sessions' trials and units, block by block, in canonical order.
 
     Args:
@@ -95,22 +95,22 @@ def join(parts: list[Part], plan: Plan, *, source: str, recipe: str, notes: list
     return dataset
 
 
-def _covariate(parts: list[Part], name: str) -> NDArray[np.float64]:
+def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:
     """Return one covariate of all trials; NaN in sessions that do not tell it."""
     return np.concatenate([part.covariates.get(name, np.full(len(part.labels), np.nan)) for part in parts])
 
 
-def _left_out(part: Part) -> str:
+def _left_out(part: SessionCounts) -> str:
     return f"{part.source}: no trial is left, so its {len(part.unit_ids)} units are left out"
 
 
-def _content(part: Part) -> tuple[Any, ...]:
+def _content(part: SessionCounts) -> tuple[Any, ...]:
     """What makes the data: all else (window, selection, file names) only says how they came about."""
     names = (part.subject, part.session, part.labels, part.trial_ids, part.unit_ids)
     return part.counts, part.duration, names
 
 
-def _about(part: Part) -> dict[str, Any]:
+def _about(part: SessionCounts) -> dict[str, Any]:
     return {
         "subject": part.subject,
         "session": part.session,
@@ -124,7 +124,7 @@ def _about(part: Part) -> dict[str, Any]:
     }
 
 
-def _missing(parts: list[Part], vocabulary: tuple[str, ...]) -> dict[str, list[str]]:
+def _missing(parts: list[SessionCounts], vocabulary: tuple[str, ...]) -> dict[str, list[str]]:
     have: dict[str, set[str]] = {}
     for part in parts:
         have.setdefault(part.subject, set()).update(part.labels)

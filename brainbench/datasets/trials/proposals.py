@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
-from brainbench.datasets.layouts.registry import Recipe, detect_recipe
-from brainbench.datasets.sessions import Session, Table, as_labels, natural_order
+from brainbench.datasets.layouts.registry import RecordingLayout, detect_recipe
+from brainbench.datasets.sessions import Session, SessionTable, as_labels, natural_order
 from brainbench.datasets.trials.conditions import natural_vocabulary
 
 EXAMPLES = 6
@@ -70,7 +70,7 @@ def propose(sessions: Iterable[Session]) -> list[Proposal]:
     return [proposal for _, proposal in sorted(ranked, key=lambda item: item[0])]
 
 
-def _of_recipe(recipe: Recipe, table: Table) -> Proposal:
+def _of_recipe(recipe: RecordingLayout, table: SessionTable) -> Proposal:
     values = [tuple(row) for row in recipe.conditions.values(table).tolist() if all(row)]
     declared = recipe.vocabulary(recipe.conditions) or natural_vocabulary(values)
     counts = Counter("-".join(row) for row in values)
@@ -94,7 +94,7 @@ def _is_time(column: ColumnSummary) -> bool:
     return column.name in ("start_time", "stop_time") or column.name.endswith(("_time", "_times"))
 
 
-def summarise_columns(table: Table) -> Iterator[ColumnSummary]:
+def summarise_columns(table: SessionTable) -> Iterator[ColumnSummary]:
     """Describe every column of an interval table."""
     for name in table.columns:
         if f"{name}_index" in table:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.datasets.sessions import Table, as_labels
+from brainbench.datasets.sessions import SessionTable, as_labels
 
 _TRUTH = {"true": ("true", "1"), "false": ("false", "0")}
 _RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(?P<sign>!=|=)\s*(?P<values>.+?)\s*$")
@@ -49,7 +49,7 @@ class Rule:
             parts.append(f"{self.column}={low}..{high}")
         return " and ".join(parts)
 
-    def keep(self, table: Table) -> NDArray[np.bool_] | None:
+    def keep(self, table: SessionTable) -> NDArray[np.bool_] | None:
         """Return which rows of ``table`` pass [rows], or None where an optional column is absent.
 
         Raises:
@@ -148,7 +148,7 @@ class Tally:
         self.removed[rule] = self.removed.get(rule, 0) + int(np.sum(kept & ~passes))
         return kept & passes
 
-    def select(self, table: Table, rules: tuple[Rule, ...], scope: str) -> NDArray[np.bool_]:
+    def select(self, table: SessionTable, rules: tuple[Rule, ...], scope: str) -> NDArray[np.bool_]:
         """Apply rules in order to all rows of a table; returns which remain [rows]."""
         kept = np.ones(len(table), dtype=bool)
         for rule in rules:

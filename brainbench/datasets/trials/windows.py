@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets.sessions import Session, Table
+from brainbench.datasets.sessions import Session, SessionTable
 
 FIRST_CONTACT = "first-contact"
 CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
@@ -81,7 +81,7 @@ class Window:
         ends += [f"+{self.length:g}"] if self.length is not None else []
         return f"{self.anchor}{_signed(self.offset)}..{' or '.join(ends)}"
 
-    def edges(self, session: Session, table: Table, notes: list[str]) -> NDArray[np.float64]:
+    def edges(self, session: Session, table: SessionTable, notes: list[str]) -> NDArray[np.float64]:
         """Return begin and end of the window of every row [rows, 2] (s); NaN where an event is missing.
 
         Raises:
@@ -113,7 +113,7 @@ class Window:
     def _first_contacts(
         self,
         source: str,
-        contacts: dict[str, Table],
+        contacts: dict[str, SessionTable],
         start: NDArray[np.float64],
         until: NDArray[np.float64],
         notes: list[str],
@@ -138,7 +138,7 @@ def resolve_window(window: Window | str) -> Window:
     return Window.parse(window) if isinstance(window, str) else window
 
 
-def _event(table: Table, anchor: str) -> NDArray[np.float64]:
+def _event(table: SessionTable, anchor: str) -> NDArray[np.float64]:
     return table.times(_ANCHORS.get(anchor, anchor))
 
 

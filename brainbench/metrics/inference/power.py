@@ -39,7 +39,7 @@ _CHUNK_ELEMENTS = 1 << 21
 
 
 @dataclass(frozen=True)
-class Design:
+class ExperimentDesign:
     """An experiment, and the truth it is to find.
 
     Raises:
@@ -79,7 +79,7 @@ class Design:
 class Power:
     """How often a design finds its effect."""
 
-    design: Design
+    design: ExperimentDesign
     power: float
     """Share of simulated experiments with p ≤ α; 0 where no p can be that small."""
     interval: Interval | None
@@ -92,7 +92,7 @@ class Power:
     """Why no simulation was needed."""
 
 
-def power(design: Design, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
+def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
     """Simulate experiments of one design.
 
     Args:
@@ -123,7 +123,12 @@ def power(design: Design, *, simulations: int = SIMULATIONS, seed: int = 0) -> P
 
 
 def needed(
-    design: Design, vary: str = "stimuli", *, target: float = 0.8, simulations: int = SIMULATIONS, seed: int = 0
+    design: ExperimentDesign,
+    vary: str = "stimuli",
+    *,
+    target: float = 0.8,
+    simulations: int = SIMULATIONS,
+    seed: int = 0,
 ) -> int | None:
     """Return the smallest tried number of stimuli or animals whose power reaches ``target``; None if none does.
 
@@ -150,7 +155,7 @@ def _orders(stimuli: int, seed: int) -> np.ndarray:
     return np.concatenate([np.arange(stimuli)[None], random])
 
 
-def _chunks(simulations: int, design: Design, orders: int) -> Iterator[int]:
+def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator[int]:
     pairs = design.stimuli * (design.stimuli - 1) // 2
     step = max(
         1, _CHUNK_ELEMENTS // (orders * max(pairs, design.layers * (design.animals if design.layers > 1 else 1)))
@@ -159,7 +164,7 @@ def _chunks(simulations: int, design: Design, orders: int) -> Iterator[int]:
         yield min(step, simulations - start)
 
 
-def _experiments(generator: np.random.Generator, design: Design, size: int) -> tuple[Floats, Floats]:
+def _experiments(generator: np.random.Generator, design: ExperimentDesign, size: int) -> tuple[Floats, Floats]:
     """Return models [S, L, P] and measured animals [S, A, P]."""
 
     def rdms(*shape: int) -> Floats:

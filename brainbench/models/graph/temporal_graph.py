@@ -353,8 +353,8 @@ class _Pass:
 
     def _tapes(self) -> Iterator[tuple[nn.Module, Any]]:
         """Yield what convolutions and gates write down for their gradients."""
-        from brainbench.models.ops.convolution import Tape
-        from brainbench.models.ops.gates import GateTape
+        from brainbench.models.ops.convolution import DeferredWeightGrad
+        from brainbench.models.ops.gates import DeferredNormGrad
 
         for name, node in self.graph._items():
             first, stop = self.steps[name]
@@ -363,13 +363,13 @@ class _Pass:
                 continue
             stimuli = self.batch * (stop - first)
             if isinstance(operation, Conv2d) and operation.fits(self.x):
-                yield operation, Tape(operation, node.grid, stimuli)
+                yield operation, DeferredWeightGrad(operation, node.grid, stimuli)
             if isinstance(memory, GatedCell):
                 grid = self.graph._memory_grid(name)
                 for conv in [part for part in memory.modules() if isinstance(part, Conv2d)]:
-                    yield conv, Tape(conv, grid, stimuli)
+                    yield conv, DeferredWeightGrad(conv, grid, stimuli)
             if isinstance(memory, IntersectionRNN):
-                yield memory, GateTape([memory.norm(gate) for gate in memory.gates] if memory.norms else [])
+                yield memory, DeferredNormGrad([memory.norm(gate) for gate in memory.gates] if memory.norms else [])
 
     def _run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
         groups = self.graph._groups

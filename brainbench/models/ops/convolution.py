@@ -1,8 +1,9 @@
 """Convolutions as products of rows, and weight gradients that wait for the last step of a sweep.
 
 A recurrent network meets the same weights at every step. Summing their gradient step by step reads and writes all of it
-every time, in products that are too small to fill a GPU; a :class:`Tape` keeps both factors instead, and one product
-over all steps gives the sum. Letters: B batch, C channels, (H, W) grid, R rows (stimulus, then place), O outputs.
+every time, in products that are too small to fill a GPU; a :class:`DeferredWeightGrad` keeps both factors instead, and
+one product over all steps gives the sum. Letters: B batch, C channels, (H, W) grid, R rows
+(stimulus, then place), O outputs.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ HALF = torch.bfloat16
 
 
 @dataclass(frozen=True)
-class Geometry:
+class ConvolutionShape:
     """How a convolution of stride 1 moves over a grid."""
 
     kernel: tuple[int, int]
@@ -35,7 +36,7 @@ class Geometry:
     """Places of the result."""
 
     @classmethod
-    def of(cls, conv: Conv2d, grid: Sequence[int]) -> Geometry:
+    def of(cls, conv: Conv2d, grid: Sequence[int]) -> ConvolutionShape:
         """Return that of a convolution on a grid (H, W)."""
         left, right, top, bottom = conv.around
         rows, columns = conv.kernel_size
@@ -46,13 +47,15 @@ class Geometry:
             (int(grid[0]) + top + bottom - rows + 1, int(grid[1]) + left + right - columns + 1),
         )
 
-    def reversed(self) -> Geometry:
+    def reversed(self) -> ConvolutionShape:
         """Return that of the convolution which takes gradients back."""
         top, left = (size - 1 - pad for size, pad in zip(self.kernel, self.pads, strict=True))
-        return Geometry(self.kernel, (top, left), self.out, self.grid)
+        return ConvolutionShape(self.kernel, (top, left), self.out, self.grid)
 
 
-def unfolded(inputs: Sequence[torch.Tensor], geometry: Geometry, out: torch.Tensor | None = None) -> torch.Tensor:
+def unfolded(
+    inputs: Sequence[torch.Tensor], geometry: ConvolutionShape, out: torch.Tensor | None = None
+) -> torch.Tensor:
     """Return the windows [R, taps · ΣC] of inputs [B, C, H, W] in half precision, in ``out`` if given."""
     from brainbench.models.ops.kernels.intersection import by_places
     from brainbench.models.ops.kernels.unfold import unfold_into
@@ -72,7 +75,7 @@ def matrix_of(weight: torch.Tensor) -> torch.Tensor:
 
 def convolve(conv: Conv2d, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
     """Return the convolution [B, O, H', W'] of inputs that lie side by side on channels; no gradients."""
-    geometry = Geometry.of(conv, inputs[0].shape[2:])
+    geometry = ConvolutionShape.of(conv, inputs[0].shape[2:])
     columns = unfolded(inputs, geometry)
     return _maps(_product(columns, matrix_of(conv.weight), conv.bias), geometry)
 
@@ -83,11 +86,11 @@ def _product(columns: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor | N
     return torch.addmm(bias.detach().to(HALF), columns, matrix.t())
 
 
-def _maps(rows: torch.Tensor, geometry: Geometry) -> torch.Tensor:
+def _maps(rows: torch.Tensor, geometry: ConvolutionShape) -> torch.Tensor:
     return rows.view(-1, *geometry.out, rows.shape[1]).permute(0, 3, 1, 2)
 
 
-class Tape:
+class DeferredWeightGrad:
     """What the weight gradient of one convolution needs of all steps of one pass.
 
     Args:
@@ -97,7 +100,7 @@ class Tape:
     """
 
     def __init__(self, conv: Conv2d, grid: Sequence[int], stimuli: int) -> None:
-        self.geometry = Geometry.of(conv, grid)
+        self.geometry = ConvolutionShape.of(conv, grid)
         self.places = math.prod(self.geometry.out)
         outputs, width = len(conv.weight), conv.weight[0].numel()
         options: dict[str, Any] = {"dtype": HALF, "device": conv.weight.device}
@@ -160,7 +163,7 @@ class _Collected(torch.autograd.Function):
     """The weights as a matrix. Its backward pass comes after that of all steps, and multiplies what they left."""
 
     @staticmethod
-    def forward(ctx: Any, tape: Tape, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+    def forward(ctx: Any, tape: DeferredWeightGrad, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
         ctx.tape, ctx.shape = tape, weight.shape
         ctx.set_materialize_grads(False)
         return matrix_of(weight)
@@ -177,7 +180,7 @@ class _Collected(torch.autograd.Function):
 
 class _Convolved(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, tape: Tape, matrix: torch.Tensor, *inputs: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, tape: DeferredWeightGrad, matrix: torch.Tensor, *inputs: torch.Tensor) -> torch.Tensor:
         columns = unfolded(inputs, tape.geometry, tape.reserve(len(inputs[0])))
         ctx.tape, ctx.span = tape, tape.span
         ctx.inputs = [(x.shape[1], x.dtype) for x in inputs]
@@ -186,7 +189,7 @@ class _Convolved(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *given: Any) -> Any:
-        tape: Tape = ctx.tape
+        tape: DeferredWeightGrad = ctx.tape
         place = tape.gradient(ctx.span)
         gradient = given[0] if place is None else _maps(place, tape.geometry)
         if gradient.data_ptr() != given[0].data_ptr():
@@ -199,7 +202,7 @@ class _Convolved(torch.autograd.Function):
         return None, None, *(part.to(kind) for part, (_, kind) in zip(parts, ctx.inputs, strict=True))
 
 
-def unfolded_plainly(inputs: Sequence[torch.Tensor], geometry: Geometry) -> torch.Tensor:
+def unfolded_plainly(inputs: Sequence[torch.Tensor], geometry: ConvolutionShape) -> torch.Tensor:
     """Return what :func:`unfolded` returns, by PyTorch's own operations: to compare with."""
     x = torch.cat([item.float() for item in inputs], 1)
     (top, left), (rows, columns) = geometry.pads, geometry.kernel

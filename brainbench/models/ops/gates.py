@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from brainbench.models.ops.convolution import HALF, Tape
+from brainbench.models.ops.convolution import HALF, DeferredWeightGrad
 
 if TYPE_CHECKING:
     from brainbench.models.cells import ChannelNorm, IntersectionRNN
 
 
-class GateTape:
+class DeferredNormGrad:
     """What the gradients of a cell's norms add up to over the steps of a pass."""
 
     def __init__(self, norms: list[ChannelNorm]) -> None:
@@ -37,7 +37,7 @@ class _Stacked(torch.autograd.Function):
     """Scales and shifts as one array. Its backward pass comes after that of all steps, which left their sums."""
 
     @staticmethod
-    def forward(ctx: Any, tape: GateTape, *weights: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, tape: DeferredNormGrad, *weights: torch.Tensor) -> torch.Tensor:
         ctx.tape, ctx.kinds = tape, [weight.dtype for weight in weights]
         ctx.set_materialize_grads(False)
         return torch.stack([weight.detach().float() for weight in weights])
@@ -77,8 +77,8 @@ class _Settled(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        tape: GateTape,
-        conv: Tape,
+        tape: DeferredNormGrad,
+        conv: DeferredWeightGrad,
         norms: torch.Tensor | None,
         kind: torch.dtype,
         fused: torch.Tensor,

@@ -20,7 +20,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.models.ops import dispatch
 
 if TYPE_CHECKING:
-    from brainbench.models.ops.convolution import Tape
+    from brainbench.models.ops.convolution import DeferredWeightGrad
 
 RECTIFIER_GAIN = math.sqrt(2.0)
 
@@ -134,7 +134,7 @@ class Conv2d(nn.Conv2d):
         self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
         self._extra: tuple[int, int, int, int] | None = None
         self._packed: Packed | None = None
-        self.tape: Tape | None = None
+        self.tape: DeferredWeightGrad | None = None
         """Where the steps of a pass leave what the gradient of the weights needs; None outside of such a pass."""
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":

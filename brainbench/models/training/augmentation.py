@@ -65,13 +65,13 @@ class Augmentation:
             part: (rank, number) when ``x`` holds every number-th sweep of a larger batch, from rank on; each sweep is
                 then treated as it would be in the whole batch.
         """
-        draw = Draw(generator, *part)
+        draw = SampledAugmentation(generator, *part)
         y = KINDS[self.kind](x, draw)
         return mask_steps(y, self.masking, draw) if self.masking else y
 
 
 @dataclass(frozen=True)
-class Draw:
+class SampledAugmentation:
     """Random numbers for the sweeps of one batch, or of this process's part of it."""
 
     generator: torch.Generator
@@ -125,7 +125,7 @@ def reverse_time(x: torch.Tensor) -> torch.Tensor:
     return samples.flip(1).reshape(x.shape)
 
 
-def mask_steps(x: torch.Tensor, share: float, draw: Draw) -> torch.Tensor:
+def mask_steps(x: torch.Tensor, share: float, draw: SampledAugmentation) -> torch.Tensor:
     """Set a share of the time steps of each sample to zero (rounded to whole steps, at least one step stays)."""
     batch, steps = x.shape[:2]
     count = min(round(share * steps), steps - 1)
@@ -158,14 +158,14 @@ def _places(direction: str) -> tuple[int, ...]:
     return tuple(places)
 
 
-def _physical(x: torch.Tensor, draw: Draw) -> torch.Tensor:
+def _physical(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
     # Both flips together are the half turn, so three fair coins draw the eight motions evenly.
     for direction in _MIRRORED:
         x = torch.where(draw.coins(x), flip(x, direction), x)
     return torch.where(draw.coins(x), reverse_time(x), x)
 
 
-def _thesis(x: torch.Tensor, draw: Draw) -> torch.Tensor:
+def _thesis(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
     drawn = draw.for_all(4, x.device)
     rows, columns = x.shape[3:]
     # Nothing is read back from the device: every outcome is a table, and the one drawn is looked up.
@@ -192,7 +192,7 @@ def _turned_places(rows: int, columns: int) -> tuple[int, ...]:
     return tuple(found)
 
 
-def _image(x: torch.Tensor, draw: Draw) -> torch.Tensor:
+def _image(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
     # Pictures have one unit per pixel: work in the units the networks see.
     units = tuple(Normaliser.physical(x.shape[2] // len(CHANNELS)).scale.flatten().tolist())
     scale = _constant(units, x.device).to(x.dtype).view(-1, 1, 1)
@@ -215,12 +215,12 @@ def _image(x: torch.Tensor, draw: Draw) -> torch.Tensor:
     return y * scale
 
 
-def _none(x: torch.Tensor, draw: Draw) -> torch.Tensor:
+def _none(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
     del draw
     return x
 
 
-KINDS: Mapping[str, Callable[[torch.Tensor, Draw], torch.Tensor]] = {
+KINDS: Mapping[str, Callable[[torch.Tensor, SampledAugmentation], torch.Tensor]] = {
     "none": _none,
     "physical": _physical,
     "thesis": _thesis,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
-from brainbench.models.recipes import BATCH_SIZE, EPOCHS, Setting, recipe_for
+from brainbench.models.recipes import BATCH_SIZE, EPOCHS, TrainingSetting, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
 
 PRECISIONS = ("auto", "float32", "bf16")
@@ -97,7 +97,7 @@ class TrainingConfig:
         recipe = recipe_for(model, objective)
         setting = recipe.setting
         if variant == "warmup" and objective == "simsiam":
-            setting = Setting(setting.optimizer, setting.schedule, setting.learning_rate, 10)
+            setting = TrainingSetting(setting.optimizer, setting.schedule, setting.learning_rate, 10)
         elif variant:
             raise unknown_name("objective", f"{objective}-{variant}", ("supervised", "simclr", "simsiam", "ae"))
         values = {

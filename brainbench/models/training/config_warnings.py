@@ -11,7 +11,7 @@ PLAYED_BACKWARDS = ("physical", "thesis")
 """Augmentations that reverse time."""
 
 
-def doubts(config: TrainingConfig, model: Any) -> list[str]:
+def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
     """Return reasons why a run may teach nothing, each a sentence and what to do instead.
 
     Args:

@@ -35,7 +35,7 @@ from brainbench.models.training.batches import Batches, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.config_warnings import doubts
+from brainbench.models.training.config_warnings import config_warnings
 from brainbench.models.training.cuda_graphs import Gradients, fuse
 from brainbench.models.training.evaluation import Evaluation, evaluate
 from brainbench.models.training.initial_state import draw_silent_biases
@@ -149,7 +149,7 @@ class _Run:
         if (out / STATE).is_file():
             self._restore()
         self.log = RunLog(out, step=self.step, active=where.first)
-        for doubt in doubts(config, self.model) if where.first else ():
+        for doubt in config_warnings(config, self.model) if where.first else ():
             _log.warning("%s", doubt)
 
     def run(self, allowed: float) -> TrainingResult:

@@ -22,7 +22,7 @@ SAMPLING = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class JobSchedule:
     """Distinct jobs of some scenes, and where each whisker of each scene finds its trace."""
 
     jobs: tuple[Job, ...]
@@ -35,7 +35,7 @@ class Plan:
     """Whether the engine touches exact surfaces where there are some, instead of convex parts."""
 
 
-def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> Plan:
+def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> JobSchedule:
     """Find the distinct jobs of ``scenes``, for an engine that touches exact ``surfaces`` or convex parts."""
     distinct: dict[str, int] = {}
     jobs: list[Job] = []
@@ -55,7 +55,7 @@ def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> Plan:
             near.append(reach)
         places.append(tuple(row))
         reaches.append(tuple(near))
-    return Plan(tuple(jobs), tuple(places), tuple(reaches), surfaces)
+    return JobSchedule(tuple(jobs), tuple(places), tuple(reaches), surfaces)
 
 
 def reach_of(job: Job, *, surfaces: bool = False) -> Reach:

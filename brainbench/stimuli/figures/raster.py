@@ -69,7 +69,7 @@ class Triangles:
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class RasterLayer:
     """What is visible at each pixel of a picture of some triangles."""
 
     nearness: NDArray[np.float64]
@@ -84,7 +84,7 @@ class Layer:
     """[n, 3] colours."""
 
 
-def draw(triangles: Triangles, lens: Lens) -> Layer:
+def draw(triangles: Triangles, lens: Lens) -> RasterLayer:
     """Find the nearest triangle at each pixel, and point, normal and colour there."""
     triangles = triangles.split(lens)
     planes = _planes(lens.project(triangles.corners))
@@ -103,7 +103,7 @@ def draw(triangles: Triangles, lens: Lens) -> Layer:
     length = np.maximum(np.sqrt(np.einsum("ni,ni->n", normals, normals)), 1e-12)
     length = np.where(np.sum(normals * towards, axis=1) < 0, -length, length)
     normals /= length[:, None].astype(np.float32)
-    return Layer(nearness, pixels, points, normals, triangles.colors.astype(np.float32)[faces])
+    return RasterLayer(nearness, pixels, points, normals, triangles.colors.astype(np.float32)[faces])
 
 
 @dataclass(frozen=True, eq=False)

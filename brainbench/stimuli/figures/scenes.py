@@ -19,9 +19,9 @@ from brainbench.stimuli.figures.annotation import Annotation
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.canvas import ROW_COLORS, check_format, round_up
 from brainbench.stimuli.figures.films import require_writer, write_film
-from brainbench.stimuli.figures.raster import Layer, Triangles, draw
+from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
 from brainbench.stimuli.figures.shading import floor, lamp, paint, shade
-from brainbench.stimuli.figures.surfaces import Surface, ball, object_surface, smoothed, tube
+from brainbench.stimuli.figures.surfaces import DrawnSurface, ball, object_surface, smoothed, tube
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.whisker_shapes import Recording, record
 
@@ -94,9 +94,9 @@ class Picture:
         self.recording = recording
         self.camera = camera or Camera()
         self.style = style or Style()
-        self._surfaces: list[Surface] = [object_surface(item) for item in recording.scene.objects]
+        self._surfaces: list[DrawnSurface] = [object_surface(item) for item in recording.scene.objects]
         self._still = all(surface.motion is None for surface in self._surfaces)
-        self._cached: tuple[Triangles, Layer] | None = None
+        self._cached: tuple[Triangles, RasterLayer] | None = None
 
     @cached_property
     def lens(self) -> Lens:
@@ -133,7 +133,7 @@ class Picture:
         total = sum(image[row::factor, column::factor] for row in range(factor) for column in range(factor))
         return np.round(255 / factor**2 * np.asarray(total)).astype(np.uint8)
 
-    def _objects(self, index: int, lens: Lens) -> tuple[Triangles, Layer]:
+    def _objects(self, index: int, lens: Lens) -> tuple[Triangles, RasterLayer]:
         """Triangles of the objects and what the camera sees of them; found once when nothing moves."""
         if self._cached is not None and self._still:
             return self._cached

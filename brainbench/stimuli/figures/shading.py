@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.raster import Layer, Triangles, draw
+from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,7 +71,9 @@ def lamp(lens: Lens, samples: int, points: NDArray[np.float64], triangles: Trian
     return Light(fitted, draw(triangles, fitted).nearness, strength)
 
 
-def shade(layer: Layer, lens: Lens, light: Light, *, gloss: float = 0.0, bias: float = 4.0) -> NDArray[np.float64]:
+def shade(
+    layer: RasterLayer, lens: Lens, light: Light, *, gloss: float = 0.0, bias: float = 4.0
+) -> NDArray[np.float64]:
     """Return the colours [n, 3] of a layer's pixels: diffuse, with shadows and a highlight of strength ``gloss``."""
     facing = layer.normals @ light.direction.astype(np.float32)
     lit = np.zeros(len(facing), dtype=np.float32)
@@ -110,7 +112,7 @@ def floor(lens: Lens, light: Light, height: float) -> NDArray[Any]:
     return bright - shadow.repeat(2, axis=0).repeat(2, axis=1)[:rows, :width]
 
 
-def paint(layer: Layer, colors: NDArray[Any], background: NDArray[Any], opacity: float = 1.0) -> None:
+def paint(layer: RasterLayer, colors: NDArray[Any], background: NDArray[Any], opacity: float = 1.0) -> None:
     """Lay the colours [n, 3] of a layer over ``background`` [H, W, 3], in place."""
     flat = background.reshape(-1, 3)
     flat[layer.pixels] = opacity * colors + (1 - opacity) * flat[layer.pixels]

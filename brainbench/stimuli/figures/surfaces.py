@@ -32,7 +32,7 @@ _DETAILED = 200_000
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class DrawnSurface:
     """The surface of one object."""
 
     corners: NDArray[np.float64]
@@ -52,7 +52,7 @@ class Surface:
         return Triangles(self.corners @ turn.T + positions[0], self.normals @ turn.T, colors)
 
 
-def object_surface(item: PlacedObject) -> Surface:
+def object_surface(item: PlacedObject) -> DrawnSurface:
     """Return the surface of an object: its mesh, or what whiskers touch when it has none."""
     from brainbench.stimuli.objects.placed_object import euler_matrix
 
@@ -66,7 +66,7 @@ def object_surface(item: PlacedObject) -> Surface:
         meshes = [item.solid.mesh.transformed(euler_matrix(item.rotation), place)]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
     normals = np.concatenate([corner_normals(mesh) for mesh in meshes])
-    return Surface(corners, normals, obstacle.motion)
+    return DrawnSurface(corners, normals, obstacle.motion)
 
 
 def part_mesh(part: Part) -> Mesh:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.stimuli.motion import trajectories
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Spin, Still, Translation, Whisking
-from brainbench.stimuli.scenes.toml_tables import MILLI, Table, listed, number, text, vector
+from brainbench.stimuli.scenes.toml_tables import MILLI, TomlTable, listed, number, text, vector
 
 if TYPE_CHECKING:
     from brainbench.stimuli.motion.recorded import Recorded
@@ -21,7 +21,7 @@ _DEGREE = math.pi / 180
 _WHISKINGS = ("sinusoid", "still", "recorded")
 
 
-def read_head_motion(table: Table) -> Still | Translation | trajectories.Path:
+def read_head_motion(table: TomlTable) -> Still | Translation | trajectories.Path:
     """Return how a head moves: a velocity, keyframes, or not at all.
 
     Raises:
@@ -30,7 +30,7 @@ def read_head_motion(table: Table) -> Still | Translation | trajectories.Path:
     return _only(table, "a velocity or keyframes", _translation(table), _keyframes(table))
 
 
-def read_object_motion(table: Table) -> Still | Translation | Spin | trajectories.Path:
+def read_object_motion(table: TomlTable) -> Still | Translation | Spin | trajectories.Path:
     """Return how an object moves: a velocity, a spin, keyframes, or not at all.
 
     Raises:
@@ -39,14 +39,14 @@ def read_object_motion(table: Table) -> Still | Translation | Spin | trajectorie
     return _only(table, "a velocity, a spin or keyframes", _translation(table), _spin(table), _keyframes(table))
 
 
-def _only(table: Table, choice: str, *motions: Moving | None) -> Moving | Still:
+def _only(table: TomlTable, choice: str, *motions: Moving | None) -> Moving | Still:
     given = [item for item in motions if item is not None]
     if len(given) > 1:
         raise UsageError(f"{table.name} takes {choice}, not several; keyframes can do all of it.")
     return given[0] if given else Still()
 
 
-def _translation(table: Table) -> Translation | None:
+def _translation(table: TomlTable) -> Translation | None:
     velocity = table.take("velocity_mm_s", vector(MILLI), None)
     onset = table.take("velocity_onset_ms", number(MILLI), None)
     if velocity is None:
@@ -54,7 +54,7 @@ def _translation(table: Table) -> Translation | None:
     return Translation(velocity) if onset is None else Translation(velocity, onset)
 
 
-def _spin(table: Table) -> Spin | None:
+def _spin(table: TomlTable) -> Spin | None:
     velocity = table.take("spin_deg_s", vector(_DEGREE), None)
     onset = table.take("spin_onset_ms", number(MILLI), None)
     if velocity is None:
@@ -62,7 +62,7 @@ def _spin(table: Table) -> Spin | None:
     return Spin(velocity) if onset is None else Spin(velocity, onset)
 
 
-def _keyframes(table: Table) -> trajectories.Path | None:
+def _keyframes(table: TomlTable) -> trajectories.Path | None:
     keys = ("times_ms", "path_mm", "path_deg")
     times = table.take(keys[0], listed(number(MILLI)), None)
     places = table.take(keys[1], listed(vector(MILLI)), None)
@@ -75,7 +75,7 @@ def _keyframes(table: Table) -> trajectories.Path | None:
     return trajectories.Path(times, still if places is None else places, still if turns is None else turns)
 
 
-def read_whisking(table: Table, folder: Path) -> Still | Whisking | Recorded:
+def read_whisking(table: TomlTable, folder: Path) -> Still | Whisking | Recorded:
     """Return what ``[whisking]`` says; paths are relative to ``folder``."""
     kind = table.take("kind", text, "sinusoid")
     if kind not in _WHISKINGS:
@@ -96,7 +96,7 @@ def read_whisking(table: Table, folder: Path) -> Still | Whisking | Recorded:
     return recorded or (whisking if kind == "sinusoid" else Still())
 
 
-def _recorded(table: Table, folder: Path, rotations: Rotations) -> Recorded:
+def _recorded(table: TomlTable, folder: Path, rotations: Rotations) -> Recorded:
     from brainbench.stimuli.motion.recorded import Recorded, load_initial_angles, load_trajectory
 
     layout = table.take("layout", text, None)

@@ -21,12 +21,12 @@ from brainbench.stimuli.objects.placed_object import (
     sphere,
 )
 from brainbench.stimuli.scenes.motion_tables import read_object_motion
-from brainbench.stimuli.scenes.toml_tables import MILLI, Table, length, number, text, vector, whole
+from brainbench.stimuli.scenes.toml_tables import MILLI, TomlTable, length, number, text, vector, whole
 
 _FAMILY = "family:"
 
 
-def read_object(table: Table, folder: Path) -> PlacedObject:
+def read_object(table: TomlTable, folder: Path) -> PlacedObject:
     """Return the object that a table describes; paths are relative to ``folder``.
 
     Raises:
@@ -47,7 +47,7 @@ def read_object(table: Table, folder: Path) -> PlacedObject:
     return placed
 
 
-def _mesh(table: Table, folder: Path) -> Solid:
+def _mesh(table: TomlTable, folder: Path) -> Solid:
     path = folder / table.take("path", text)
     return mesh_solid(
         path,
@@ -58,7 +58,7 @@ def _mesh(table: Table, folder: Path) -> Solid:
     )
 
 
-def _family(table: Table, name: str) -> Solid:
+def _family(table: TomlTable, name: str) -> Solid:
     shape = procedural.make(name, table.take("seed", whole, 0), detail=table.take("detail", whole, 4_000))
     return shape_solid(
         shape,
@@ -68,7 +68,7 @@ def _family(table: Table, name: str) -> Solid:
     )
 
 
-def _decomposition(table: Table) -> DecompositionSettings:
+def _decomposition(table: TomlTable) -> DecompositionSettings:
     usual = DecompositionSettings()
     return DecompositionSettings(
         method=table.take("method", text, usual.method),  # type: ignore[arg-type]
@@ -77,12 +77,12 @@ def _decomposition(table: Table) -> DecompositionSettings:
     )
 
 
-def _rodgers(table: Table, folder: Path) -> Solid:
+def _rodgers(table: TomlTable, folder: Path) -> Solid:
     diagonal = table.take("diagonal_mm", length, 0.055)
     return rodgers_solid(diagonal, segments=table.take("segments", whole, 24))
 
 
-_SHAPES: dict[str, Callable[[Table, Path], Solid]] = {
+_SHAPES: dict[str, Callable[[TomlTable, Path], Solid]] = {
     "sphere": lambda table, folder: sphere(table.take("radius_mm", length)),
     "box": lambda table, folder: box(table.take("size_mm", vector(MILLI))),
     "cylinder": lambda table, folder: cylinder(table.take("radius_mm", length), table.take("height_mm", length)),

@@ -67,7 +67,7 @@ from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.motion_tables import read_head_motion, read_whisking
 from brainbench.stimuli.scenes.object_tables import read_object
 from brainbench.stimuli.scenes.scene import Animal, Head, Scene
-from brainbench.stimuli.scenes.toml_tables import MILLI, Table, mapping, number, tables, text, vector, whole
+from brainbench.stimuli.scenes.toml_tables import MILLI, TomlTable, mapping, number, tables, text, vector, whole
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
 
@@ -114,10 +114,10 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
 
 
 def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
-    top = Table("the scene file", data)
+    top = TomlTable("the scene file", data)
     description = top.take("description", text, "")
     array = _array(top.table("array"))
-    others = tuple(_animal(Table("[[animal]]", item), path.parent) for item in top.take("animal", tables, []))
+    others = tuple(_animal(TomlTable("[[animal]]", item), path.parent) for item in top.take("animal", tables, []))
     shared = {name: top.take(name, mapping, _NOTHING) for name in ("head", "whisking", "frames")}
     common = top.take("object", tables, [])
     entries = top.take("scene", tables, [])
@@ -139,7 +139,7 @@ def _scene(
     common: list[Mapping[str, Any]],
     folder: Path,
 ) -> Scene:
-    table = Table("[[scene]]", entry)
+    table = TomlTable("[[scene]]", entry)
     label = table.take("label", text)
     merged = {name: {**shared[name], **table.take(name, mapping, _NOTHING)} for name in ("head", "whisking")}
     objects = [*common, *table.take("object", tables, [])]
@@ -147,15 +147,15 @@ def _scene(
     return Scene(
         label=label,
         array=array,
-        objects=tuple(read_object(Table(f"[[object]] of scene {label!r}", item), folder) for item in objects),
-        whisking=read_whisking(Table("[whisking]", merged["whisking"]), folder),
-        head=_head(Table("[head]", merged["head"])),
-        frames=_frames(Table("[frames]", shared["frames"])),
+        objects=tuple(read_object(TomlTable(f"[[object]] of scene {label!r}", item), folder) for item in objects),
+        whisking=read_whisking(TomlTable("[whisking]", merged["whisking"]), folder),
+        head=_head(TomlTable("[head]", merged["head"])),
+        frames=_frames(TomlTable("[frames]", shared["frames"])),
         others=others,
     )
 
 
-def _animal(table: Table, folder: Path) -> Animal:
+def _animal(table: TomlTable, folder: Path) -> Animal:
     animal = Animal(
         name=table.take("name", text),
         array=_array(table.table("array")),
@@ -166,7 +166,7 @@ def _animal(table: Table, folder: Path) -> Animal:
     return animal
 
 
-def _array(table: Table) -> WhiskerArray:
+def _array(table: TomlTable) -> WhiskerArray:
     species = table.take("species", text, "mouse")
     if species not in SPECIES:
         raise unknown_name("species", species, SPECIES)
@@ -179,7 +179,7 @@ def _array(table: Table) -> WhiskerArray:
     return array
 
 
-def _head(table: Table) -> Head:
+def _head(table: TomlTable) -> Head:
     head = Head(
         position=table.take("position_mm", vector(MILLI), (0.0, 0.0, 0.0)),
         rotation=table.take("rotation_deg", vector(math.pi / 180), (0.0, 0.0, 0.0)),
@@ -189,7 +189,7 @@ def _head(table: Table) -> Head:
     return head
 
 
-def _frames(table: Table) -> Frames:
+def _frames(table: TomlTable) -> Frames:
     usual = Frames()
     interval = table.take("interval_ms", number(MILLI), None)
     rate = table.take("rate_hz", number(1.0), None)

@@ -14,7 +14,7 @@ MILLI = 1e-3
 _REQUIRED = object()
 
 
-class Table:
+class TomlTable:
     """One TOML table from which known keys are taken; whatever is left is an error."""
 
     def __init__(self, name: str, data: Mapping[str, Any]) -> None:
@@ -39,9 +39,9 @@ class Table:
         except (TypeError, ValueError) as error:
             raise UsageError(f"{key!r} of {self.name} must be {error}; received {value!r}.") from error
 
-    def table(self, key: str) -> Table:
+    def table(self, key: str) -> TomlTable:
         """Return a table within this one, empty when there is none."""
-        return Table(f"[{key}]", self.take(key, mapping, {}))
+        return TomlTable(f"[{key}]", self.take(key, mapping, {}))
 
     def finish(self) -> None:
         """Refuse keys that nobody took.

@@ -15,7 +15,7 @@ from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.models.network import EAD
+from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.registry import load_model
 from brainbench.models.streaming import StreamingStep
 from robotics_bridge.policies.encoders.calibration import HandCalibration
@@ -71,7 +71,7 @@ class FrontEnd(nn.Module):
         network = (
             load_model(model, seed=seed, pretrained=pretrained, **(options or {})) if isinstance(model, str) else model
         )
-        if not isinstance(network, EAD) or network.spec.input_shape[1:] != GRID_SHAPE:
+        if not isinstance(network, EncoderAttenderDecoder) or network.spec.input_shape[1:] != GRID_SHAPE:
             raise UsageError(
                 f"A front end needs an encoder-attender-decoder network of steps [30, 5, 7]; received "
                 f"{model if isinstance(model, str) else type(network).__name__!r}."
@@ -101,7 +101,7 @@ class FrontEnd(nn.Module):
             self.train(False)
 
     @property
-    def network(self) -> EAD:
+    def network(self) -> EncoderAttenderDecoder:
         """The network."""
         return self.step.model
 

@@ -42,7 +42,7 @@ class SweepEntry:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class StudentSweep:
     """A file of students."""
 
     name: str
@@ -125,7 +125,7 @@ class Sweep:
         return {"students": len(students), "published": len(published), "entries": entries, "types": types}
 
 
-def read_sweep(path: str | Path = PUBLISHED) -> Sweep:
+def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
     """Read a sweep.
 
     Raises:
@@ -147,7 +147,7 @@ def read_sweep(path: str | Path = PUBLISHED) -> Sweep:
     pinned, encoders = document.get("pinned", {}), document.get("encoders", {})
     _known(pinned, {"resolution", "noisy"}, "key of 'pinned'")
     _known(encoders, {"types", "arms"}, "key of 'encoders'")
-    sweep = Sweep(
+    sweep = StudentSweep(
         name=path.stem,
         entries=entries,
         types=tuple(document.get("types", ())),

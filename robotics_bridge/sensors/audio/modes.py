@@ -27,7 +27,7 @@ SHAPES = ("box", "sphere", "ellipsoid", "cylinder", "mesh")
 
 
 @dataclass(frozen=True)
-class Solid:
+class ElasticSolid:
     """A body to be struck, in its own frame.
 
     Raises:
@@ -63,7 +63,7 @@ class Solid:
 
 
 def find_modes(
-    solid: Solid,
+    solid: ElasticSolid,
     material: str | ElasticMaterial,
     *,
     count: int = 16,

@@ -15,13 +15,13 @@ from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
 from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, drag_kernel
 from robotics_bridge.sensors.noise.model import TAXEL_KNOBS
 from robotics_bridge.sensors.queries.surface_points import sample_cloud
-from robotics_bridge.sensors.sensor import Asks, ProbeRuntime, QuerySensor
+from robotics_bridge.sensors.sensor import ProbeRuntime, QueryRequirements, QuerySensor
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
 
 if TYPE_CHECKING:
-    from robotics_bridge.physics.scene import Scene
+    from robotics_bridge.physics.scene import TouchScene
     from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.sensor import Context, Place
+    from robotics_bridge.sensors.sensor import Context, ReadoutSlice
 
 _NEGLIGIBLE = 1e-7
 
@@ -133,17 +133,17 @@ class ElastomerTaxel(QuerySensor):
         """Sensors of one class and equal group share one runtime and its kernels."""
         return (self.query, self.way, self.points, self.track, "" if self.track else self.link)
 
-    def own(self, scene: Scene) -> tuple[int, ...]:
+    def own(self, scene: TouchScene) -> tuple[int, ...]:
         """Return the geometries of its own link that can be indented."""
         return tuple(g for g in scene.geometries_of(self.link) if scene.geometries[g].kind != "other")
 
-    def asks(self, scene: Scene) -> Asks:
+    def asks(self, scene: TouchScene) -> QueryRequirements:
         """Return what must be built for it."""
         asks = super().asks(scene)
         own = frozenset(self.own(scene)) if self.points else frozenset()
         if self.query == "sdf":
-            return Asks(fields=asks.fields | own)
-        return Asks(trees=asks.trees | own)
+            return QueryRequirements(fields=asks.fields | own)
+        return QueryRequirements(trees=asks.trees | own)
 
     @classmethod
     def build(cls, sensors: Mapping[str, Self], context: Context) -> ElastomerRuntime:
@@ -356,7 +356,7 @@ class ElastomerRuntime(ProbeRuntime):
                     ].flatten(1)
 
 
-def _sides(place: Place) -> tuple[int, int]:
+def _sides(place: ReadoutSlice) -> tuple[int, int]:
     """Rows and columns of a sensor's markers."""
     return (place.layout[0], place.layout[1]) if len(place.layout) == 2 else (1, place.count)
 

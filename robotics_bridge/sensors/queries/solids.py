@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.geometry import Mesh
-    from robotics_bridge.physics.scene import Scene
+    from robotics_bridge.physics.scene import TouchScene
 
 _UNBOUNDED = 1.0e6
 
@@ -82,7 +82,7 @@ class Solids:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: TouchScene,
         num_envs: int,
         device: Any,
         *,

@@ -16,7 +16,7 @@ from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_struct
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from robotics_bridge.physics.scene import Geometry, Scene
+    from robotics_bridge.physics.scene import Geometry, TouchScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ def surface_points(geometry: Geometry, count: int) -> NDArray[np.float64]:
     return cover_evenly(corners, area, count)
 
 
-def sample_cloud(scene: Scene, geometries: Sequence[int], points: int, rows: int, device: Any) -> Cloud:
+def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows: int, device: Any) -> Cloud:
     """Spread ``points`` over geometries in proportion to their areas, row by row of variants.
 
     Planes are left out: they have no end.

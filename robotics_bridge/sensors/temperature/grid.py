@@ -18,13 +18,13 @@ import numpy as np
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.sensors.sensor import Sensor
-from robotics_bridge.sensors.temperature.materials import Body, ThermalMaterial, material
+from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial, material
 
 if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 
-    from robotics_bridge.physics.scene import Geometry, Scene
+    from robotics_bridge.physics.scene import Geometry, TouchScene
     from robotics_bridge.sensors.sensor import Context
     from robotics_bridge.sensors.suite import SensorSuite
     from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
@@ -56,9 +56,9 @@ class TemperatureGrid(Sensor):
     """Whether outer faces radiate."""
     source: Any = 0.0
     """Heat made inside [W/m³]: one number, or an array [nx, ny, nz]."""
-    bodies: Mapping[str, Body] = field(default_factory=dict)
+    bodies: Mapping[str, ThermalBody] = field(default_factory=dict)
     """Link → what it is made of, for links that may touch this one; all others are ``other``."""
-    other: Body = field(default_factory=Body)
+    other: ThermalBody = field(default_factory=ThermalBody)
     """What every other link is made of."""
     conduction: Literal["physical", "thesis"] = "physical"
     """``physical``: the cell (half its depth, and the spreading of a small spot), the interface and the touched body
@@ -117,7 +117,7 @@ class TemperatureGrid(Sensor):
 
         return TemperatureRuntime(sensors, context)
 
-    def corners(self, scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def corners(self, scene: TouchScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and upper corner of the grid [3] (m, link frame)."""
         if self.low is not None and self.high is not None:
             return np.array(self.low, float), np.array(self.high, float)

@@ -71,7 +71,7 @@ def material(name: str | ThermalMaterial) -> ThermalMaterial:
 
 
 @dataclass(frozen=True)
-class Body:
+class ThermalBody:
     """What other links are made of and how warm they are."""
 
     material: str | ThermalMaterial = "plastic"

@@ -10,7 +10,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.sensor import ReadoutRuntime
-from robotics_bridge.sensors.temperature.materials import Body, material
+from robotics_bridge.sensors.temperature.materials import ThermalBody, material
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -177,12 +177,12 @@ def _lags(sensor: TemperatureGrid) -> bool:
     return sensor.tau > 0 or math.isfinite(sensor.warm_range) or math.isfinite(sensor.cold_range)
 
 
-def _body(sensors: list[TemperatureGrid], link: str) -> Body:
+def _body(sensors: list[TemperatureGrid], link: str) -> ThermalBody:
     """What a link is made of: as the configuration says, as a grid on it says, or the default."""
     if link in sensors[0].bodies:
         return sensors[0].bodies[link]
     own = next((sensor for sensor in sensors if sensor.link == link), None)
-    return sensors[0].other if own is None else Body(own.material, own.base_temperature)
+    return sensors[0].other if own is None else ThermalBody(own.material, own.base_temperature)
 
 
 def _exposed(cells: tuple[int, int, int], edges: NDArray[np.float64]) -> NDArray[np.float64]:

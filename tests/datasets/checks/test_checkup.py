@@ -10,14 +10,14 @@ from brainbench.datasets import Session, check, make_session, write_recordings
 from brainbench.datasets.checks.spikes import coincidences
 from brainbench.datasets.exports import subset
 from brainbench.datasets.reading import each_session
-from brainbench.datasets.sessions import SPIKES, Table, ragged
+from brainbench.datasets.sessions import SPIKES, SessionTable, ragged
 from brainbench.datasets.sources import open_file
-from brainbench.datasets.synthetic.animals import Design, Geometry, make_sessions, write_files
+from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, make_sessions, write_files
 from tests.datasets.layouts.test_rodgers import detection, write_rodgers
 from tests.datasets.test_nwb import HUMAN, write_nwb
 from tests.factories.recordings import make_simple_session
 
-GEOMETRY = Geometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
+GEOMETRY = ResponseGeometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
 
 
 def make_healthy(**design):
@@ -32,7 +32,7 @@ def with_spikes(session, change):
     number = len(spikes)
     units = {"id": np.arange(number), **ragged(SPIKES, spikes)}
     units |= ragged("obs_intervals", [np.array([[0.0, session.tables["trials"].data["stop_time"][-1]]])] * number)
-    return replace(session, units=Table("units", units))
+    return replace(session, units=SessionTable("units", units))
 
 
 def with_column(session, table, **columns):
@@ -267,7 +267,7 @@ def test_rows_without_any_end_and_ids_that_repeat_are_told(tmp_path):
     assert "table 'trials' has ids more than once (0, 1, 10, 11, 12 and 40 more)" in str(checkup)
     assert "none of 90 trials has the events of the window start..stop" in str(checkup)
     units = {**session.units.data, "id": np.zeros(20, dtype=np.int64)}
-    _, text = examine(tmp_path, replace(session, units=Table("units", units)), "units", "warning")
+    _, text = examine(tmp_path, replace(session, units=SessionTable("units", units)), "units", "warning")
     assert text == "1 unit ids occur more than once (0)"
 
 
@@ -284,13 +284,13 @@ def test_trials_without_recording_and_breaks_are_told(tmp_path):
         make_healthy(), lambda spikes: [times[(times < 40) | ((times > 80) & (times < 120))] for times in spikes]
     )
     units = {name: values for name, values in session.units.data.items() if not name.startswith("obs")}
-    items, text = examine(tmp_path, replace(session, units=Table("units", units)), "coverage")
+    items, text = examine(tmp_path, replace(session, units=SessionTable("units", units)), "coverage")
     assert {item.severity for item in items} == {"warning", "note"}
     assert "trials lie outside the recorded span" in text
     assert "no unit fires for more than 30 s in 1 places (40–80 s)" in text
     assert "no obs_intervals" in text
     shorter = {**session.units.data, **ragged("obs_intervals", [np.array([[0.0, 60.0]])] * 20)}
-    _, text = examine(tmp_path, replace(session, units=Table("units", shorter)), "coverage", "warning")
+    _, text = examine(tmp_path, replace(session, units=SessionTable("units", shorter)), "coverage", "warning")
     assert "trials lie outside the recorded span" in text
 
 

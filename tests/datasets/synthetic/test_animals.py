@@ -11,7 +11,7 @@ from brainbench.datasets import blocks, open_recordings
 from brainbench.datasets.synthetic.animals import (
     FAULTS,
     Design,
-    Geometry,
+    ResponseGeometry,
     as_recordings,
     calibrate,
     make_sessions,
@@ -27,7 +27,7 @@ SMALL = Design(animals=3, sessions=2, units=12, trials=5)
 
 
 def make_geometry(seed=0, stimuli=6, features=4):
-    return Geometry.from_features(np.random.default_rng(seed).normal(size=(stimuli, features)))
+    return ResponseGeometry.from_features(np.random.default_rng(seed).normal(size=(stimuli, features)))
 
 
 def measured(animals, stimuli=6):
@@ -46,7 +46,7 @@ def pearson(one, two):
 @given(seed=st.integers(0, 2**16), stimuli=st.integers(2, 12), features=st.integers(3, 40))
 def test_the_truth_of_features_is_their_correlation_distance(seed, stimuli, features):
     values = np.random.default_rng(seed).normal(size=(stimuli, features)) + 5.0
-    geometry = Geometry.from_features(values)
+    geometry = ResponseGeometry.from_features(values)
     np.testing.assert_allclose(geometry.rdm, rdm(values), atol=1e-9)
     assert geometry.directions.shape[1] <= max(stimuli, 2) or features <= stimuli
 
@@ -55,14 +55,14 @@ def test_the_truth_of_features_is_their_correlation_distance(seed, stimuli, feat
 @given(seed=st.integers(0, 2**16), stimuli=st.integers(2, 12))
 def test_an_rdm_that_vectors_can_have_is_embedded_exactly(seed, stimuli):
     wanted = make_geometry(seed, stimuli, 5).rdm
-    geometry = Geometry.from_rdm(wanted)
+    geometry = ResponseGeometry.from_rdm(wanted)
     np.testing.assert_allclose(geometry.rdm, wanted, atol=1e-6)
     assert geometry.distortion < 1e-6
 
 
 def test_an_impossible_rdm_says_by_how_much_it_was_changed():
     # Three stimuli cannot all be opposite to one another; the nearest have angles of 120 degrees.
-    geometry = Geometry.from_rdm([2.0, 2.0, 2.0])
+    geometry = ResponseGeometry.from_rdm([2.0, 2.0, 2.0])
     np.testing.assert_allclose(geometry.rdm, 1.5)
     assert geometry.distortion == pytest.approx(0.5)
 
@@ -70,12 +70,20 @@ def test_an_impossible_rdm_says_by_how_much_it_was_changed():
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Geometry.from_features(np.zeros(3)), UsageError, r"at least 2 × 2; received shape \(3,\)"),
-        (lambda: Geometry.from_features([[1, 2], [3, 3]]), DataError, "stimulus 1 are constant"),
-        (lambda: Geometry.from_features([[1, 2], [3, np.nan]]), DataError, "1 feature values are not finite"),
-        (lambda: Geometry.from_rdm([1.0, 1.0]), UsageError, r"upper triangle \[K\(K-1\)/2\]; received shape \(2,\)"),
-        (lambda: Geometry.from_rdm([1.0, 1.0, 9.0]), UsageError, "between 0 and 2; received 1 to 9"),
-        (lambda: Geometry.from_features(np.eye(3), ["a", "b", "b"]), UsageError, "3 stimuli need as many different"),
+        (lambda: ResponseGeometry.from_features(np.zeros(3)), UsageError, r"at least 2 × 2; received shape \(3,\)"),
+        (lambda: ResponseGeometry.from_features([[1, 2], [3, 3]]), DataError, "stimulus 1 are constant"),
+        (lambda: ResponseGeometry.from_features([[1, 2], [3, np.nan]]), DataError, "1 feature values are not finite"),
+        (
+            lambda: ResponseGeometry.from_rdm([1.0, 1.0]),
+            UsageError,
+            r"upper triangle \[K\(K-1\)/2\]; received shape \(2,\)",
+        ),
+        (lambda: ResponseGeometry.from_rdm([1.0, 1.0, 9.0]), UsageError, "between 0 and 2; received 1 to 9"),
+        (
+            lambda: ResponseGeometry.from_features(np.eye(3), ["a", "b", "b"]),
+            UsageError,
+            "3 stimuli need as many different",
+        ),
         (lambda: Design(units=0), UsageError, "at least one of units; received 0"),
         (lambda: Design(rate=0.0), UsageError, "rate of a design is positive"),
         (lambda: Design(dispersion=-1.0), UsageError, "dispersion of a design is not negative"),

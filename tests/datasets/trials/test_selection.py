@@ -3,12 +3,12 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import Rule, Selection
-from brainbench.datasets.sessions import Table
+from brainbench.datasets.sessions import SessionTable
 from brainbench.datasets.trials.selection import Tally
 
 
 def make_table(**columns):
-    return Table("trials", {name: np.array(values) for name, values in columns.items()}, "f.nwb")
+    return SessionTable("trials", {name: np.array(values) for name, values in columns.items()}, "f.nwb")
 
 
 def test_each_row_is_counted_under_the_first_rule_that_removes_it():

@@ -7,12 +7,12 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import score_rdms
-from brainbench.metrics.inference.power import Design, _experiments, needed, power
+from brainbench.metrics.inference.power import ExperimentDesign, _experiments, needed, power
 from tests.factories.animals import STIMULI, make_subject
 
 
 def test_the_simulated_rdms_have_the_stated_correlations():
-    design = Design(stimuli=40, animals=3, effect=0.5, consistency=0.7, reliability=0.6, layers=2)
+    design = ExperimentDesign(stimuli=40, animals=3, effect=0.5, consistency=0.7, reliability=0.6, layers=2)
     model, brain = _experiments(np.random.default_rng(0), design, 60)
 
     def r(a, b):
@@ -26,15 +26,21 @@ def test_the_simulated_rdms_have_the_stated_correlations():
 
 @pytest.mark.parametrize("layers", [1, 8])
 def test_without_an_effect_the_power_is_the_level(layers):
-    found = power(Design(effect=0.0, animals=4, layers=layers), simulations=600)
+    found = power(ExperimentDesign(effect=0.0, animals=4, layers=layers), simulations=600)
     assert found.interval.low <= 0.05 <= found.interval.high
 
 
 def test_power_grows_with_stimuli_animals_and_effect():
-    base = Design(stimuli=6, animals=4, effect=0.5)
+    base = ExperimentDesign(stimuli=6, animals=4, effect=0.5)
     values = [
         power(design, simulations=300).power
-        for design in (Design(6, 4, 0.2), base, Design(6, 4, 0.8), Design(10, 4, 0.5), Design(6, 30, 0.5))
+        for design in (
+            ExperimentDesign(6, 4, 0.2),
+            base,
+            ExperimentDesign(6, 4, 0.8),
+            ExperimentDesign(10, 4, 0.5),
+            ExperimentDesign(6, 30, 0.5),
+        )
     ]
     assert values[0] < values[1] < values[2]
     assert values[3] > values[1]
@@ -42,22 +48,22 @@ def test_power_grows_with_stimuli_animals_and_effect():
 
 
 def test_the_search_returns_a_number_that_suffices_and_none_where_nothing_does():
-    design = Design(effect=0.6, animals=6)
+    design = ExperimentDesign(effect=0.6, animals=6)
     number = needed(design, "stimuli", simulations=300)
-    assert power(Design(number, 6, 0.6), simulations=300).power >= 0.8
+    assert power(ExperimentDesign(number, 6, 0.6), simulations=300).power >= 0.8
     # With six stimuli more animals cannot help a weak effect.
-    assert needed(Design(effect=0.2), "animals", simulations=200) is None
+    assert needed(ExperimentDesign(effect=0.2), "animals", simulations=200) is None
 
 
 def test_three_stimuli_find_nothing():
-    found = power(Design(stimuli=3))
+    found = power(ExperimentDesign(stimuli=3))
     assert (found.power, found.simulations) == (0.0, 0)
     assert found.reason == "3 stimuli allow no p below 0.167, whatever is true"
 
 
 @pytest.mark.slow
 def test_power_is_that_of_the_scores_own_test():
-    design = Design(animals=5, effect=0.6, layers=3)
+    design = ExperimentDesign(animals=5, effect=0.6, layers=3)
     rng = np.random.default_rng(1)
     model, brain = _experiments(rng, design, 400)
     found = 0
@@ -80,13 +86,13 @@ def test_power_is_that_of_the_scores_own_test():
 )
 def test_impossible_designs_are_refused_in_a_sentence(change, message):
     with pytest.raises(UsageError, match=message):
-        Design(**change)
+        ExperimentDesign(**change)
 
 
 def test_other_misuse_is_told_in_a_sentence():
     with pytest.raises(UsageError, match="'stimuli' or 'animals'; received 'trials'"):
-        needed(Design(), "trials")
+        needed(ExperimentDesign(), "trials")
     with pytest.raises(UsageError, match="target power"):
-        needed(Design(), target=1.0)
+        needed(ExperimentDesign(), target=1.0)
     with pytest.raises(UsageError, match="at least 1 simulation"):
-        power(Design(), simulations=0)
+        power(ExperimentDesign(), simulations=0)

@@ -151,7 +151,7 @@ def test_windows_are_those_of_pytorch(kernel: tuple[int, int], padding: Any, sin
     conv = Conv2d(7, 5, kernel_size=kernel, padding=padding).to(single)
     inputs = [torch.randn(3, 4, 4, 6, device=single).to(memory_format=torch.channels_last)]
     inputs.append(torch.randn(3, 3, 4, 6, device=single))
-    geometry = convolution.Geometry.of(conv, (4, 6))
+    geometry = convolution.ConvolutionShape.of(conv, (4, 6))
     windows = convolution.unfolded(inputs, geometry)
     torch.testing.assert_close(windows, convolution.unfolded_plainly(inputs, geometry).float(), rtol=1e-2, atol=1e-2)
     with torch.no_grad():
@@ -165,7 +165,7 @@ def test_windows_of_any_number_of_inputs_lie_side_by_side(channels: tuple[int, .
     inputs = [torch.randn(5, 4, 6, count, device=single).permute(0, 3, 1, 2) for count in channels]
     inputs[1:] = [x.bfloat16() for x in inputs[1:]]
     inputs[0] = torch.cat((inputs[0], inputs[0]), 1)[:, : channels[0]]
-    geometry = convolution.Geometry.of(conv, (4, 6))
+    geometry = convolution.ConvolutionShape.of(conv, (4, 6))
     windows = convolution.unfolded(inputs, geometry)
     assert windows.shape == (5 * 24, 4 * sum(channels))
     expected = convolution.unfolded_plainly(inputs, geometry).float()

@@ -8,7 +8,7 @@ from brainbench.models.training.augmentation import (
     KINDS,
     LAST_COLUMNS,
     Augmentation,
-    Draw,
+    SampledAugmentation,
     flip,
     mask_steps,
     reverse_time,
@@ -121,12 +121,12 @@ def test_the_image_form_changes_values_differently_for_every_sample():
 
 def test_masking_silences_whole_steps_of_each_sample():
     x = torch.ones(8, 20, 6, 5, 7)
-    y = mask_steps(x, 0.75, Draw(_generator()))
+    y = mask_steps(x, 0.75, SampledAugmentation(_generator()))
     kept = y.flatten(2).mean(2)
     assert set(kept.unique().tolist()) == {0.0, 1.0}
     assert (kept.sum(1) == 5).all()
     assert len({tuple(row.tolist()) for row in kept}) > 1
-    assert mask_steps(x[:, :2], 0.9, Draw(_generator())).any()
+    assert mask_steps(x[:, :2], 0.9, SampledAugmentation(_generator())).any()
 
 
 def test_equal_generators_give_equal_results():

@@ -109,11 +109,11 @@ def test_the_hub_is_asked_only_by_its_prefix(folder, monkeypatch):
 
 
 def test_a_score_carries_what_the_checkpoint_says(folder):
-    from brainbench.scoring.model_responses import find_model
+    from brainbench.scoring.model_responses import resolve_model
 
     config = json.loads((folder / "config.json").read_text())
     found = {"top1": 0.5, "top5": 0.9, "interval": {"low": 0.4, "high": 0.6}, "data": "abc", "collapsed": False}
     (folder / "config.json").write_text(json.dumps(config | {"evaluation": found, "twin": NAME, "seed": 4}))
-    card = find_model(f"local-dir:{folder}").card
+    card = resolve_model(f"local-dir:{folder}").card
     assert (card.objective, card.top1, card.accuracy_interval.high, card.twin, card.seed) == ("ae", 0.5, 0.6, NAME, 4)
-    assert find_model(NAME).card.objective == "untrained"
+    assert resolve_model(NAME).card.objective == "untrained"

@@ -6,13 +6,13 @@ import torch
 from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import reverse_time
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.config_warnings import doubts
+from brainbench.models.training.config_warnings import config_warnings
 from brainbench.models.training.trainer import train
 from tests.factories.training_sweeps import sweeps, tiny
 
 
 def _doubts(name, objective, **changes):
-    return doubts(TrainingConfig.published(name, objective, **changes), load_model(name))
+    return config_warnings(TrainingConfig.published(name, objective, **changes), load_model(name))
 
 
 def test_published_recipes_of_networks_with_memory_raise_no_doubt():

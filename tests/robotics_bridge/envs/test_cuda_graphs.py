@@ -21,12 +21,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import constant
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.envs.cuda_graphs import Captured
 from robotics_bridge.envs.simulation import World
-from robotics_bridge.tasks.rotations import constant
-from robotics_bridge.tasks.step_context import Moment
+from robotics_bridge.tasks.step_context import StepContext
 from robotics_bridge.tasks.task import Reward
 
 TOUCHING = {"observe": "force_torque", "resolution": "low", "noisy": True, "link_pose": True}
@@ -68,8 +68,8 @@ def test_a_control_step_neither_copies_from_the_host_nor_waits_for_the_device(ta
         for _ in range(9):
             env.step(action)
     # C MuJoCo lives on the host.
-    assert [line for line in waits.found if "envs/_world.py" not in line] == []
-    assert any("envs/_world.py" in line for line in waits.found)
+    assert [line for line in waits.found if "envs/simulation.py" not in line] == []
+    assert any("envs/simulation.py" in line for line in waits.found)
 
 
 @pytest.mark.parametrize(
@@ -300,7 +300,7 @@ def test_a_constant_is_made_once() -> None:
         assert not constant((1.0, 3.0), like).is_inference()
 
 
-def _waiting(m: Moment) -> torch.Tensor:
+def _waiting(m: StepContext) -> torch.Tensor:
     return m.power * float(m.power.sum())
 
 

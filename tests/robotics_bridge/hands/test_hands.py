@@ -12,7 +12,7 @@ from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands.hand import palmar_directions
 from robotics_bridge.hands.layouts import active_count, fillers, read_probes, write_probes
-from robotics_bridge.hands.spec import Capsule, HandSpec, Joint, Link, build, quaternion
+from robotics_bridge.hands.spec import CapsuleGeometry, HandSpec, Joint, Link, build, quaternion
 
 URDF = {
     "xhand1": "hands/xhand1/xhand_right_updated_effort.urdf",
@@ -245,7 +245,7 @@ def test_probe_files_of_another_form_or_for_another_hand_are_refused(tmp_path):
 
 
 def test_a_hand_that_does_not_hang_together_is_refused():
-    links = (Link("a", 0.1, (Capsule((0, 0, 0), (0, 0, 1), 0.1),)), Link("b", 0.1), Link("c", 0.1))
+    links = (Link("a", 0.1, (CapsuleGeometry((0, 0, 0), (0, 0, 1), 0.1),)), Link("b", 0.1), Link("c", 0.1))
     joint = Joint("j", "b", "c", (0, 0, 0), (0, 0, 0), (0, 0, 1), (0, 1), 1, 1, 1, 1, 0.1)
     with pytest.raises(UsageError, match="form no tree"):
         build(HandSpec("broken", "a", links, (joint,), {}))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics import Geometry, MujocoEngine, Scene, Variants, compile_variants
+from robotics_bridge.physics import Geometry, MujocoEngine, TouchScene, Variants, compile_variants
 
 CHAIN = """<mujoco><worldbody>
 <geom name="floor" type="plane" size="0 0 1"/>
@@ -19,12 +19,12 @@ CHAIN = """<mujoco><worldbody>
 </worldbody><contact><exclude body1="tip" body2="world"/></contact></mujoco>"""
 
 
-def _names(scene: Scene, link: str) -> list[str]:
+def _names(scene: TouchScene, link: str) -> list[str]:
     return [scene.geometries[g].name for g in scene.candidates(link)]
 
 
 def test_candidates_follow_collision_bits_parents_and_exclusions() -> None:
-    scene = Scene.from_mujoco(mujoco.MjModel.from_xml_string(CHAIN))
+    scene = TouchScene.from_mujoco(mujoco.MjModel.from_xml_string(CHAIN))
     assert _names(scene, "base") == ["floor", "g2"]
     assert _names(scene, "arm") == ["floor"]
     assert _names(scene, "tip") == ["g0"]
@@ -34,7 +34,7 @@ def test_candidates_follow_collision_bits_parents_and_exclusions() -> None:
 
 def test_every_pair_that_mujoco_finds_is_a_candidate() -> None:
     model = mujoco.MjModel.from_xml_string(CHAIN.replace('pos="0 0 1"', 'pos="0 0 0.1"'))
-    scene, data = Scene.from_mujoco(model), mujoco.MjData(model)
+    scene, data = TouchScene.from_mujoco(model), mujoco.MjData(model)
     rng, seen = np.random.default_rng(0), set()
     for _ in range(200):
         data.qpos[:] = model.qpos0 + rng.normal(0, 0.4, model.nq)
@@ -48,7 +48,7 @@ def test_every_pair_that_mujoco_finds_is_a_candidate() -> None:
 def test_variants_give_each_environment_its_shape() -> None:
     ball = Geometry(name="o", link="o", kind="sphere", size=(0.1,))
     box = Geometry(name="o", link="o", kind="box", size=(0.1, 0.1, 0.1))
-    scene = Scene(("world", "o"), (ball,), variants={0: Variants((ball, box), (1, 1, 0))})
+    scene = TouchScene(("world", "o"), (ball,), variants={0: Variants((ball, box), (1, 1, 0))})
     assert [scene.geometry_in(env, 0).kind for env in range(4)] == ["box", "box", "sphere", "box"]
 
 
@@ -73,8 +73,8 @@ def test_compiled_variants_differ_where_they_should() -> None:
         (lambda: Geometry(name="a", link="b", kind="bx"), "did you mean 'box'"),
         (lambda: Geometry(name="a", link="b", kind="box", size=(1.0,)), "needs 3 positive"),
         (lambda: Geometry(name="a", link="b", kind="mesh"), "names no mesh"),
-        (lambda: Scene(("w", "w")), "two of the link 'w'"),
-        (lambda: Scene(("w",), (Geometry(name="a", link="v", kind="plane"),)), "Geometry 'a' is fixed"),
+        (lambda: TouchScene(("w", "w")), "two of the link 'w'"),
+        (lambda: TouchScene(("w",), (Geometry(name="a", link="v", kind="plane"),)), "Geometry 'a' is fixed"),
         (lambda: Variants(()), "at least one choice"),
     ],
 )

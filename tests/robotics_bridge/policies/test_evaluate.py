@@ -8,19 +8,21 @@ import pytest
 import torch
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import about, multiply
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.policies.evaluate import Evaluation, agent, evaluate
-from robotics_bridge.tasks.rotations import about, multiply
+from robotics_bridge.policies.evaluate import PolicyEvaluation, agent, evaluate
 
 
 def _env() -> Env:
     return tasks.make(replace(tasks.load("in_palm_rotate"), episode=0.1), num_envs=3, threads=1)
 
 
-def _made(won: int, of: int) -> Evaluation:
+def _made(won: int, of: int) -> PolicyEvaluation:
     success = (True,) * won + (False,) * (of - won)
-    return Evaluation("a", "t", (0,), success, (1.0,) * of, tuple(map(float, range(of))), (4,) * of, 0, (won / of,))
+    return PolicyEvaluation(
+        "a", "t", (0,), success, (1.0,) * of, tuple(map(float, range(of))), (4,) * of, 0, (won / of,)
+    )
 
 
 def test_every_environment_contributes_equally_many_episodes_of_every_seed() -> None:

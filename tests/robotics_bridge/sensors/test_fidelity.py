@@ -8,7 +8,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from brainbench.geometry import Mesh, winding_number
-from robotics_bridge.sensors import ContactProbe, ElastomerTaxel, Fidelity, Probes, ProximityTaxel
+from robotics_bridge.sensors import ContactProbe, ElastomerTaxel, Probes, ProximityTaxel, SensorFidelity
 from robotics_bridge.sensors.fidelity import PRESETS, TABLE
 from robotics_bridge.sensors.tradeoff import triangle_distance
 
@@ -18,7 +18,7 @@ PROBES = Probes([[0, 0, 0]], [[0, 0, 1.0]], 0.01)
 def test_the_automatic_choice_keeps_its_promise_and_is_no_dearer_than_needed() -> None:
     rows = read_json(TABLE)["points"]
     for error in (0.2, 0.05, 0.02):
-        chosen = Fidelity.auto(error=error)
+        chosen = SensorFidelity.auto(error=error)
         meshes = [r for r in rows if r["part"] == "mesh" and r["query"] == chosen.query]
         mesh = next(r for r in meshes if r["resolution"] in (chosen.resolution, None))
         points = next(r for r in rows if r["part"] == "points" and r["points"] == chosen.points)
@@ -26,7 +26,7 @@ def test_the_automatic_choice_keeps_its_promise_and_is_no_dearer_than_needed() -
         cheaper = [r for r in rows if r["part"] == "points" and r["cost"] < points["cost"]]
         assert all(r["error"] > error for r in cheaper)
     with pytest.raises(UsageError, match="most accurate"):
-        Fidelity.auto(error=1e-12)
+        SensorFidelity.auto(error=1e-12)
 
 
 def test_the_table_says_that_more_effort_errs_less() -> None:
@@ -44,18 +44,18 @@ def test_fidelity_replaces_what_a_sensor_has_and_nothing_else() -> None:
         "near": ProximityTaxel(link="a", probes=PROBES, points=7),
         "gel": ElastomerTaxel(link="a", probes=PROBES, points=0),
     }
-    changed = Fidelity("raycast", 32, 99).apply(sensors)
+    changed = SensorFidelity("raycast", 32, 99).apply(sensors)
     assert changed["bit"] == ContactProbe(link="a", probes=PROBES, threshold=1e-3, query="raycast")
     assert changed["near"].points == 99  # type: ignore[attr-defined]
     assert changed["gel"].points == 0  # type: ignore[attr-defined]
 
 
 def test_presets_are_named_and_others_refused() -> None:
-    assert {Fidelity.preset(name).points for name in PRESETS} == {500, 2000, 16_000}
+    assert {SensorFidelity.preset(name).points for name in PRESETS} == {500, 2000, 16_000}
     with pytest.raises(UsageError, match="did you mean 'balanced'"):
-        Fidelity.preset("balance")
+        SensorFidelity.preset("balance")
     with pytest.raises(UsageError, match="4 to 512"):
-        Fidelity(resolution=2)
+        SensorFidelity(resolution=2)
 
 
 def test_distances_to_triangles_in_double_precision_are_exact_for_a_cube() -> None:

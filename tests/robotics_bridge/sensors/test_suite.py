@@ -10,7 +10,7 @@ import torch
 
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
-from robotics_bridge.physics import Geometry, Scene
+from robotics_bridge.physics import Geometry, TouchScene
 from robotics_bridge.sensors import (
     ContactDepthProbe,
     ContactProbe,
@@ -31,7 +31,7 @@ BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
 GRID = Probes.grid(4, 5, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.003)
 
 
-def _suite(sensors: dict, envs: int = 1, scene: Scene | None = None, **options: object) -> SensorSuite:
+def _suite(sensors: dict, envs: int = 1, scene: TouchScene | None = None, **options: object) -> SensorSuite:
     return SensorSuite(scene or pad_scene(BALL), sensors, num_envs=envs, **options)  # type: ignore[arg-type]
 
 
@@ -184,7 +184,7 @@ def test_readings_do_not_depend_on_batch_pose_or_order_of_probes() -> None:
 
 
 def test_an_empty_scene_touches_nothing() -> None:
-    scene = Scene(("world", "hand"), (PAD,))
+    scene = TouchScene(("world", "hand"), (PAD,))
     suite = _suite(
         {
             "depth": ContactDepthProbe(link="hand", probes=GRID),

@@ -118,9 +118,9 @@ def test_groups_are_those_of_table_4_7(name: str) -> None:
 
 def test_hot_ball_is_that_of_section_4_6_3() -> None:
     from robotics_bridge.tasks.hot_ball import BALLS, CELLS, DIAMETER, SIDE
-    from robotics_bridge.tasks.thermometers import Thermal
+    from robotics_bridge.tasks.thermometers import ThermalSettings
 
-    task, thermal = tasks.load("hot_ball", "published"), Thermal()
+    task, thermal = tasks.load("hot_ball", "published"), ThermalSettings()
     assert (SIDE, BALLS, DIAMETER, task.copies, task.episode) == (0.5, 8, 0.08, 8, 20.0)
     assert (thermal.ambient, thermal.hot, thermal.margin) == (22.0, 45.0, 0.12)
     assert thermal.threshold == pytest.approx(42.24)

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import about, angle_of, conjugate, multiply
 from robotics_bridge import hands, tasks
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import box, screwdriver, slots, with_sizes
-from robotics_bridge.tasks.rotations import about, angle_of, conjugate, multiply
 from robotics_bridge.tasks.scenes import build, palm_up
 
 MY_TASK = """
@@ -146,9 +146,9 @@ def test_sampled_grasps_hold_without_any_action() -> None:
 
 
 def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
-    from robotics_bridge.tasks.thermometers import Thermal, progress
+    from robotics_bridge.tasks.thermometers import ThermalSettings, progress
 
-    thermal = Thermal()
+    thermal = ThermalSettings()
     reading = torch.tensor([10.0, 22.0, 33.5, 42.3, 60.0])
     assert progress(reading, thermal).tolist() == pytest.approx([0.0, 0.0, 0.5, 0.8826, 1.0], abs=1e-4)
     env = tasks.make("hot_ball", num_envs=2, threads=1)
@@ -159,4 +159,4 @@ def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
     assert not watch.latched.any()
     assert env.metric.tolist() == [0.0, 0.0]
     with pytest.raises(UsageError, match="hotter than the room"):
-        Thermal(hot=10.0)
+        ThermalSettings(hot=10.0)

@@ -16,7 +16,8 @@ from brainbench.stimuli.validation import bench_tests
 ASKED = (
     simulation.simulate, simulation.prepare, load_stimuli, whisker_shapes.record, scenes.render, simulate_sweeps,
     bench_tests.peg, bench_tests.point_load, bench_tests.ringdown, bench_tests.slip_off, fidelity.measured,
-    fidelity.Fidelity.auto, Settings, tradeoff.Setting, draw.render, draw.plot, simulate_command.simulate, sweep.sweep,
+    fidelity.Fidelity.auto, Settings, tradeoff.SimulationSetting, draw.render, draw.plot,
+    simulate_command.simulate, sweep.sweep,
 )  # fmt: skip
 
 

@@ -87,7 +87,7 @@ def test_a_seed_repeats(family):
 
 def test_shapes_are_equal_across_processes_and_numbers_of_threads():
     code = (
-        "from brainbench.stimuli import shapes\n"
+        "from brainbench.stimuli.objects import procedural\n"
         "print(*[procedural.make(f, 5, detail=3000).mesh.content_hash for f in procedural.list_families()[::4]])"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "99", "OPENBLAS_NUM_THREADS": "1"}

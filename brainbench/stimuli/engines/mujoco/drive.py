@@ -22,7 +22,7 @@ reaction (µN·m) deflect the follicle."""
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class PrescribedMotion:
     """Prescribed positions and velocities of some joints and the accelerations that produce them."""
 
     position: NDArray[np.float64]
@@ -33,12 +33,12 @@ class Drive:
     """[n, degrees of freedom] over step n."""
 
 
-def drive_scalars(path: NDArray[np.float64], step: float) -> Drive:
+def drive_scalars(path: NDArray[np.float64], step: float) -> PrescribedMotion:
     """Drive hinges or slides along ``path`` [n + 1, joints] sampled at every step (ms)."""
     return _drive(path[:-1], np.diff(path, axis=0) / step, step)
 
 
-def drive_free(position: NDArray[np.float64], quaternion: NDArray[np.float64], step: float) -> Drive:
+def drive_free(position: NDArray[np.float64], quaternion: NDArray[np.float64], step: float) -> PrescribedMotion:
     """Drive a free joint along positions [n + 1, 3] and unit quaternions [n + 1, 4].
 
     MuJoCo integrates a quaternion by the constant body-frame rotation of each step, so the rotation
@@ -49,13 +49,13 @@ def drive_free(position: NDArray[np.float64], quaternion: NDArray[np.float64], s
     return _drive(np.concatenate([position, quaternion], axis=1)[:-1], np.concatenate([linear, angular], axis=1), step)
 
 
-def _drive(position: NDArray, after: NDArray, step: float) -> Drive:
+def _drive(position: NDArray, after: NDArray, step: float) -> PrescribedMotion:
     """Build a drive from positions before and velocities after each step."""
     acceleration = np.empty_like(after)
     acceleration[1:] = np.diff(after, axis=0) / step
     # The acceleration at the start is unknown before the first sample: continue the next one.
     acceleration[0] = acceleration[1] if len(after) > 1 else 0.0
-    return Drive(position, after - step * acceleration, acceleration)
+    return PrescribedMotion(position, after - step * acceleration, acceleration)
 
 
 def _conjugate(q: NDArray) -> NDArray[np.float64]:

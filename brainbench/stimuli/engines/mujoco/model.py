@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from brainbench.core.errors import MissingDependencyError
-from brainbench.stimuli.engines.mujoco.drive import ARMATURE, Drive, drive_free, drive_scalars
+from brainbench.stimuli.engines.mujoco.drive import ARMATURE, PrescribedMotion, drive_free, drive_scalars
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.trust import CONE_SIDES, LEAST_TAPER, MICRO, MILLI, step_travel
 from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Sphere, rotation_matrix
@@ -61,7 +61,7 @@ class WhiskerModel:
 
     model: Any
     """The compiled ``mujoco.MjModel``."""
-    drives: tuple[Drive, ...]
+    drives: tuple[PrescribedMotion, ...]
     """Prescribed motion of the first joints, in the order of their coordinates."""
     base: NDArray[np.float64]
     """[n, 3] base point before every step (mm, world)."""
@@ -252,7 +252,7 @@ def _add_obstacles(
     whisker_friction: float,
     times: NDArray,
     step: float,
-) -> list[Drive]:
+) -> list[PrescribedMotion]:
     """Add the obstacles; return the drives of the moving ones in the order of their joints."""
     drives = []
     for number, obstacle in enumerate(obstacles):
@@ -280,7 +280,7 @@ def _add_obstacles(
     return drives
 
 
-def _add_obstacle_joints(body: Element, position: NDArray, quaternion: NDArray, step: float) -> list[Drive]:
+def _add_obstacle_joints(body: Element, position: NDArray, quaternion: NDArray, step: float) -> list[PrescribedMotion]:
     if np.ptp(quaternion, axis=0).max() > 0:
         _add(body, "joint", type="free", armature=ARMATURE)
         _add(body, "inertial", pos="0 0 0", **_NOTHING)

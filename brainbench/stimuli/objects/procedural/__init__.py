@@ -19,7 +19,7 @@ import numpy as np
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.geometry import Mesh, convex_hull
 from brainbench.stimuli.objects.procedural import assembled, extruded, round, swept, turned
-from brainbench.stimuli.objects.procedural.bodies import Body, Draw
+from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 DETAIL = (2_000, 20_000)
 """Fewest and most triangles of a shape."""
 
-_FAMILIES: dict[str, Callable[[Draw, int], Body]] = {
+_FAMILIES: dict[str, Callable[[ShapeSampler, int], Body]] = {
     **round.FAMILIES,
     **turned.FAMILIES,
     **swept.FAMILIES,
@@ -95,8 +95,8 @@ def make(family: str, seed: int = 0, *, detail: int = 4_000) -> Shape:
 
 
 @functools.lru_cache(maxsize=64)
-def _make(family: str, build: Callable[[Draw, int], Body], seed: int, detail: int) -> Shape:
-    draw = Draw(np.random.default_rng([zlib.crc32(family.encode()), seed]))
+def _make(family: str, build: Callable[[ShapeSampler, int], Body], seed: int, detail: int) -> Shape:
+    draw = ShapeSampler(np.random.default_rng([zlib.crc32(family.encode()), seed]))
     body = build(draw, detail)
     # Booleans leave slivers where faces nearly meet; collapsing what is below a millionth of the size removes them
     # (as one original, or slivers between two operands would be kept as their seam).
@@ -137,7 +137,7 @@ def _refined(solid: Manifold, detail: int) -> Manifold:
     return best
 
 
-def _family(name: str) -> Callable[[Draw, int], Body]:
+def _family(name: str) -> Callable[[ShapeSampler, int], Body]:
     if name not in _FAMILIES:
         raise unknown_name("shape family", name, list_families())
     return _FAMILIES[name]

@@ -6,17 +6,17 @@ import functools
 
 import numpy as np
 
-from brainbench.stimuli.objects.procedural.bodies import Body, Draw, around, block, prism, rod, tube
+from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler, around, block, prism, rod, tube
 
 
-def table(draw: Draw, detail: int) -> Body:
+def table(draw: ShapeSampler, detail: int) -> Body:
     """Four-legged table."""
     length, width = draw("length", 0.9, 1.5), draw("width", 0.6, 0.9)
     height, leg = draw("height", 0.5, 0.9), draw("leg", 0.06, 0.12)
     return _legs(length, width, height, leg) + block(length, width, 0.1).moved(z=0.05)
 
 
-def chair(draw: Draw, detail: int) -> Body:
+def chair(draw: ShapeSampler, detail: int) -> Body:
     """Four-legged chair with a back."""
     seat, height = draw("seat", 0.55, 0.75), draw("height", 0.45, 0.65)
     leg, back = draw("leg", 0.06, 0.11), draw("back", 0.5, 0.85)
@@ -31,7 +31,7 @@ def _legs(length: float, width: float, height: float, leg: float) -> Body:
     return one.moved(x, y) + one.moved(-x, y) + one.moved(x, -y) + one.moved(-x, -y)
 
 
-def stairs(draw: Draw, detail: int) -> Body:
+def stairs(draw: ShapeSampler, detail: int) -> Body:
     """Flight of three to seven steps."""
     steps, width = draw.whole("steps", 3, 7), draw("width", 0.4, 1.0)
     rise, run = draw("rise", 0.7, 1.2), 1.2
@@ -43,7 +43,7 @@ def stairs(draw: Draw, detail: int) -> Body:
     return functools.reduce(Body.__add__, slabs)
 
 
-def arch(draw: Draw, detail: int) -> Body:
+def arch(draw: ShapeSampler, detail: int) -> Body:
     """Round arch on two pillars."""
     span, pillar = draw("span", 0.35, 0.55), draw("pillar", 0.18, 0.32)
     height, depth = draw("height", 0.4, 1.0), draw("depth", 0.3, 0.6)
@@ -63,7 +63,7 @@ def arch(draw: Draw, detail: int) -> Body:
     return prism(outline, depth)
 
 
-def frame(draw: Draw, detail: int) -> Body:
+def frame(draw: ShapeSampler, detail: int) -> Body:
     """Rectangular window frame."""
     wide, tall = draw("width", 0.8, 1.6), draw("height", 0.8, 1.2)
     bar, depth = draw("bar", 0.1, 0.18), draw("depth", 0.15, 0.4)
@@ -72,7 +72,7 @@ def frame(draw: Draw, detail: int) -> Body:
     return upright.moved(x) + upright.moved(-x) + beam.moved(y=y) + beam.moved(y=-y)
 
 
-def perforated(draw: Draw, detail: int) -> Body:
+def perforated(draw: ShapeSampler, detail: int) -> Body:
     """Box with one to three round holes bored through it."""
     holes, length = draw.whole("holes", 1, 3), draw("length", 1.2, 1.8)
     width, thick = draw("width", 0.6, 0.9), draw("thickness", 0.25, 0.6)
@@ -84,35 +84,35 @@ def perforated(draw: Draw, detail: int) -> Body:
     return body
 
 
-def pyramid(draw: Draw, detail: int) -> Body:
+def pyramid(draw: ShapeSampler, detail: int) -> Body:
     """Pyramid over three to six sides, with a small flat top."""
     sides, height = draw.whole("sides", 3, 6), draw("height", 0.8, 1.7)
     angles = 2 * np.pi * np.arange(sides) / sides
     return prism(np.column_stack([np.cos(angles), np.sin(angles)]), height, top=draw("top", 0.02, 0.15))
 
 
-def wedge(draw: Draw, detail: int) -> Body:
+def wedge(draw: ShapeSampler, detail: int) -> Body:
     """Ramp: a box cut along its diagonal."""
     height, width, lip = draw("height", 0.35, 0.9), draw("width", 0.4, 1.0), draw("lip", 0.02, 0.1)
     return prism([(0, 0), (1.3, 0), (1.3, lip), (0, height)], width).turned(x=90.0)
 
 
-def cone(draw: Draw, detail: int) -> Body:
+def cone(draw: ShapeSampler, detail: int) -> Body:
     """Cone with a small flat top."""
     return rod(draw("radius", 0.35, 0.6), draw("height", 0.8, 1.4), around(detail), top=draw("top", 0.01, 0.06))
 
 
-def cylinder(draw: Draw, detail: int) -> Body:
+def cylinder(draw: ShapeSampler, detail: int) -> Body:
     """Cylinder, from a disc to a pole."""
     return rod(draw("radius", 0.15, 0.6), draw("height", 0.5, 1.4), 2 * around(detail))
 
 
-def brick(draw: Draw, detail: int) -> Body:
+def brick(draw: ShapeSampler, detail: int) -> Body:
     """Rectangular block."""
     return block(1.0, draw("y_over_x", 0.4, 0.9), draw("z_over_x", 0.2, 0.7))
 
 
-def hammer(draw: Draw, detail: int) -> Body:
+def hammer(draw: ShapeSampler, detail: int) -> Body:
     """Cylindrical head across the end of a handle."""
     head, length = draw("head", 0.13, 0.2), draw("head_length", 0.5, 0.8)
     grip, shaft = draw("grip", 0.05, 0.08), draw("handle", 1.0, 1.5)
@@ -120,7 +120,7 @@ def hammer(draw: Draw, detail: int) -> Body:
     return rod(head, length, facets).turned(x=90.0).moved(z=shaft / 2) + rod(grip, shaft, facets)
 
 
-def bolt(draw: Draw, detail: int) -> Body:
+def bolt(draw: ShapeSampler, detail: int) -> Body:
     """Hexagonal head on a round shank."""
     head, thick = draw("head", 0.32, 0.46), draw("head_height", 0.2, 0.32)
     shank, length = draw("shank", 0.12, 0.22), draw("length", 0.6, 1.6)
@@ -128,7 +128,7 @@ def bolt(draw: Draw, detail: int) -> Body:
     return rod(shank, length, around(detail)) + nut.moved(z=(length + thick) / 2 - 0.01)
 
 
-def jack(draw: Draw, detail: int) -> Body:
+def jack(draw: ShapeSampler, detail: int) -> Body:
     """Three rods crossing at right angles, with thick ends."""
     bar, knob, arm = draw("bar", 0.08, 0.14), draw("knob", 0.15, 0.22), draw("arm", 0.5, 0.75)
     facets = around(detail)
@@ -137,7 +137,7 @@ def jack(draw: Draw, detail: int) -> Body:
     return one + one.turned(x=90.0) + one.turned(y=90.0)
 
 
-def house(draw: Draw, detail: int) -> Body:
+def house(draw: ShapeSampler, detail: int) -> Body:
     """Box under a pitched roof with eaves."""
     wide, deep = draw("width", 0.6, 0.9), draw("depth", 0.7, 1.2)
     wall, roof, eave = draw("wall", 0.4, 0.7), draw("roof", 0.25, 0.5), draw("eave", 0.05, 0.15)
@@ -146,7 +146,7 @@ def house(draw: Draw, detail: int) -> Body:
     return block(wide, deep, wall + 0.02).moved(z=0.01 - wall / 2) + gable
 
 
-def basket(draw: Draw, detail: int) -> Body:
+def basket(draw: ShapeSampler, detail: int) -> Body:
     """Open box with an arched handle."""
     wide, deep = draw("width", 0.8, 1.1), draw("depth", 0.5, 0.75)
     tall, handle = draw("height", 0.3, 0.5), draw("handle", 0.3, 0.55)

@@ -1,6 +1,6 @@
 """Building blocks of the shape families: bodies that know a convex decomposition of themselves.
 
-A family draws its proportions from a :class:`Draw` and combines bodies in any unit; the result is scaled
+A family draws its proportions from a :class:`ShapeSampler` and combines bodies in any unit; the result is scaled
 afterwards. Booleans are exact to rounding and always closed (Manifold library).
 """
 
@@ -21,7 +21,7 @@ WEDGES = 24
 """Wedges around the axis that stand for a hollow turned wall: convex pieces within 1 % of its radius."""
 
 
-class Draw:
+class ShapeSampler:
     """Random proportions of one shape, remembered by name."""
 
     def __init__(self, rng: np.random.Generator) -> None:

@@ -6,14 +6,14 @@ import functools
 
 import numpy as np
 
-from brainbench.stimuli.objects.procedural.bodies import Body, Draw, block, prism
+from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler, block, prism
 
 
 def _polar(radii: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
 
 
-def star(draw: Draw, detail: int) -> Body:
+def star(draw: ShapeSampler, detail: int) -> Body:
     """Star of four to seven points, thick as a block or tapered."""
     points, depth = draw.whole("points", 4, 7), draw("notch", 0.4, 0.58)
     thick, top = draw("thickness", 0.25, 0.6), draw("taper", 0.6, 1.0)
@@ -21,7 +21,7 @@ def star(draw: Draw, detail: int) -> Body:
     return prism(_polar(np.where(np.arange(2 * points) % 2, depth, 1.0), angles), thick, top=top)
 
 
-def gear(draw: Draw, detail: int) -> Body:
+def gear(draw: ShapeSampler, detail: int) -> Body:
     """Spur gear without a bore."""
     teeth, tooth = draw.whole("teeth", 8, 14), draw("tooth", 0.15, 0.28)
     thick, width = draw("thickness", 0.25, 0.6), draw("tooth_width", 0.42, 0.58)
@@ -31,7 +31,7 @@ def gear(draw: Draw, detail: int) -> Body:
     return prism(_polar(np.tile([1 - tooth, 1.0, 1.0, 1 - tooth], teeth), angles), thick)
 
 
-def flower(draw: Draw, detail: int) -> Body:
+def flower(draw: ShapeSampler, detail: int) -> Body:
     """Thick disc with a wavy rim of petals."""
     petals, depth, thick = draw.whole("petals", 4, 8), draw("depth", 0.14, 0.26), draw("thickness", 0.25, 0.6)
     count = 12 * petals
@@ -39,14 +39,14 @@ def flower(draw: Draw, detail: int) -> Body:
     return prism(_polar(1 + depth * np.cos(petals * angles), angles), thick)
 
 
-def cross(draw: Draw, detail: int) -> Body:
+def cross(draw: ShapeSampler, detail: int) -> Body:
     """Flat cross of two bars."""
     width, thick = draw("width", 0.2, 0.45), draw("thickness", 0.2, 0.5)
     shift, arm = draw("shift", 0.0, 0.25), draw("arm", 0.65, 1.0)
     return block(width, 2.0, thick) + block(2.0 * arm, width, thick).moved(y=shift)
 
 
-def arrow(draw: Draw, detail: int) -> Body:
+def arrow(draw: ShapeSampler, detail: int) -> Body:
     """Arrow with a broad head."""
     head, width = draw("head", 0.5, 0.9), draw("head_width", 0.45, 0.75)
     shaft, thick, sweep = draw("shaft_width", 0.12, 0.24), draw("thickness", 0.2, 0.45), draw("sweep", 0.0, 0.2)
@@ -54,7 +54,7 @@ def arrow(draw: Draw, detail: int) -> Body:
     return prism([*outline, (1 - head - sweep, width), (1 - head, shaft), (-1, shaft)], thick)
 
 
-def crescent(draw: Draw, detail: int) -> Body:
+def crescent(draw: ShapeSampler, detail: int) -> Body:
     """Moon-shaped slab."""
     bite, thick, opening = draw("bite", 0.35, 0.7), draw("thickness", 0.3, 0.7), draw("opening", 0.55, 0.75)
     angles = np.linspace(-opening * np.pi, opening * np.pi, 49)
@@ -68,7 +68,7 @@ def crescent(draw: Draw, detail: int) -> Body:
     return prism(outline, thick)
 
 
-def heart(draw: Draw, detail: int) -> Body:
+def heart(draw: ShapeSampler, detail: int) -> Body:
     """Heart-shaped slab."""
     wide, thick = draw("width", 0.85, 1.2), draw("thickness", 0.3, 0.7)
     tip = draw("tip", 0.9, 1.25)
@@ -88,7 +88,7 @@ _LETTERS = {
 """Bars (x, y, width, height) of block letters."""
 
 
-def letter(draw: Draw, detail: int) -> Body:
+def letter(draw: ShapeSampler, detail: int) -> Body:
     """Block letter E, F, H, L, T or U."""
     bars = _LETTERS[draw.choice("letter", sorted(_LETTERS))]
     wide, thick = draw("width", 0.8, 1.2), draw("thickness", 0.2, 0.4)
@@ -96,7 +96,7 @@ def letter(draw: Draw, detail: int) -> Body:
     return functools.reduce(Body.__add__, blocks).stretched(x=wide)
 
 
-def twist(draw: Draw, detail: int) -> Body:
+def twist(draw: ShapeSampler, detail: int) -> Body:
     """Bar of three to five sides, twisted about its axis."""
     sides, turn = draw.whole("sides", 3, 5), draw("turn", 90.0, 240.0)
     height, top = draw("height", 1.8, 3.0), draw("taper", 0.6, 1.0)
@@ -110,7 +110,7 @@ def twist(draw: Draw, detail: int) -> Body:
     return prism(outline, height, top=top, twist=turn, slices=39)
 
 
-def polygon(draw: Draw, detail: int) -> Body:
+def polygon(draw: ShapeSampler, detail: int) -> Body:
     """Upright prism of three to eight sides."""
     sides, height = draw.whole("sides", 3, 8), draw("height", 0.8, 2.2)
     return prism(_polar(np.ones(sides), 2 * np.pi * np.arange(sides) / sides), height)

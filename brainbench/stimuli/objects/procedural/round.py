@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.stimuli.objects.procedural.bodies import Body, Draw, around, ball, block, convex, points_of, rod
+from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler, around, ball, block, convex, points_of, rod
 
 
-def ellipsoid(draw: Draw, detail: int) -> Body:
+def ellipsoid(draw: ShapeSampler, detail: int) -> Body:
     """Ellipsoid with three different axes."""
     y, z = draw("y_over_x", 0.5, 0.8), draw("z_over_x", 0.3, 0.5)
     return convex(ball(detail)).stretched(1.0, y, z)
 
 
-def superquadric(draw: Draw, detail: int) -> Body:
+def superquadric(draw: ShapeSampler, detail: int) -> Body:
     """Rounded box, cylinder or double cone (Barr 1981) with both exponents drawn."""
     vertical, around_z = draw("exponent_vertical", 0.25, 1.9), draw("exponent_around", 0.25, 1.9)
     y, z = draw("y_over_x", 0.7, 1.0), draw("z_over_x", 0.6, 1.4)
@@ -27,7 +27,7 @@ def superquadric(draw: Draw, detail: int) -> Body:
     return convex(ball(detail, warp)).stretched(1.0, y, z)
 
 
-def bumpy(draw: Draw, detail: int) -> Body:
+def bumpy(draw: ShapeSampler, detail: int) -> Body:
     """Sphere with rounded bumps."""
     count, height, width = draw.whole("bumps", 10, 24), draw("height", 0.15, 0.3), draw("width", 0.25, 0.38)
     golden = np.pi * (3 - np.sqrt(5)) * np.arange(count)
@@ -43,7 +43,7 @@ def bumpy(draw: Draw, detail: int) -> Body:
     return Body(ball(detail, warp), None)
 
 
-def pebble(draw: Draw, detail: int) -> Body:
+def pebble(draw: ShapeSampler, detail: int) -> Body:
     """Smooth irregular stone: a flattened ball with gentle low-order undulation."""
     flat, amount = draw("flatness", 0.4, 0.65), draw("undulation", 0.08, 0.16)
     waves = draw.normals(6, 3)
@@ -56,7 +56,7 @@ def pebble(draw: Draw, detail: int) -> Body:
     return Body(ball(detail, warp), None).stretched(z=flat)
 
 
-def urchin(draw: Draw, detail: int) -> Body:
+def urchin(draw: ShapeSampler, detail: int) -> Body:
     """Ball with conical spikes along the axes and diagonals."""
     spikes, length = draw.whole("spikes", 8, 14), draw("length", 0.7, 1.2)
     width = draw("width", 0.16, 0.28)
@@ -69,21 +69,21 @@ def urchin(draw: Draw, detail: int) -> Body:
     return body
 
 
-def lens(draw: Draw, detail: int) -> Body:
+def lens(draw: ShapeSampler, detail: int) -> Body:
     """Intersection of two balls."""
     apart = draw("separation", 0.6, 1.6)
     sphere = ball(2 * detail)
     return convex(sphere.translate((0, 0, apart / 2)) ^ sphere.translate((0, 0, -apart / 2)))
 
 
-def carved(draw: Draw, detail: int) -> Body:
+def carved(draw: ShapeSampler, detail: int) -> Body:
     """Ball bored through along the three axes."""
     bore = draw("bore", 0.3, 0.52)
     hole = rod(bore, 3.0, around(detail))
     return Body(ball(detail), None) - hole - hole.turned(x=90.0) - hole.turned(y=90.0)
 
 
-def orange(draw: Draw, detail: int) -> Body:
+def orange(draw: ShapeSampler, detail: int) -> Body:
     """Ball with one wedge cut out."""
     opening, flat = draw("opening", 60.0, 130.0), draw("flatness", 0.75, 1.0)
     sphere = ball(detail)

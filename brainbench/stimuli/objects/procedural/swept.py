@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from brainbench.stimuli.objects.procedural.bodies import Body, Draw, ball, convex, rod, tube
+from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler, ball, convex, rod, tube
 
 
 def _mesh_of(detail: int, *, sides: int = 0) -> tuple[int, int]:
@@ -15,7 +15,7 @@ def _mesh_of(detail: int, *, sides: int = 0) -> tuple[int, int]:
     return sides, min(math.ceil(detail / sides / 2) + 2, 9_900 // sides)
 
 
-def torus(draw: Draw, detail: int) -> Body:
+def torus(draw: ShapeSampler, detail: int) -> Body:
     """Ring of round cross-section."""
     ratio = draw("tube_over_ring", 0.2, 0.48)
     sides, steps = _mesh_of(detail, sides=max(16, int(math.sqrt(detail) / 3)))
@@ -23,7 +23,7 @@ def torus(draw: Draw, detail: int) -> Body:
     return tube(np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), ratio, sides, closed=True)
 
 
-def ring(draw: Draw, detail: int) -> Body:
+def ring(draw: ShapeSampler, detail: int) -> Body:
     """Flat band, like a finger ring or a section of pipe."""
     wall, height = draw("wall", 0.06, 0.12), draw("height", 0.3, 0.8)
     steps = max(24, detail // 40)
@@ -39,7 +39,7 @@ def ring(draw: Draw, detail: int) -> Body:
     return Body((outer - inner).solid, parts)
 
 
-def knot(draw: Draw, detail: int) -> Body:
+def knot(draw: ShapeSampler, detail: int) -> Body:
     """Torus knot with two turns through the hole and three or five lobes."""
     lobes = int(draw.choice("lobes", ["3", "5"]))
     swing, radius = draw("swing", 0.38, 0.5), draw("tube", 0.12, 0.22)
@@ -56,7 +56,7 @@ def knot(draw: Draw, detail: int) -> Body:
     )
 
 
-def spring(draw: Draw, detail: int) -> Body:
+def spring(draw: ShapeSampler, detail: int) -> Body:
     """Helix with open turns."""
     turns, pitch = draw("turns", 3.0, 5.5), draw("pitch", 0.38, 0.6)
     wire = draw("wire", 0.08, 0.14)
@@ -65,7 +65,7 @@ def spring(draw: Draw, detail: int) -> Body:
     return tube(np.column_stack([np.cos(t), np.sin(t), pitch * t / (2 * np.pi)]), wire, sides, closed=False)
 
 
-def horseshoe(draw: Draw, detail: int) -> Body:
+def horseshoe(draw: ShapeSampler, detail: int) -> Body:
     """Round bar bent to a U."""
     length, bar = draw("arms", 0.4, 1.2), draw("bar", 0.14, 0.26)
     sides, steps = _mesh_of(detail)
@@ -76,7 +76,7 @@ def horseshoe(draw: Draw, detail: int) -> Body:
     return tube(np.column_stack([path, 0 * path[:, 0]]), bar, sides, closed=False)
 
 
-def hook(draw: Draw, detail: int) -> Body:
+def hook(draw: ShapeSampler, detail: int) -> Body:
     """Walking cane: a straight bar that curls round at one end."""
     length, bar, curl = draw("shaft", 1.6, 2.8), draw("bar", 0.12, 0.2), draw("curl", 0.8, 1.25)
     sides, steps = _mesh_of(detail)
@@ -87,7 +87,7 @@ def hook(draw: Draw, detail: int) -> Body:
     return tube(np.column_stack([path, 0 * path[:, 0]]), bar, sides, closed=False)
 
 
-def horn(draw: Draw, detail: int) -> Body:
+def horn(draw: ShapeSampler, detail: int) -> Body:
     """Curved horn that tapers to a blunt tip."""
     turn, base, rise = draw("turn", 0.55, 0.95), draw("base", 0.24, 0.36), draw("rise", 0.1, 0.5)
     sides, steps = _mesh_of(detail)
@@ -97,7 +97,7 @@ def horn(draw: Draw, detail: int) -> Body:
     return tube(path, base * (1 - t) + 0.03, sides, closed=False)
 
 
-def dumbbell(draw: Draw, detail: int) -> Body:
+def dumbbell(draw: ShapeSampler, detail: int) -> Body:
     """Two balls on a bar."""
     size, bar, length = draw("ball", 0.2, 0.38), draw("bar", 0.06, 0.13), draw("length", 0.75, 1.3)
     sphere = convex(ball(detail // 3)).stretched(size, size, size)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.stimuli.objects.procedural.bodies import Body, Draw, around, lathe, rod, tube
+from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler, around, lathe, rod, tube
 
 
 def _outline(heights: list[float], radii: list[float], count: int) -> np.ndarray:
@@ -19,7 +19,7 @@ def _rings(detail: int) -> int:
     return max(8, detail // (5 * around(detail)))
 
 
-def vase(draw: Draw, detail: int) -> Body:
+def vase(draw: ShapeSampler, detail: int) -> Body:
     """Hollow vase with a belly, a neck and a flared lip."""
     belly, neck = draw("belly", 0.32, 0.5), draw("neck", 0.12, 0.2)
     lip, low = draw("lip", 0.22, 0.34), draw("belly_height", 0.3, 0.5)
@@ -28,7 +28,7 @@ def vase(draw: Draw, detail: int) -> Body:
     return lathe(line, around(detail), wall=0.05, floor=line[1, 1])
 
 
-def bottle(draw: Draw, detail: int) -> Body:
+def bottle(draw: ShapeSampler, detail: int) -> Body:
     """Cylindrical bottle with a shoulder and a narrow neck."""
     radius, neck = draw("radius", 0.22, 0.32), draw("neck", 0.07, 0.11)
     shoulder, height = draw("shoulder", 0.5, 0.68), draw("height", 1.3, 1.7)
@@ -38,14 +38,14 @@ def bottle(draw: Draw, detail: int) -> Body:
     )
 
 
-def cup(draw: Draw, detail: int) -> Body:
+def cup(draw: ShapeSampler, detail: int) -> Body:
     """Hollow tumbler that widens upwards, without a handle."""
     low, high, height = draw("base", 0.22, 0.32), draw("rim", 0.34, 0.46), draw("height", 0.7, 1.0)
     z = np.linspace(0, height, max(4, _rings(detail) // 2))
     return lathe(np.column_stack([low + (high - low) * z / height, z]), around(detail), wall=0.05, floor=z[1])
 
 
-def mug(draw: Draw, detail: int) -> Body:
+def mug(draw: ShapeSampler, detail: int) -> Body:
     """Cylindrical cup with a handle."""
     radius, height = draw("radius", 0.26, 0.42), draw("height", 0.6, 1.0)
     reach, thick = draw("handle_reach", 0.2, 0.3), draw("handle_thickness", 0.04, 0.06)
@@ -58,7 +58,7 @@ def mug(draw: Draw, detail: int) -> Body:
     return body + tube(arc, thick * 0.99, 12, closed=False)
 
 
-def bowl(draw: Draw, detail: int) -> Body:
+def bowl(draw: ShapeSampler, detail: int) -> Body:
     """Wide hollow bowl on a small foot."""
     rim, height, foot = draw("rim", 0.5, 0.65), draw("height", 0.25, 0.42), draw("foot", 0.15, 0.22)
     count = _rings(detail)
@@ -68,7 +68,7 @@ def bowl(draw: Draw, detail: int) -> Body:
     return lathe(line, around(detail), wall=0.06, floor=line[max(2, count // 6), 1])
 
 
-def goblet(draw: Draw, detail: int) -> Body:
+def goblet(draw: ShapeSampler, detail: int) -> Body:
     """Wine glass: hollow cup on a thin stem with a disc foot."""
     cup_radius, stem = draw("cup", 0.26, 0.36), draw("stem", 0.035, 0.06)
     foot, split = draw("foot", 0.24, 0.32), draw("stem_share", 0.45, 0.58)
@@ -78,7 +78,7 @@ def goblet(draw: Draw, detail: int) -> Body:
     return lathe(line, around(detail), wall=0.045, floor=cup_line[1, 1])
 
 
-def spool(draw: Draw, detail: int) -> Body:
+def spool(draw: ShapeSampler, detail: int) -> Body:
     """Two discs joined by a thick core."""
     core, flange = draw("core", 0.15, 0.26), draw("flange", 0.4, 0.5)
     thick, height = draw("flange_thickness", 0.08, 0.14), draw("height", 0.7, 1.1)
@@ -88,7 +88,7 @@ def spool(draw: Draw, detail: int) -> Body:
     return shaft + disc.moved(z=(height - thick) / 2) + disc.moved(z=(thick - height) / 2)
 
 
-def hourglass(draw: Draw, detail: int) -> Body:
+def hourglass(draw: ShapeSampler, detail: int) -> Body:
     """Two bulbs that meet in a waist."""
     waist, end = draw("waist", 0.06, 0.14), draw("end", 0.32, 0.46)
     bulge, height = draw("bulge", 1.0, 1.12), draw("height", 1.0, 1.4)
@@ -96,7 +96,7 @@ def hourglass(draw: Draw, detail: int) -> Body:
     return lathe(_outline(z, [end, end * bulge, waist, end * bulge, end], 2 * _rings(detail)), around(detail))
 
 
-def mushroom(draw: Draw, detail: int) -> Body:
+def mushroom(draw: ShapeSampler, detail: int) -> Body:
     """Domed cap on a stem."""
     cap, stem = draw("cap", 0.38, 0.5), draw("stem", 0.1, 0.17)
     length, dome = draw("stem_length", 0.4, 0.65), draw("dome", 0.28, 0.42)
@@ -107,7 +107,7 @@ def mushroom(draw: Draw, detail: int) -> Body:
     return lathe(curve, facets) + rod(1.15 * stem, length + 0.1, facets, top=stem).moved(z=length / 2 + 0.05)
 
 
-def dome(draw: Draw, detail: int) -> Body:
+def dome(draw: ShapeSampler, detail: int) -> Body:
     """Half an ellipsoid on its flat side."""
     radius, height = draw("radius", 0.4, 0.55), draw("height", 0.3, 0.6)
     angle = np.linspace(0, np.pi / 2, 2 * _rings(detail))
@@ -116,7 +116,7 @@ def dome(draw: Draw, detail: int) -> Body:
     return lathe(curve, around(detail))
 
 
-def top(draw: Draw, detail: int) -> Body:
+def top(draw: ShapeSampler, detail: int) -> Body:
     """Spinning top: a cone on its tip, a rim and a handle."""
     rim, depth = draw("rim", 0.34, 0.58), draw("depth", 0.3, 0.65)
     pin, length = draw("pin", 0.04, 0.08), draw("pin_length", 0.25, 0.4)
@@ -126,7 +126,7 @@ def top(draw: Draw, detail: int) -> Body:
     return lathe(np.array(points), around(detail))
 
 
-def bell(draw: Draw, detail: int) -> Body:
+def bell(draw: ShapeSampler, detail: int) -> Body:
     """Hollow bell, mouth up, with a flaring rim."""
     rim, crown = draw("rim", 0.42, 0.52), draw("crown", 0.2, 0.28)
     height, flare = draw("height", 0.7, 0.95), draw("flare", 0.55, 0.75)

@@ -10,11 +10,11 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.cpu import MujocoEngine
-from robotics_bridge.physics.scene import Geometry, Scene
+from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.audio.microphone import Microphone
-from robotics_bridge.sensors.audio.modes import Solid, find_modes
+from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, joint_drive
 from robotics_bridge.sensors.suite import SensorSuite
 
@@ -23,12 +23,12 @@ DT, K = 0.005, 160
 RATE = K / DT
 
 
-def _scene() -> Scene:
+def _scene() -> TouchScene:
     shapes = (
         Geometry(name="box", link="box", kind="box", size=(0.1, 0.1, 0.01)),
         Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
     )
-    return Scene(("world", "box", "ball"), shapes)
+    return TouchScene(("world", "box", "ball"), shapes)
 
 
 def _make(envs: int = 1, **knobs):
@@ -258,7 +258,9 @@ def test_balls_on_wood_metal_and_glass_are_told_apart_by_a_linear_classifier_at_
     model = mujoco.MjModel.from_xml_string(_DROP)
     materials = ("wood", "metal", "glass")
     sensors = {
-        name: ContactAudio(link="slab", samples=K, modes=find_modes(Solid("box", (0.15, 0.1, 0.015)), name, cells=8))
+        name: ContactAudio(
+            link="slab", samples=K, modes=find_modes(ElasticSolid("box", (0.15, 0.1, 0.015)), name, cells=8)
+        )
         for name in materials
     }
     engine = MujocoEngine(model, envs, threads=1)

@@ -365,7 +365,7 @@ def test_a_signal_with_other_axes_is_refused():
 
 
 def test_noise_in_the_sensors_kernel_and_in_stages_measures_alike():
-    from robotics_bridge.physics import Geometry, HandState, Scene
+    from robotics_bridge.physics import Geometry, HandState, TouchScene
     from robotics_bridge.sensors import KinematicTaxel, Probes, SensorSuite
 
     shapes = (
@@ -380,7 +380,7 @@ def test_noise_in_the_sensors_kernel_and_in_stages_measures_alike():
     for way, crosstalk in (("fused", 0.0), ("staged", 1e-12)):
         probes = Probes.grid(4, 5, size=(0.02, 0.02), radius=0.004)
         taxels = KinematicTaxel(link="pad", probes=probes, noise=Noise(**knobs, crosstalk=crosstalk))
-        suite = SensorSuite(Scene(("pad", "ball"), shapes), {"taxels": taxels}, num_envs=3, seed=5)
+        suite = SensorSuite(TouchScene(("pad", "ball"), shapes), {"taxels": taxels}, num_envs=3, seed=5)
         state = HandState.empty(3, 2, 3)
         state.set_contacts([0, 1, 2], [[0, 1]] * 3)
         pose = np.zeros((3, 2, 7))

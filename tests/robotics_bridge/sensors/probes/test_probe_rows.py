@@ -14,7 +14,7 @@ from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import KinematicTaxel, Noise, Probes, SensorSuite, sensor
 from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED
-from robotics_bridge.sensors.sensor import Place, probe_rows
+from robotics_bridge.sensors.sensor import ReadoutSlice, probe_rows
 from robotics_bridge.sensors.taxels import kinematic
 from tests.factories.touch_scenes import pad_scene, random_pose, state_of
 
@@ -45,7 +45,7 @@ def test_every_probe_is_taken_once_and_by_its_own_sensor(counts: list[int], envs
     context = _gpu(envs)
     context.device.is_cuda = cuda
     starts = np.cumsum([0, *counts])
-    places = [Place(int(start), (count,), False) for start, count in zip(starts, counts, strict=False)]
+    places = [ReadoutSlice(int(start), (count,), False) for start, count in zip(starts, counts, strict=False)]
     owner = np.full(starts[-1], -1)
     for first, end, step, part in probe_rows(places, context, mode):
         taken = np.arange(first, end, step)
@@ -60,7 +60,7 @@ def test_every_probe_is_taken_once_and_by_its_own_sensor(counts: list[int], envs
     [(1, CLEAN, 1), (100, CLEAN, 4), (1000, CLEAN, 8), (100, FUSED, 2), (1000, FUSED, 4), (10_000, FUSED, 4)],
 )
 def test_a_gpu_shares_as_much_as_was_fastest_when_measured(taxels: int, mode: int, expected: int) -> None:
-    rows = probe_rows([Place(0, (taxels,), False)], _gpu(16_384), mode)
+    rows = probe_rows([ReadoutSlice(0, (taxels,), False)], _gpu(16_384), mode)
     assert len(rows) == -(-taxels // expected)
 
 

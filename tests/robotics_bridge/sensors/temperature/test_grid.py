@@ -14,12 +14,12 @@ from scipy.special import erf
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.cpu import MujocoEngine
-from robotics_bridge.physics.scene import Geometry, Scene
+from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature, lost_contacts
-from robotics_bridge.sensors.temperature.materials import MATERIALS, Body, ThermalMaterial, material
+from robotics_bridge.sensors.temperature.materials import MATERIALS, ThermalBody, ThermalMaterial, material
 from robotics_bridge.sensors.temperature.runtime import diffusion
 
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
@@ -31,7 +31,7 @@ def _make(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), 
         Geometry(name="pad", link="pad", kind="box", size=half),
         Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
     )
-    scene = Scene(("world", "pad", "object"), geometries)
+    scene = TouchScene(("world", "pad", "object"), geometries)
     defaults = {"convection": 0.0, "radiates": False, "material": PLAIN}
     suite = SensorSuite(scene, {"grid": TemperatureGrid(link="pad", **{**defaults, **knobs})}, num_envs=envs)
     return suite, HandState.empty(envs, 3, contacts)
@@ -145,7 +145,7 @@ def test_touching_a_half_space_gives_the_temperatures_of_two_half_spaces(name):
     # A face of 2 m so that heat flows straight through; 24 mm deep.
     suite, state = _make(
         half=(1.0, 1.0, 0.012), contacts=4, cells=(1, 1, 240), base_temperature=33.0,
-        bodies={"object": Body(name, 13.0)},
+        bodies={"object": ThermalBody(name, 13.0)},
     )  # fmt: skip
     _face(state, 1.0, height=0.012)
     dt, steps = 2e-3, 1000
@@ -169,7 +169,7 @@ def test_metal_feels_colder_than_wood_at_the_same_temperature():
             cells=(5, 5, 5),
             base_temperature=33.0,
             material="skin",
-            bodies={"object": Body(name, 22.0)},
+            bodies={"object": ThermalBody(name, 22.0)},
         )
         state.set_contacts(
             [0], [[0, 1]], distance=[-1e-3], position=[[0.0, 0.0, 0.003]], normal=[[0.0, 0.0, 1.0]]
@@ -183,7 +183,11 @@ def test_metal_feels_colder_than_wood_at_the_same_temperature():
 
 def test_the_published_conduction_is_available_with_its_length_and_area():
     suite, state = _make(
-        contacts=4, cells=(1, 1, 1), conduction="thesis", base_temperature=20.0, bodies={"object": Body("steel", 50.0)}
+        contacts=4,
+        cells=(1, 1, 1),
+        conduction="thesis",
+        base_temperature=20.0,
+        bodies={"object": ThermalBody("steel", 50.0)},
     )
     _face(state, 0.008)
     for _ in range(1000):
@@ -199,7 +203,7 @@ def test_a_contact_of_depth_has_the_area_of_a_cut_ball_and_none_gives_no_heat():
     def gain(depth: float, conductance: float = 1.0) -> float:
         suite, state = _make(
             contacts=1, cells=(1, 1, 1), base_temperature=0.0, contact_conductance=conductance, contact_radius=0.004,
-            bodies={"object": Body("copper", 100.0)}, material=ThermalMaterial(400, 1000, 100, 0),
+            bodies={"object": ThermalBody("copper", 100.0)}, material=ThermalMaterial(400, 1000, 100, 0),
         )  # fmt: skip
         state.set_contacts([0], [[1, 0]], distance=[-depth], position=[[0.0, 0, 0.03]], normal=[[0.0, 0, -1]])
         suite.update(state, 1.0)
@@ -217,7 +221,7 @@ def test_a_contact_of_depth_has_the_area_of_a_cut_ball_and_none_gives_no_heat():
 def test_no_step_is_too_long_even_for_a_thin_hot_copper_pad(dt):
     suite, state = _make(
         half=(0.01, 0.01, 1e-4), contacts=4, cells=(4, 4, 2), material="copper", convection=500.0, radiates=True,
-        bodies={"object": Body("copper", 400.0)}, ambient_temperature=-20.0,
+        bodies={"object": ThermalBody("copper", 400.0)}, ambient_temperature=-20.0,
     )  # fmt: skip
     _face(state, 0.01, depth=1e-3, height=1e-4)
     for _ in range(100):
@@ -243,7 +247,7 @@ def test_the_element_lags_exactly_and_reads_less_upward_than_downward():
 
 
 def test_environments_are_reset_and_break_alone():
-    suite, state = _make(envs=3, contacts=12, cells=(2, 2, 2), bodies={"object": Body("steel", 60.0)})
+    suite, state = _make(envs=3, contacts=12, cells=(2, 2, 2), bodies={"object": ThermalBody("steel", 60.0)})
     _face(state, 0.008, envs=(0, 1, 2), depth=1e-3)
     warm = link_temperature(suite, "grid")
     warm[2] = 22.0
@@ -282,7 +286,9 @@ def test_a_hot_ball_resting_on_a_plate_warms_the_cells_below_it():
       <body name="ball" pos="0.03 0.03 0.0449"><freejoint/><geom name="ball" size="0.04" mass="0.5"/></body>
     </worldbody></mujoco>""")
     engine = MujocoEngine(model, 2, threads=1)
-    grid = TemperatureGrid(link="plate", cells=(5, 5, 1), material="aluminium", bodies={"ball": Body("steel", 45.0)})
+    grid = TemperatureGrid(
+        link="plate", cells=(5, 5, 1), material="aluminium", bodies={"ball": ThermalBody("steel", 45.0)}
+    )
     suite = SensorSuite(engine.scene, {"grid": grid}, num_envs=2)
     for _ in range(100):
         engine.step()
@@ -303,7 +309,7 @@ def test_a_hot_ball_resting_on_a_plate_warms_the_cells_below_it():
         ({"source": np.zeros((1, 2))}, "source is a number or an array"),
         ({"tau": -1.0}, "tau must be zero or positive"),
         ({"conduction": "real"}, "Unknown conduction"),
-        ({"bodies": {"object": Body("woood")}}, "did you mean 'wood'"),
+        ({"bodies": {"object": ThermalBody("woood")}}, "did you mean 'wood'"),
         ({"noise": Noise(gain=(0.5, 2.0))}, "TemperatureGrid has no noise knob 'gain'"),
     ],
 )
@@ -313,7 +319,7 @@ def test_wrong_settings_are_explained(knobs, message):
 
 
 def test_a_grid_needs_finite_geometry_or_corners():
-    scene = Scene(("world",), (Geometry(name="floor", link="world", kind="plane"),))
+    scene = TouchScene(("world",), (Geometry(name="floor", link="world", kind="plane"),))
     with pytest.raises(UsageError, match="no geometry of finite size"):
         SensorSuite(scene, {"grid": TemperatureGrid(link="world")}, num_envs=1)
     with pytest.raises(UsageError, match="positive"):
@@ -325,7 +331,7 @@ def test_a_grid_needs_finite_geometry_or_corners():
 
 
 def test_contacts_without_room_are_counted():
-    suite, state = _make(contacts=60, bodies={"object": Body("steel", 60.0)})
+    suite, state = _make(contacts=60, bodies={"object": ThermalBody("steel", 60.0)})
     state.set_contacts(
         np.zeros(60), np.tile([[0, 1]], (60, 1)), distance=np.full(60, -1e-4),
         position=np.random.default_rng(0).normal(size=(60, 3)) * 0.01, normal=np.tile([0.0, 0, 1], (60, 1)),
@@ -336,7 +342,7 @@ def test_contacts_without_room_are_counted():
 
 
 def test_an_empty_scene_is_read_at_the_shortest_and_the_longest_step():
-    scene = Scene(("world", "pad"))
+    scene = TouchScene(("world", "pad"))
     grid = TemperatureGrid(link="pad", low=(0, 0, 0), high=(0.01, 0.01, 0.01), base_temperature=30.0)
     suite, state = SensorSuite(scene, {"grid": grid}, num_envs=2), HandState.empty(2, 2)
     for dt in (1e-5, 0.1, 10.0):
@@ -360,8 +366,10 @@ def test_cpu_and_cuda_agree():
             Geometry(name="pad", link="pad", kind="box", size=(0.01, 0.02, 0.03)),
             Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
         )
-        grid = TemperatureGrid(link="pad", cells=(4, 5, 6), bodies={"object": Body("steel", 60.0)}, tau=0.1)
-        suite = SensorSuite(Scene(("world", "pad", "object"), geometries), {"grid": grid}, num_envs=8, device=device)
+        grid = TemperatureGrid(link="pad", cells=(4, 5, 6), bodies={"object": ThermalBody("steel", 60.0)}, tau=0.1)
+        suite = SensorSuite(
+            TouchScene(("world", "pad", "object"), geometries), {"grid": grid}, num_envs=8, device=device
+        )
         state = HandState.empty(8, 3, 32, device)
         _face(state, 0.008, envs=tuple(range(8)), depth=1e-3)
         for _ in range(100):

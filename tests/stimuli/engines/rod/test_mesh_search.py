@@ -227,7 +227,7 @@ def test_threads_that_search_together_find_what_one_finds(lanes):
     alone = np.where((alone == alone.min(axis=1, keepdims=True)) | counts, alone, np.nan)
     arrays = _bodies(surface)
     with thread_warp() as (threads, modules):
-        nearest = modules.search.searches(np.float64, lanes).nearest
+        nearest = modules.mesh_search.searches(np.float64, lanes).nearest
         bodies = SimpleNamespace(**{name: Memory(values) for name, values in arrays.items()})
         for begin in range(0, len(starts), count):
             found = {}

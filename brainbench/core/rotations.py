@@ -1,4 +1,8 @@
-"""Rotations of batches as torch tensors: quaternions (w, x, y, z), axes, angles. The last dimension is the vector."""
+"""Rotations. A quaternion is (w, x, y, z) everywhere in this project; the last dimension is the vector.
+
+NumPy arrays go through SciPy's ``Rotation`` (:func:`to_matrices`, :func:`from_matrices`); the other functions take
+batches as torch tensors, without copies to or from a device.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,27 @@ from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     import torch
+    from numpy.typing import ArrayLike, NDArray
+
+
+def to_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    from scipy.spatial.transform import Rotation
+
+    q = np.asarray(quaternions, dtype=np.float64)
+    return Rotation.from_quat(np.roll(q, -1, axis=-1).reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
+
+
+def from_matrices(matrices: ArrayLike) -> NDArray[np.float64]:
+    """Return the unit quaternions [..., 4] of rotation matrices [..., 3, 3]."""
+    from scipy.spatial.transform import Rotation
+
+    m = np.asarray(matrices, dtype=np.float64)
+    return np.roll(Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(), 1, axis=-1).reshape(*m.shape[:-2], 4)
 
 
 def constant(values: float | Sequence[float], like: torch.Tensor, dtype: torch.dtype | None = None) -> torch.Tensor:

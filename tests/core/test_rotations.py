@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robotics_bridge.tasks import rotations as r
+from brainbench.core import rotations as r
 
 
 def _draw(seed: int, count: int = 5) -> tuple[torch.Tensor, Rotation]:

@@ -1,0 +1,106 @@
+"""Objects of users and of other packages: ``FILE.py:NAME``, ``package.module:NAME`` and entry points."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+
+_LOG = logging.getLogger(__name__)
+
+
+def is_target(text: str) -> bool:
+    """Return whether a text names an object of a file or a module: ``FILE.py:NAME`` or ``module:NAME``."""
+    path, colon, name = text.rpartition(":")
+    return bool(colon and path and name) and name.isidentifier()
+
+
+def load_object(target: str, kind: str, *, offers: Callable[[Any], bool] = callable) -> Any:
+    """Return the object NAME of ``path/to/FILE.py:NAME`` or ``package.module:NAME``; the file or module is run.
+
+    Args:
+        target: as above. The file's own folder can be imported from while it loads.
+        kind: what is loaded, for messages: ``model``, ``metric``, ``layout``.
+        offers: which objects of the file a message about an unknown name lists.
+
+    Raises:
+        UsageError: the target has another form, or there is no such name.
+        DataFileNotFoundError: there is no such file or module.
+        DataError: the file or module cannot be imported.
+    """
+    path, _, name = target.rpartition(":")
+    if not path or not name:
+        raise UsageError(
+            f"A {kind} of your own is given as path/to/FILE.py:NAME or package.module:NAME; received {target!r}."
+        )
+    module = load_module(path)
+    if not hasattr(module, name):
+        choices = [key for key, value in vars(module).items() if not key.startswith("_") and offers(value)]
+        raise unknown_name(f"{kind} in {path!r}", name, choices)
+    return getattr(module, name)
+
+
+def load_module(path: str) -> ModuleType:
+    """Import ``path/to/file.py`` or ``package.module``.
+
+    Raises:
+        DataFileNotFoundError: there is no such file or module.
+        DataError: it cannot be imported.
+    """
+    is_file = path.endswith(".py") or "/" in path or "\\" in path
+    if is_file and not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no Python file {path!r}.")
+    try:
+        return _import_file(Path(path).resolve()) if is_file else importlib.import_module(path)
+    except ModuleNotFoundError as error:
+        if not is_file and error.name is not None and (path == error.name or path.startswith(f"{error.name}.")):
+            raise DataFileNotFoundError(f"There is no Python module {path!r}; a file is given as {path}.py.") from error
+        raise DataError(f"Importing {path!r} failed: {error}.") from error
+    except Exception as error:
+        raise DataError(f"Importing {path!r} failed with {type(error).__name__}: {error}.") from error
+
+
+def load_entry_points(group: str, take: Callable[[str, Any], None]) -> None:
+    """Hand every object of an entry-point group to ``take(name, object)``; a faulty one is logged and left out."""
+    from importlib.metadata import entry_points
+
+    for entry in entry_points(group=group):
+        try:
+            take(entry.name, entry.load())
+        except Exception as error:  # noqa: BLE001 - another package's fault must not take ours away
+            _LOG.warning("The entry point %r (%s) of %s could not be loaded: %s", entry.name, entry.value, group, error)
+
+
+def _import_file(path: Path) -> ModuleType:
+    # The name is the file's own, so that classes defined there can be found again by their module.
+    name = f"brainbench_user_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise UsageError(f"{str(path)!r} is not a Python file.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        with _importable(path.parent):
+            spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+@contextmanager
+def _importable(folder: Path) -> Iterator[None]:
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
