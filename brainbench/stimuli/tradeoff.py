@@ -84,7 +84,8 @@ class SimulationSetting:
 
 REFERENCE = SimulationSetting(Fidelity(links=40, time_step=1e-5), "rod")
 """The converged simulation of the dynamic tests: with friction ``rod`` is within some tenths of a per cent of a
-differential equation that no engine shares (``benchmarks/friction_truth.py``), ``mujoco`` within some per cent."""
+differential equation that no engine shares (``benchmarks/whiskers/friction_reference.py``), ``mujoco`` within some
+per cent."""
 
 
 def settings(

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.tactile_scene import CHECKED, restore, snapshot
-from benchmarks.tactile_tables import tables
+from benchmarks.tactile.scene import CHECKED, restore, snapshot
+from benchmarks.tactile.tables import tables
 from robotics_bridge.physics import HandState
 
 ROOT = Path(__file__).parents[2]

@@ -1,10 +1,5 @@
-"""Whiskers far from the usual: each case obeys mechanics, is flagged ``unstable``, or is refused.
+"""Whiskers far from the usual: each case obeys mechanics, is flagged ``unstable``, or is refused."""
 
-``PYTHONPATH=. python tests/stimuli/test_extremes.py`` writes the table of what each case did into
-benchmarks/RESULTS.md.
-"""
-
-import itertools
 import math
 from dataclasses import replace
 
@@ -210,30 +205,3 @@ def test_the_base_force_of_a_whisker_waved_in_air_is_its_mass_times_acceleration
     momentum = np.einsum("i,nik->nk", chain.masses, centres)
     inertia = -np.diff(momentum, n=2, axis=0) / step**2
     np.testing.assert_allclose(trace.wrench[1:-1, 1], inertia[:, 1], atol=0.02 * np.abs(inertia[:, 1]).max())
-
-
-def _survey():
-    """Rows (case, outcome) of the grid of held whiskers."""
-    rows = []
-    grid = itertools.product((1.5e-6, 8.78e-6, 30e-6), (1e6, 5e9, 1e11), SHORT_STEPS + LONG_STEPS)
-    for tip_radius, young_modulus, time_step in grid:
-        trace = _press(tip_radius, young_modulus, time_step)
-        case = [f"{tip_radius * 1e6:g}", f"{young_modulus:.0e}", f"{time_step * 1e6:g}"]
-        if trace.status != "ok":
-            rows.append([*case, "unstable", trace.reason])
-        elif trace.contact[-1]:
-            rows.append([*case, "ok", f"moment − r × F: {100 * _imbalance(trace):.2g} %"])
-        else:
-            rows.append([*case, "ok", f"lost the peg; deepest overlap {trace.penetration * 1e6:.2g} µm"])
-    return rows
-
-
-if __name__ == "__main__":
-    from benchmarks.results import table, write_section
-
-    write_section(
-        "Whiskers at the extremes",
-        "PYTHONPATH=. python tests/stimuli/test_extremes.py",
-        "A rod of radius .5 mm pushes mouse C2 (10 links) aside by 1 mm at 7 mm and rests.\n\n"
-        + table(["tip µm", "E Pa", "step µs", "status", "what it did"], _survey()),
-    )

@@ -21,7 +21,7 @@ def bench(
 ) -> None:
     """Time one update of each sensor class on a hand that holds a ball, with the memory per environment.
 
-    The benchmark against peers and rooflines is benchmarks/tactile.py in the repository.
+    The benchmark against peers and rooflines is benchmarks/tactile/throughput.py in the repository.
     """
     from brainbench.cli.tactile import grip_scene
     from brainbench.core.errors import UsageError

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.gelsight_fit import (
+from benchmarks.tactile.gelsight_fit import (
     MODELS,
     STARTS,
     by_sensor,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.friction_truth import Passing, Penalty, misses, solve
+from benchmarks.whiskers.friction_reference import Passing, Penalty, misses, solve
 from brainbench.stimuli.engines import get_backend
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.whiskers.array import WhiskerArray

@@ -1,0 +1,382 @@
+"""Students of one teacher that differ in what they feel, trained for the same number of control steps and compared.
+
+    python -m benchmarks.policies.students --teacher RUN --device cuda --iterations 300 --together 2 --out STUDENTS
+        [--gpus 2] [--end EPOCH_SECOND] [--arms none ft_hand …] [--tar $OUT]
+    brainbench policy report STUDENTS --picture report.png --records leaderboards/results
+
+Each student is a process of its own; ``--together`` of them share a GPU. Rows are printed as they come and kept in
+``STUDENTS/students.jsonl``. By ``--end`` all have stopped, were evaluated as far as they got (their evaluation says how
+far), and lie in ``$OUT/results.tar.gz`` (all but weights) and ``$OUT/models-<n>.tar`` of at most 15 MiB each, renewed
+whenever one is done. Run again with the same folder, students that were stopped go on.
+
+    python -m benchmarks.policies.students --lay-out FOLDER … [--at-least 90] [--notes FILE] [--device "2 × NVIDIA
+    H200"]
+        [--write] [--records FOLDER]
+
+lays out what came back, several training seeds of an arm and several folders together: tables of arms, of every
+student and of the differences between arms; with ``--write`` a section of RESULTS.md and two pictures, with
+``--records`` records for a leaderboard, whose commands name the teacher as it is shipped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from robotics_bridge.policies.report import StudentResult
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+
+NETWORK = "zhuang-intersection-ln-small"
+ARMS: dict[str, dict[str, Any]] = {
+    "none": {"observe": "none"},
+    "ft_hand": {"observe": "force_torque", "placement": "hand"},
+    "ft_tips": {"observe": "force_torque", "placement": "tips"},
+    "bool_hand": {"observe": "agg_bool", "placement": "hand"},
+    "bool_tips": {"observe": "agg_bool", "placement": "tips"},
+    "ead_simclr": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.simclr"},
+    "ead_supervised": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.supervised"},
+    "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
+}
+CONTRASTS = (
+    ("ft_hand", "ft_tips"), ("bool_hand", "bool_tips"), ("ft_tips", "bool_tips"), ("ft_hand", "bool_hand"),
+    ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
+    ("ft_hand", "ead_simclr"), ("bool_tips", "none"), ("ead_untrained", "none"),
+)  # fmt: skip
+"""Arms whose differences are tested."""
+_TAR = 15 << 20
+_SMOOTH = 8
+"""Iterations over which curves are averaged."""
+_PICTURES = Path(__file__).resolve().parents[2] / "docs" / "images"
+_PER_EVALUATION = 60.0
+"""Seconds kept for making the environments of a student and for its evaluation."""
+
+
+def put(out: Path, row: dict[str, Any]) -> None:
+    """Print a row and keep it; processes append whole lines."""
+    line = json.dumps(row)
+    print(line, flush=True)
+    with (out / "students.jsonl").open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
+
+
+def train(options: argparse.Namespace) -> None:
+    """Train and evaluate one student in this process."""
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+    from robotics_bridge.policies.training.students import train_student
+
+    settings = dict(ARMS[options.arm])
+    if "encoder" in settings:
+        settings["encoder_settings"] = {"learning": "frozen"}
+    precision = "bf16" if options.device != "cpu" and settings["observe"] != "none" else "float32"
+    config = DistillConfig(
+        task=options.task, variant=options.config, teacher=str(options.teacher), num_envs=options.envs,
+        precision=precision, seed=options.seed, save_interval=1_000_000, learning_rate=options.learning_rate,
+        epochs=options.epochs, teacher_share=options.teacher_share,
+        teacher_iterations=options.teacher_iterations, **settings,
+    )  # fmt: skip
+    began = time.time()
+    left = None if options.end is None else max(options.end - began - options.reserve, 1.0)
+    folder = options.out / options.arm / f"seed{options.seed}"
+
+    def tell(done: int, total: int, what: str) -> None:
+        if what == "evaluating" or done == 1 or done % options.every == 0:
+            put(options.out, {"arm": options.arm, "what": what, "done": done, "s": round(time.time() - began, 1)})
+
+    student = train_student(
+        config, folder, device=options.device, episodes=options.episodes, stop_after=left, stop_at=options.iterations,
+        progress=tell,
+    )  # fmt: skip
+    logged = [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+    last = {kind: next((row for row in reversed(logged) if row["kind"] == kind), {}) for kind in ("loss", "time")}
+    row: dict[str, Any] = {"arm": options.arm, "seed": options.seed, "status": student.result.status}
+    row |= {"iterations": student.result.iterations}
+    row |= {"control_steps": student.result.iterations * config.steps_per_env * config.num_envs}
+    row |= {"learning_s": round(student.result.seconds, 1), "s": round(time.time() - began, 1)}
+    row |= {"loss": last["loss"].get("behaviour"), "acting": last["time"].get("acting")}
+    row |= {"learning": last["time"].get("learning")}
+    for name in ("success", "goals", "turn_rate", "seconds", "returns", "dropped"):
+        values = [value for item in student.evaluations for value in item.get(name, [])]
+        row[name] = sum(values) / len(values) if values else None
+    put(options.out, row)
+
+
+def others(options: argparse.Namespace) -> None:
+    """Evaluate the teacher, zero and random over the students' evaluation seeds."""
+    from brainbench.core.files import write_json
+    from robotics_bridge import tasks
+    from robotics_bridge.policies.evaluate import agent, evaluate
+    from robotics_bridge.policies.training.students import SEEDS
+    from robotics_bridge.policies.training.teacher import load_teacher
+
+    env = tasks.make(options.task, config=options.config, num_envs=options.envs, device=options.device, seed=1)
+    found = []
+    for name in ("teacher", "zero", "random"):
+        act = load_teacher(options.teacher, env) if name == "teacher" else agent(name, env)
+        found.append(evaluate(env, act, episodes=options.episodes, seed=SEEDS, name=name).summary())
+        put(options.out, {"arm": name, **found[-1]})
+    write_json(options.out / "agents.json", found)
+
+
+def together(options: argparse.Namespace) -> None:
+    """Run all arms, some at once per GPU, and pack what they leave."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    words = sys.argv[1:]
+    waiting = [*([] if options.no_agents else ["agents"]), *options.arms]
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    running: dict[subprocess.Popen[bytes], tuple[str, int]] = {}
+    places = [gpu for _ in range(options.together) for gpu in range(options.gpus)]
+    while waiting or running:
+        while waiting and places:
+            name = waiting.pop(0)
+            if options.end is not None and time.time() > options.end - options.reserve - 20:
+                put(options.out, {"arm": name, "status": "no time"})
+                continue
+            gpu = places.pop(0)
+            environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "2")}
+            if options.device != "cpu":
+                environment["CUDA_VISIBLE_DEVICES"] = visible[gpu] if visible else str(gpu)
+            process = subprocess.Popen([sys.executable, "-m", __spec__.name, *words, "--arm", name], env=environment)
+            running[process] = name, gpu
+        time.sleep(0.2)
+        for process in [process for process in running if process.poll() is not None]:
+            name, gpu = running.pop(process)
+            places.append(gpu)
+            if process.returncode:
+                put(options.out, {"arm": name, "status": "failed", "code": process.returncode})
+            pack(options.out, options.tar or options.out, options.arms, options.tars)
+
+
+def pack(out: Path, to: Path, arms: list[str], most: int) -> None:
+    """Put everything but weights into one file, and weights into small ones, those of the first arms first."""
+    to.mkdir(parents=True, exist_ok=True)
+    kept = [path for path in out.rglob("*") if path.suffix in (".json", ".jsonl")]
+    with tarfile.open(to / "results.tar.gz", "w:gz") as file:
+        for path in kept:
+            file.add(path, path.relative_to(out))
+    number, size, file = 0, 0, None
+    for path in (path for arm in arms for path in sorted((out / arm).rglob("model.safetensors"))):
+        if number == most and size + path.stat().st_size > _TAR:
+            break
+        if file is None or size + path.stat().st_size > _TAR:
+            if file is not None:
+                file.close()
+            number, size = number + 1, 0
+            file = tarfile.open(to / f"models-{number}.tar", "w")  # noqa: SIM115 - closed before the next is opened
+        file.add(path, path.relative_to(out))
+        size += path.stat().st_size
+    if file is not None:
+        file.close()
+
+
+def lay_out(options: argparse.Namespace) -> None:
+    """Print the comparison; with ``--write`` keep it as a section and draw it, and how students learned."""
+    from dataclasses import replace
+
+    from benchmarks.report import table, write_section
+    from leaderboards import write_record
+    from robotics_bridge.policies import report
+
+    results = report.read_results(options.lay_out, at_least=options.at_least)
+    agents = report.read_agents(options.lay_out)
+    title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
+    named = {arm: result for arm in ARMS for result in results if arm_of(result.config) == arm}
+    notes = report.remarks([replace(result, left_out=()) for result in results])
+    left = [f"{arm} seed {item.seed} ({item.iterations})" for arm, r in named.items() for item in r.left_out]
+    notes += [f"left out, after so many iterations: {', '.join(left)}"] if left else []
+    parts = [f"{title}.", table(columns, rows)]
+    parts += [f"Notes: {'; '.join(notes)}."] if notes else []
+    logs = found_logs(options.lay_out, named)
+    parts += [every_student(named, logs), differences(named)]
+    if options.notes:
+        parts.append(options.notes.read_text(encoding="utf-8").strip())
+    body = "\n\n".join(parts)
+    print(body)
+    if options.write:
+        report.draw(results, _PICTURES / "policy-students.png", agents=agents)
+        curves(logs, _PICTURES / "policy-students-learning.png")
+        command = f"python -m benchmarks.policies.students --teacher {options.teacher} --config careful"
+        write_section(f"Students of {options.task}", command, body, where=options.device, subject="policies")
+    if options.records is not None:
+        shipped = [replace(result, config=replace(result.config, teacher=str(options.teacher))) for result in results]
+        for record in report.records(shipped):
+            print(write_record(record, options.records))
+
+
+def arm_of(config: DistillConfig) -> str | None:
+    """Return the arm that a student belongs to."""
+    learned = {} if config.tactile is None else {"encoder": config.tactile.arm}
+    for arm, settings in ARMS.items():
+        wanted = {"placement": config.placement, "encoder": learned.get("encoder"), **settings}
+        if config.observe == "none" == settings["observe"]:
+            return arm
+        frozen = config.encoder_settings.get("learning") == "frozen"
+        if (config.observe, config.placement) == (settings["observe"], wanted["placement"]) and (
+            frozen == ("encoder" in settings) and learned.get("encoder") == wanted["encoder"]
+        ):
+            return arm
+    return None
+
+
+def found_logs(folders: list[Path], named: dict[str, StudentResult]) -> dict[tuple[str, int], list[dict[str, Any]]]:
+    """Return the log of every student that counts, by arm and training seed."""
+    from brainbench.core.files import read_json
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+
+    logs = {}
+    for path in (path for folder in folders for path in sorted(folder.rglob("log.jsonl"))):
+        config = DistillConfig.of(read_json(path.parent / "config.json")["distill"])
+        arm = arm_of(config)
+        if arm not in named or config.seed not in named[arm].seeds:
+            continue
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        if len(rows) > len(logs.get((arm, config.seed), [])):
+            logs[arm, config.seed] = rows
+    return dict(sorted(logs.items(), key=lambda item: (list(ARMS).index(item[0][0]), item[0][1])))
+
+
+def every_student(named: dict[str, StudentResult], logs: dict[tuple[str, int], list[dict[str, Any]]]) -> str:
+    """Return the table of single students: one row per arm and training seed."""
+    from benchmarks.report import table
+
+    least = min(learned or 0 for result in named.values() for learned in result.learned)
+    rows = []
+    for (arm, seed), log in logs.items():
+        result = named[arm]
+        number = result.seeds.index(seed)
+        learned = result.learned[number] or 0
+        steps = learned * result.config.steps_per_env * result.config.num_envs
+        loss = [row["behaviour"] for row in log if row["kind"] == "loss"][-_SMOOTH:]
+        rows.append(
+            [
+                arm, str(seed), str(learned), f"{steps / 1e6:.1f}e6", f"{sum(loss) / len(loss):.3f}",
+                f"{seen(log, least):.3f}", f"{result.success[number]:.3f}",
+            ]
+        )  # fmt: skip
+    span = f"{least - _SMOOTH + 1} to {least}"
+    columns = ["arm", "training seed", "iterations", "control steps", f"imitation loss, last {_SMOOTH}"]
+    return table([*columns, f"success in training, iterations {span}", "success in evaluation"], rows)
+
+
+def differences(named: dict[str, StudentResult]) -> str:
+    """Return the table of :data:`CONTRASTS`, and of what spread they were held against."""
+    from benchmarks.report import table
+    from brainbench.metrics.inference.multiple import adjust
+    from robotics_bridge.policies.contrasts import contrast, pooled_spread
+
+    spread, freedom = pooled_spread([result.success for result in named.values()])
+    pairs = [(one, other) for one, other in CONTRASTS if one in named and other in named]
+    found = [contrast(named[one].success, named[other].success, spread, freedom) for one, other in pairs]
+    held = adjust([item.p for item in found], "holm")
+    rows = [
+        [
+            f"{one} – {other}", f"{len(named[one].seeds)}, {len(named[other].seeds)}", f"{item.difference:+.3f}",
+            f"[{item.interval.low:+.3f}, {item.interval.high:+.3f}]", f"{p:.2g}",
+        ]
+        for (one, other), item, p in zip(pairs, found, held, strict=True)
+    ]  # fmt: skip
+    said = (
+        f"Training seeds spread success by {spread:.3f} (standard deviation pooled over {len(named)} arms, {freedom} "
+        "degrees of freedom). Differences of arms against it:"
+    )
+    return f"{said}\n\n{table(['arms', 'seeds', 'success', '95 % interval', 'p (Holm)'], rows)}"
+
+
+def seen(log: list[dict[str, Any]], iteration: int) -> float:
+    """Return the success in training over the last iterations up to one."""
+    own = [row for row in log if row["kind"] == "episode" and iteration - _SMOOTH < row["step"] <= iteration]
+    return sum(row["episodes"] * row["success"] for row in own) / sum(row["episodes"] for row in own)
+
+
+def curves(logs: dict[tuple[str, int], list[dict[str, Any]]], path: Path) -> None:
+    """Draw success in training and the loss of imitation over the iterations of every student."""
+    import matplotlib as mpl
+    import numpy as np
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
+    told, spans, most = set(), [], []
+    for (arm, seed), rows in logs.items():
+        color = f"C{list(ARMS).index(arm)}"
+        for axis, kind, key in ((axes[0], "episode", "success"), (axes[1], "loss", "behaviour")):
+            own = [row for row in rows if row["kind"] == kind and key in row]
+            if not own:
+                continue
+            weights = np.array([row.get("episodes", 1.0) for row in own])
+            window = np.ones(min(_SMOOTH, len(own)))
+            means = np.convolve(weights * [row[key] for row in own], window, "valid")
+            means /= np.convolve(weights, window, "valid")
+            label = arm if axis is axes[0] and arm not in told else None
+            axis.plot([row["step"] for row in own][len(window) - 1 :], means, color=color, label=label, lw=1)
+            if axis is axes[1]:
+                spans.append((0.95 * float(means.min()), 1.05 * float(np.quantile(means, 0.9))))
+                most.append((max(row[key] for row in own), f"{arm}, seed {seed}"))
+        told.add(arm)
+    # One loss that explodes would leave the others no height; it is named instead.
+    top = max(high for _, high in spans)
+    far = [f"{name}: one iteration reaches {loss:.0e}" for loss, name in most if loss > 100 * top]
+    axes[1].set_ylim(min(low for low, _ in spans), top)
+    axes[1].text(0.98, 0.98, "\n".join(far), fontsize=7, ha="right", va="top", transform=axes[1].transAxes)
+    axes[0].set(ylabel="success in training", xlabel="iteration", ylim=(0, None))
+    axes[1].set(ylabel="imitation loss", xlabel="iteration")
+    figure.legend(frameon=False, fontsize=7, ncols=len(told), loc="outside lower center", handlelength=1.2)
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--teacher", type=Path, default=Path("in_palm_rotate.careful"), help="shipped, or a run's folder"
+    )
+    parser.add_argument("--lay-out", type=Path, nargs="+", help="folders of students that came back")
+    parser.add_argument("--at-least", type=int, default=0, help="iterations; what learned fewer is left out, by name")
+    parser.add_argument("--records", type=Path, help="folder for records of what is laid out")
+    parser.add_argument("--notes", type=Path, help="text that follows the tables")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--task", default="in_palm_rotate")
+    parser.add_argument("--config", default="default", help="configuration of the task; that of the teacher")
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--gpus", type=int, default=1)
+    parser.add_argument("--no-agents", action="store_true", help="do not evaluate the teacher, zero and random again")
+    parser.add_argument("--together", type=int, default=1, help="processes per GPU")
+    parser.add_argument("--envs", type=int, default=4096)
+    parser.add_argument("--iterations", type=int, default=300, help="after which each student stops")
+    parser.add_argument("--learning-rate", type=float, help="by default the task's own (published)")
+    parser.add_argument("--epochs", type=int, help="over each iteration's steps; by default the task's own (published)")
+    parser.add_argument("--teacher-share", type=float, default=0.0, help="of the first iteration's actions")
+    parser.add_argument("--teacher-iterations", type=int, default=0, help="over which that share falls to 0")
+    parser.add_argument("--episodes", type=int, default=512, help="per evaluation seed, at least")
+    parser.add_argument("--end", type=float, help="second since 1970 by which all is done")
+    parser.add_argument("--reserve", type=float, default=_PER_EVALUATION, help="of it, for start and evaluation")
+    parser.add_argument("--every", type=int, default=25, help="iterations between rows")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("policy-students"))
+    parser.add_argument("--tar", type=Path, help="folder for what is kept; by default --out")
+    parser.add_argument("--tars", type=int, default=5, help="files of weights at most; later arms keep none")
+    parser.add_argument("--arm", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.lay_out is not None:
+        lay_out(options)
+    elif options.arm is None:
+        together(options)
+    elif options.arm == "agents":
+        others(options)
+    else:
+        train(options)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,356 @@
+"""Speed of the dexterous tasks and the campaign that trains their teachers, on one GPU or on processors.
+
+    python -m benchmarks.policies.tasks --part speed --device cuda --out $OUT  # environment steps/s per task and sense
+    python -m benchmarks.policies.tasks --part split --device cuda --out $OUT       # a PPO iteration in its parts
+    # an iteration of a student in its parts
+    python -m benchmarks.policies.tasks --part student --device cuda --out $OUT
+    python -m benchmarks.policies.tasks --part teacher --device cuda --out $OUT --minutes 7.5 [--resume FOLDER]
+        [--start RUN --start-std 0.5] [--change is_dropped=-300 goal.start_threshold=0.4 entropy=0]
+    python -m benchmarks.policies.tasks --part tables --out FOLDER --write          # lay out what was measured
+
+Every row is printed and appended to ``$OUT/policy.jsonl`` when it is measured; small sizes come first. The teacher
+keeps ``$OUT/teacher-<task>/``: log.jsonl, small checkpoints of every save, and what it needs to go on; at the end it is
+held against the agents zero and random over three seeds. Needs torch, warp, mujoco, mujoco_warp, rsl_rl, tensordict.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.report import table, write_section
+from robotics_bridge import tasks
+from robotics_bridge.envs import Env
+from robotics_bridge.policies.evaluate import agent, evaluate
+from robotics_bridge.policies.training import teacher
+from robotics_bridge.tasks.overrides import changed
+
+SENSES = ("none", "force_torque", "encoder-small", "encoder")
+ENCODERS = {"encoder-small": "zhuang-intersection-ln-small", "encoder": "zhuang-intersection-ln"}
+
+
+def put(out: Path, row: dict[str, Any]) -> None:
+    """Print a row and keep it."""
+    print(json.dumps(row), flush=True)
+    with (out / "policy.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def wait(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def per_call(work: Callable[[], Any], device: torch.device, *, repeats: int, warm: int = 3) -> float:
+    """Return the mean seconds of a call."""
+    for _ in range(warm):
+        work()
+    start = wait(device)
+    for _ in range(repeats):
+        work()
+    return (wait(device) - start) / repeats
+
+
+def speed(options: argparse.Namespace, out: Path) -> None:
+    """Environment steps per second with random actions."""
+    for envs in options.envs:
+        for task in options.tasks:
+            for sense in options.senses:
+                if task == "hot_ball" and envs > 2048:
+                    continue
+                try:
+                    put(out, one_speed(task, sense, envs, options))
+                except (RuntimeError, ValueError) as error:
+                    put(out, {"part": "speed", "task": task, "sense": sense, "envs": envs, "error": str(error)[:300]})
+                if options.device != "cpu":
+                    torch.cuda.empty_cache()
+
+
+def one_speed(task: str, sense: str, envs: int, options: argparse.Namespace) -> dict[str, Any]:
+    start = time.perf_counter()
+    observe = "none" if sense == "none" else "force_torque"
+    env = tasks.make(
+        task, num_envs=envs, device=options.device, observe=observe, placement="hand", resolution="med",
+        graphs=False if options.eager else None,
+    )  # fmt: skip
+    actions = torch.randn(8, envs, env.num_actions, device=env.device)
+    look = front_end(sense, env)
+    count = 0
+
+    def step() -> None:
+        nonlocal count
+        observations, *_ = env.step(actions[count % 8])
+        count += 1
+        if look is not None:
+            look(observations["tactile"])
+
+    with torch.inference_mode():
+        step()
+        made = wait(env.device) - start
+        seconds = per_call(step, env.device, repeats=options.repeats)
+    row = {"part": "speed", "task": task, "sense": sense, "envs": envs, "device": options.device, "made_s": made}
+    row |= {"graphs": env.recorded, "step_ms": 1e3 * seconds, "env_steps_per_s": envs / seconds}
+    if env.device.type == "cuda":
+        row["memory_gb"] = torch.cuda.max_memory_allocated(env.device) / 2**30
+    return row
+
+
+def front_end(sense: str, env: Env) -> Callable[[torch.Tensor], None] | None:
+    """Return one streaming step of an encoder on the group ``tactile``."""
+    if sense not in ENCODERS:
+        return None
+    from robotics_bridge.policies.encoders.front_end import FrontEnd
+    from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+
+    assert env.tactile is not None
+    module = FrontEnd(ENCODERS[sense], TaxelGrid(env.hand, placement="hand", resolution="med")).to(env.device).eval()
+    state = module.init_state(env.num_envs).to(env.device)
+
+    def look(reading: torch.Tensor) -> None:
+        nonlocal state
+        with torch.autocast(env.device.type, dtype=torch.bfloat16):
+            _, state = module(reading, state)
+
+    return look
+
+
+def split(options: argparse.Namespace, out: Path) -> None:
+    """A PPO iteration: physics, touch, the rest of the environment, acting, learning."""
+    for envs in options.envs:
+        task = tasks.load("in_palm_rotate")
+        env = tasks.make(
+            task, num_envs=envs, device=options.device, observe="force_torque", graphs=False if options.eager else None
+        )
+        trainer = teacher.Trainer(env, replace(task.teacher, num_envs=envs))
+        rows = [trainer.iterate() for _ in range(3)][1:]
+        steps = trainer.settings.steps_per_env
+        actions = torch.randn(envs, env.num_actions, device=env.device)
+
+        def physics(env: Env = env) -> None:
+            for substep in range(env.decimation):
+                env.drives.launch(substep)
+                env.world.step()
+
+        def touch(env: Env = env) -> None:
+            for substep in range(env.decimation):
+                env.touch.update(env.world.state, env.physics_dt, substep)  # type: ignore[union-attr]
+
+        observations = trainer.env.get_observations()
+        with torch.inference_mode():
+            whole = per_call(lambda env=env, a=actions: env.step(a), env.device, repeats=options.repeats)
+            parts = {
+                "physics_ms": per_call(physics, env.device, repeats=options.repeats),
+                "touch_ms": per_call(touch, env.device, repeats=options.repeats),
+                "policy_ms": per_call(
+                    lambda t=trainer, o=observations: t.algorithm.actor(o, stochastic_output=True), env.device,
+                    repeats=options.repeats,
+                ),
+            }  # fmt: skip
+        row = {"part": "split", "envs": envs, "device": options.device, "graphs": env.recorded}
+        row["env_step_ms"] = 1e3 * whole
+        row |= {name: 1e3 * value for name, value in parts.items()}
+        row["rest_ms"] = row["env_step_ms"] - row["physics_ms"] - row["touch_ms"]
+        row |= {"iteration_s": sum(r["collect_s"] + r["learn_s"] for r in rows) / len(rows)}
+        row |= {"update_s": sum(r["learn_s"] for r in rows) / len(rows), "steps_per_iteration": steps}
+        put(out, row)
+
+
+FELT = {
+    "none": {"observe": "none"},
+    "tips": {"observe": "force_torque", "placement": "tips"},
+    "hand": {"observe": "force_torque", "placement": "hand"},
+    "ead": {"observe": "force_torque", "placement": "hand", "encoder": "zhuang-intersection-ln-small"},
+}
+
+
+def student(options: argparse.Namespace, out: Path) -> None:
+    """An iteration of a student: acting and learning, for what it feels, in single and mixed precision."""
+    envs, task = options.envs[-1], tasks.load(options.tasks[0], options.config)
+    worlds: dict[tuple[str, str], Env] = {}
+    for felt in options.felt:
+        place = FELT[felt]["observe"], FELT[felt].get("placement", "hand")
+        if place not in worlds:
+            worlds.clear()
+            worlds[place] = tasks.make(
+                task, num_envs=envs, device=options.device, observe=place[0], placement=place[1]
+            )  # fmt: skip
+        for precision in ("float32",) if felt == "none" or options.device == "cpu" else ("float32", "bf16"):
+            for graphs in (True, False) if precision == "float32" else (True,):
+                try:
+                    put(out, one_student(felt, worlds[place], options, precision=precision, graphs=graphs))
+                except RuntimeError as error:
+                    put(out, {"part": "student", "felt": felt, "precision": precision, "error": str(error)[:300]})
+
+
+def one_student(felt: str, env: Env, options: argparse.Namespace, *, precision: str, graphs: bool) -> dict[str, Any]:
+    from robotics_bridge.policies.training.distill import _Run
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+
+    settings: dict[str, Any] = FELT[felt]
+    config = DistillConfig(task=env.task.name, num_envs=env.num_envs, precision=precision, **settings)
+    known = teacher.Trainer(env, env.task.teacher).policy()
+    found = []
+    torch.set_float32_matmul_precision("high")
+    with tempfile.TemporaryDirectory() as folder:
+        run = _Run(config.resolved(env.task.student), Path(folder), env, known, graphs=graphs)
+        for _ in range(options.repeats):
+            begun = wait(env.device)
+            rollout = run._act(0.0)
+            acted = wait(env.device)
+            losses = run._learn(rollout)
+            found.append((acted - begun, wait(env.device) - acted))
+        run.log.close()
+        if felt == options.profile and not graphs:
+            profiled(lambda: run._learn(rollout), options.device)
+            profiled(lambda: run._act(0.0), options.device)
+    acting, learning = (min(item[part] for item in found[1:]) for part in range(2))
+    row = {"part": "student", "felt": felt, "precision": precision, "graphs": graphs, "envs": env.num_envs}
+    row |= {"device": options.device, "acting_s": acting, "learning_s": learning, "iteration_s": acting + learning}
+    row |= {"loss": losses["behaviour"]}
+    if env.device.type == "cuda":
+        row["memory_gb"] = torch.cuda.max_memory_allocated(env.device) / 2**30
+        torch.cuda.reset_peak_memory_stats(env.device)
+        torch.cuda.empty_cache()
+    return row
+
+
+def profiled(work: Callable[[], Any], device: str) -> None:
+    """Print what a piece of work spends its time on."""
+    from torch.profiler import ProfilerActivity, profile
+
+    kinds = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device != "cpu" else [])]
+    with profile(activities=kinds) as found:
+        work()
+    by = "self_cuda_time_total" if device != "cpu" else "self_cpu_time_total"
+    print(found.key_averages().table(sort_by=by, row_limit=24, max_name_column_width=70), flush=True)
+
+
+def train(options: argparse.Namespace, out: Path) -> None:
+    """Train a teacher for some minutes, then hold it against zero and random."""
+    (name,) = options.tasks[:1]
+    envs = options.envs[-1]
+    task = changed(tasks.load(name, options.config), options.change)
+    run = out / f"teacher-{name}"
+    if options.resume and not run.exists():
+        shutil.copytree(options.resume, run)
+    env = tasks.make(task, num_envs=envs, device=options.device, seed=options.seed)
+    put(out, {"part": "teacher", "task": name, "config": options.config, "changes": options.change})
+    began = time.perf_counter()
+
+    def tell(iteration: int, _total: int, _word: str) -> None:
+        if iteration % 10 == 0:
+            with (run / "log.jsonl").open(encoding="utf-8") as file:
+                row = json.loads(file.readlines()[-1])
+            kept = ("iteration", "steps", "reward", "curiosity", "std", "threshold", "learning_rate", "collect_s")
+            kept += ("learn_s", "episode/return", "episode/success")
+            kept += ("episode/metric", "episode/length", "episode/diverged")
+            put(
+                out, {"part": "teacher", "task": name, "s": time.perf_counter() - began} | {k: row.get(k) for k in kept}
+            )
+
+    settings = replace(task.teacher, num_envs=envs)
+    result = teacher.train(
+        env, run, iterations=options.iterations, minutes=options.minutes, settings=settings, seed=options.seed,
+        save_every=50, keep_env=envs <= 256, start=options.start, start_std=options.start_std, progress=tell,
+    )  # fmt: skip
+    put(out, {"part": "teacher", "task": name, "iterations": result.iterations, "control_steps": result.steps})
+    kept = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
+    for path in kept[:-2]:
+        path.unlink()
+    if not options.episodes:
+        return
+    env = tasks.make(task, num_envs=min(envs, 512), device=options.device, seed=options.seed + 1)
+    for who, act in (
+        ("teacher", teacher.load_teacher(run, env)), ("zero", agent("zero", env)), ("random", agent("random", env)),
+    ):  # fmt: skip
+        found = evaluate(env, act, episodes=options.episodes, seed=(0, 1, 2), name=who)
+        put(out, {"part": "evaluation", "control_steps": result.steps} | found.summary())
+
+
+def tables(options: argparse.Namespace, out: Path) -> None:
+    """Print tables of the rows in a folder; ``--write`` puts them into RESULTS.md."""
+    rows = [json.loads(line) for line in (out / "policy.jsonl").read_text(encoding="utf-8").splitlines()]
+    speeds = [r for r in rows if r["part"] == "speed" and "error" not in r]
+    base = {(r["task"], r["envs"]): r["env_steps_per_s"] for r in speeds if r["sense"] == "none"}
+    parts = []
+    if speeds:
+        lines = []
+        for r in speeds:
+            against = base.get((r["task"], r["envs"]))
+            cost = "" if against is None else f"{100 * (1 - r['env_steps_per_s'] / against):.0f} %"
+            rate, took = f"{r['env_steps_per_s']:,.0f}", f"{r['step_ms']:.2f}"
+            lines.append([r["task"], r["sense"], str(r["envs"]), rate, took, cost])
+        parts.append(table(["task", "sense", "environments", "control steps/s", "ms", "slower by"], lines))
+    shown = ("envs", "physics_ms", "touch_ms", "rest_ms", "policy_ms", "update_s", "iteration_s")
+    splits = [[f"{r[k]:.3g}" for k in shown] for r in rows if r["part"] == "split"]
+    if splits:
+        parts.append(table([name.replace("_", " ") for name in shown], splits))
+    columns = ("felt", "precision", "graphs", "acting_s", "learning_s", "iteration_s", "memory_gb")
+    learned = [
+        [f"{r[k]:.3g}" if isinstance(r.get(k), float) else str(r.get(k, "")) for k in columns]
+        for r in rows
+        if r["part"] == "student" and "error" not in r
+    ]
+    if learned:
+        parts.append(table([name.replace("_", " ") for name in columns], learned))
+    found = []
+    for r in (row for row in rows if row["part"] == "evaluation"):
+        interval = "{:.3f}–{:.3f}".format(*r["success_interval"])
+        value = f"{r['returns']:.3g} ± {r['returns_half_width']:.2g}"
+        line = [r["task"], r["agent"], f"{r.get('control_steps', 0):,}", str(r["episodes"])]
+        found.append([*line, f"{r['success_rate']:.3f}", interval, f"{r['metric']:.3g}", value])
+    if found:
+        columns = ["task", "agent", "control steps", "episodes", "success", "95 %", "metric", "return"]
+        parts.append(table(columns, found))
+    body = "\n\n".join(parts)
+    print(body)
+    if options.write:
+        devices = sorted({r["device"] for r in rows if "device" in r})
+        title = f"Dexterous tasks: speed and teachers ({', '.join(devices) or 'processors'})"
+        write_section(title, f"python -m benchmarks.policies.tasks --device {options.device}", body, subject="policies")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", choices=["speed", "split", "student", "teacher", "tables"], required=True)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--out", type=Path, default=Path("policy-bench"))
+    parser.add_argument("--tasks", nargs="+", default=["in_palm_rotate", "in_hand_repose", "screwdriver"])
+    parser.add_argument("--senses", nargs="+", default=["none", "force_torque"], choices=SENSES)
+    parser.add_argument("--envs", nargs="+", type=int, default=None)
+    parser.add_argument("--eager", action="store_true", help="speed and split without CUDA graphs")
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--felt", nargs="+", default=list(FELT), choices=list(FELT), help="of students")
+    parser.add_argument("--profile", choices=list(FELT), help="also print what this student's time goes into")
+    parser.add_argument("--minutes", type=float, default=7.5)
+    parser.add_argument("--iterations", type=int, default=1_000_000)
+    parser.add_argument("--episodes", type=int, default=512, help="per seed; 0 does not evaluate")
+    parser.add_argument("--config", default="default")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--resume", type=Path, help="folder teacher-<task> of an earlier machine")
+    parser.add_argument("--start", type=Path, help="another run or model, whose networks a new teacher begins with")
+    parser.add_argument("--start-std", type=float, help="standard deviation of its actions to begin with")
+    parser.add_argument("--change", nargs="*", default=[], help="name=value, see robotics_bridge.tasks.overrides")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    options.envs = options.envs or ([1024, 8192] if options.device != "cpu" else [16, 64])
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.device == "cpu":
+        torch.set_num_threads(1)
+    {"speed": speed, "split": split, "student": student, "teacher": train, "tables": tables}[options.part](
+        options, options.out
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Keep measured results, one JSON file a section, and write RESULTS.md from all of them.
+
+``python -m benchmarks.report`` writes the page anew. A section says its subject, the command that made it, the date,
+the
+machine, and a body in Markdown.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.files import read_json, write_json, write_text
+
+FOLDER = Path(__file__).parent / "results"
+PAGE = Path(__file__).with_name("RESULTS.md")
+SUBJECTS = {
+    "commands": "Commands",
+    "whiskers": "Whisker simulation",
+    "models": "Networks and training",
+    "scores": "Scores and statistics",
+    "leaderboards": "Leaderboards",
+    "tactile": "Tactile simulation",
+    "policies": "Tasks, policies and deployment",
+}
+HEAD = (
+    "# Measured results\n\n"
+    "Every figure stands with the command that made it, the date and the machine. This page is written by "
+    "`python -m benchmarks.report` from `benchmarks/results/*.json`; commands run in the repository's root.\n"
+)
+
+
+@dataclass(frozen=True)
+class Section:
+    """One measured result."""
+
+    title: str
+    subject: str
+    """One of :data:`SUBJECTS`."""
+    command: str
+    """What made it; empty where the body names several."""
+    date: str
+    """Day of the measurement, ``YYYY-MM-DD``."""
+    where: str
+    """Machine and its load; empty for the machine on which CI runs."""
+    body: str
+    """Markdown without a heading."""
+
+    @property
+    def path(self) -> Path:
+        """File of the section, named by its title."""
+        return FOLDER / (re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")[:60].strip("-") + ".json")
+
+
+def write_section(title: str, command: str, body: str, *, subject: str, where: str = "") -> None:
+    """Replace or add a section, and write the page anew.
+
+    Args:
+        title: heading, which names the section.
+        command: what made it.
+        body: Markdown without a heading.
+        subject: one of :data:`SUBJECTS`.
+        where: what measured it, if not this machine.
+    """
+    if subject not in SUBJECTS:
+        raise unknown_name("subject", subject, SUBJECTS)
+    machine = f"{platform.machine()}, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f} at the end"
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    section = Section(title, subject, command, today, where or machine, body.strip())
+    write_json(section.path, asdict(section))
+    write_page()
+
+
+def read_sections() -> list[Section]:
+    """Return all sections, by subject and then by title."""
+    sections = [Section(**read_json(path)) for path in sorted(FOLDER.glob("*.json"))]
+    for section in sections:
+        if section.subject not in SUBJECTS:
+            raise UsageError(f"{section.path.name} has the subject {section.subject!r}; allowed: {list(SUBJECTS)}.")
+    return sorted(sections, key=lambda section: (list(SUBJECTS).index(section.subject), section.title))
+
+
+def page(sections: list[Section]) -> str:
+    """Return the page: a heading a subject, a heading a section, and how each was measured."""
+    parts = [HEAD]
+    for subject, heading in SUBJECTS.items():
+        parts.append(f"## {heading}\n")
+        for section in (item for item in sections if item.subject == subject):
+            made = f"`{section.command}` — " if section.command else ""
+            where = section.where or "2 cores (AMD EPYC), 24 GiB, Python 3.11, torch 2.13 (CPU)"
+            body = re.sub(r"^(#{2,4} )", r"#\1", section.body, flags=re.MULTILINE)
+            parts.append(f"### {section.title}\n\n{made}{section.date}, {where}.\n\n{body}\n")
+    return "\n".join(parts)
+
+
+def write_page() -> None:
+    """Write RESULTS.md from the sections."""
+    write_text(PAGE, page(read_sections()))
+
+
+def table(columns: list[str], rows: list[list[str]]) -> str:
+    """Lay out a Markdown table."""
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+if __name__ == "__main__":
+    write_page()

@@ -1,0 +1,368 @@
+"""Speed and memory of the metrics beside rsatoolbox 0.3.2, same definitions, one run.
+
+    python -m benchmarks.scores.metrics [--large] [--write]
+    python -m benchmarks.scores.metrics --parity [--write]
+    python -m benchmarks.scores.metrics --device cuda [--write]
+
+``--large`` adds the RDM of 2,000 stimuli and 100,000 units; ``--device`` times instead what a torch device
+computes beside numpy, with the largest difference; ``--parity`` compares every method and comparison with
+rsatoolbox on balanced data; ``--write`` puts the tables into RESULTS.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+
+from benchmarks.report import table, write_section
+from brainbench.metrics import (
+    TrialBlock,
+    bootstrap_ceiling,
+    bootstrap_comparisons,
+    compare_models,
+    noise_precision,
+    permutation_test,
+    rdm,
+    score_animals,
+    score_rdms,
+    subject_rdm,
+)
+
+STIMULI = [f"s{k}" for k in range(6)]
+
+
+def median_seconds(job: Callable[[], object], repeats: int) -> float:
+    """Return the median wall time of several runs after one that warms up."""
+    job()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        job()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def rsatoolbox_rows() -> list[list[str]]:
+    """Time both libraries on the same numbers, and measure how far they differ."""
+    import tqdm
+    from rsatoolbox.data import Dataset
+    from rsatoolbox.data.noise import prec_from_unbalanced
+    from rsatoolbox.inference.bootstrap import bootstrap_sample_rdm
+    from rsatoolbox.inference.evaluate import eval_bootstrap_rdm
+    from rsatoolbox.inference.noise_ceiling import boot_noise_ceiling
+    from rsatoolbox.model import ModelFixed
+    from rsatoolbox.rdm import RDMs, calc_rdm
+
+    tqdm.trange = lambda n, **_: range(n)
+    rng = np.random.default_rng(0)
+    rows = []
+
+    def add(what: str, theirs: Callable[[], object], ours: Callable[[], object], goal: str, difference: str) -> None:
+        slow, fast = median_seconds(theirs, 1), median_seconds(ours, 15)
+        rows.append([what, f"{slow * 1e3:.3g}", f"{fast * 1e3:.3g}", f"{slow / fast:.0f}×", goal, difference])
+
+    brain = np.stack([rdm(rng.normal(size=(6, 12))) for _ in range(11)])
+    models = np.stack([rdm(rng.normal(size=(6, 12))) for _ in range(10)])
+    animals = RDMs(brain, rdm_descriptors={"index": np.arange(11)})
+    fixed = [ModelFixed(str(i), RDMs(model[None])) for i, model in enumerate(models)]
+    for ours, theirs in (("pearson", "corr"), ("rho-a", "rho-a")):
+
+        def their_ceilings(method: str = theirs) -> None:
+            for _ in range(1000):
+                boot_noise_ceiling(bootstrap_sample_rdm(animals)[0], method=method, rdm_descriptor="index")
+
+        plain = np.abs(np.subtract(boot_noise_ceiling(animals, method=theirs), _ceiling(brain, ours))).max()
+        add(
+            f"1,000 ceiling bootstraps, 11 animals, {ours}",
+            their_ceilings,
+            lambda m=ours: bootstrap_ceiling(brain, method=m),
+            "50×",
+            f"{plain:.0e}",
+        )
+        theirs_mean = eval_bootstrap_rdm(fixed, animals, method=theirs, N=1000, boot_noise_ceil=False).evaluations
+        ours_mean = bootstrap_comparisons(models, brain, method=ours)
+        error = np.abs(theirs_mean.mean(axis=0) - ours_mean.mean(axis=0)).max()
+        add(
+            f"1,000 bootstrap evaluations of 10 models, {ours}",
+            lambda m=theirs: eval_bootstrap_rdm(fixed, animals, method=m, N=1000, boot_noise_ceil=False),
+            lambda m=ours: bootstrap_comparisons(models, brain, method=m),
+            "50×",
+            f"{error:.0e} (random draws)",
+        )
+    responses, labels = rng.normal(size=(600, 999)), np.repeat(np.arange(6), 100)
+    precision = noise_precision(responses, labels)
+    for count in (2, 5, 10):
+        folds = np.tile(np.arange(count), 600 // count)
+        data = Dataset(responses, obs_descriptors={"stimulus": labels, "fold": folds})
+        for name, weight in (("", None), (", full precision given", precision)):
+
+            def theirs_crossnobis(data: Dataset = data, weight: object = weight) -> np.ndarray:
+                found = calc_rdm(data, method="crossnobis", descriptor="stimulus", cv_descriptor="fold", noise=weight)
+                return found.dissimilarities[0]
+
+            def ours_crossnobis(folds: np.ndarray = folds, weight: np.ndarray | None = weight) -> np.ndarray:
+                return rdm(responses, labels, method="crossnobis", folds=folds, precision=weight)
+
+            error = np.abs(theirs_crossnobis() - ours_crossnobis()).max()
+            what = f"crossnobis, 999 units × 600 trials, {count} folds{name}"
+            add(what, theirs_crossnobis, ours_crossnobis, "20×" if weight is None else "", f"{error:.0e}")
+    # A full covariance needs more trials than units, whoever inverts it.
+    for units, method in ((999, "diag"), (999, "shrinkage_diag"), (999, "shrinkage_eye"), (300, "full")):
+        part, folds = responses[:, :units], np.tile(np.arange(5), 120)
+        data = Dataset(part, obs_descriptors={"stimulus": labels, "fold": folds})
+
+        def theirs_from_trials(data: Dataset = data, method: str = method) -> np.ndarray:
+            noise = prec_from_unbalanced(data, "stimulus", method=method)
+            found = calc_rdm(data, method="crossnobis", descriptor="stimulus", cv_descriptor="fold", noise=noise)
+            return found.dissimilarities[0]
+
+        def ours_from_trials(part: np.ndarray = part, folds: np.ndarray = folds, method: str = method) -> np.ndarray:
+            return rdm(part, labels, method="crossnobis", folds=folds, precision=method)
+
+        error = np.abs(theirs_from_trials() - ours_from_trials()).max()
+        what = f"crossnobis with {method} noise of its trials, {units} units × 600 trials, 5 folds"
+        add(what, theirs_from_trials, ours_from_trials, "20×" if units == 999 else "", f"{error:.0e}")
+    data = Dataset(responses, obs_descriptors={"stimulus": labels})
+    error = np.abs(prec_from_unbalanced(data, "stimulus", method="shrinkage_diag") - precision).max()
+    add(
+        "shrinkage precision, 999 units × 600 trials",
+        lambda: prec_from_unbalanced(data, "stimulus", method="shrinkage_diag"),
+        lambda: noise_precision(responses, labels),
+        "",
+        f"{error:.0e}",
+    )
+    return rows
+
+
+def _ceiling(brain: np.ndarray, method: str) -> tuple[float, float]:
+    from brainbench.metrics import noise_ceiling
+
+    return tuple(noise_ceiling(brain, method=method))
+
+
+def parity_rows() -> list[list[str]]:
+    """Measure how far every RDM method and comparison is from rsatoolbox on balanced data, in 20 draws."""
+    from rsatoolbox.data import Dataset
+    from rsatoolbox.data.noise import prec_from_unbalanced
+    from rsatoolbox.inference.noise_ceiling import boot_noise_ceiling
+    from rsatoolbox.rdm import RDMs, calc_rdm
+    from rsatoolbox.rdm import compare as their_compare
+
+    from brainbench.metrics import compare, noise_ceiling
+
+    methods = {
+        "correlation": "correlation",
+        "sqeuclidean": "euclidean",
+        "mahalanobis": "mahalanobis",
+        "crossnobis": "crossnobis",
+        "poisson": "poisson",
+    }
+    comparisons = {
+        "pearson": "corr",
+        "spearman": "spearman",
+        "rho-a": "rho-a",
+        "tau-a": "tau-a",
+        "tau-b": "kendall",
+        "cosine": "cosine",
+        "whitened-cosine": "cosine_cov",
+        "whitened-pearson": "corr_cov",
+    }
+    worst: dict[str, float] = {}
+
+    def note(what: str, theirs: object, ours: object) -> None:
+        theirs, ours = np.asarray(theirs), np.asarray(ours)
+        error = float((np.abs(theirs - ours) / np.maximum(1.0, np.abs(theirs))).max())
+        worst[what] = max(worst.get(what, 0.0), error)
+
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        labels, folds = np.repeat(np.arange(6), 20), np.tile(np.arange(5), 24)
+        trials = rng.gamma(2.0, 2.0, (6, 40))[labels] + rng.gamma(1.0, 1.0, (120, 40))
+        data = Dataset(trials, obs_descriptors={"stimulus": labels, "fold": folds})
+        for noise in ("shrinkage_diag", "shrinkage_eye", "diag", "full"):
+            theirs = prec_from_unbalanced(data, "stimulus", method=noise)
+            note(f"noise precision, {noise}", theirs, noise_precision(trials, labels, method=noise))
+        precision = noise_precision(trials, labels)
+        for ours, theirs in methods.items():
+            given = {"noise": precision} if ours in ("mahalanobis", "crossnobis") else {}
+            cross = {"cv_descriptor": "fold"} if ours == "crossnobis" else {}
+            found = calc_rdm(data, method=theirs, descriptor="stimulus", **given, **cross).dissimilarities[0]
+            weight = precision if given else None
+            note(
+                f"RDM, {ours}",
+                found,
+                rdm(trials, labels, method=ours, precision=weight, folds=folds if cross else None),
+            )
+        stack = np.stack([rdm(rng.normal(size=(6, 12))).round(2) for _ in range(7)])
+        for ours, theirs in comparisons.items():
+            pair = their_compare(RDMs(stack[:3]), RDMs(stack[3:]), method=theirs)
+            note(f"comparison, {ours}", pair, compare(stack[:3, None], stack[3:], method=ours))
+        animals = RDMs(stack, rdm_descriptors={"index": np.arange(7)})
+        for ours, theirs in (("pearson", "corr"), ("cosine", "cosine"), ("rho-a", "rho-a"), ("spearman", "spearman")):
+            bounds = boot_noise_ceiling(animals, method=theirs, rdm_descriptor="index")
+            note(f"noise ceiling, {ours}", bounds, tuple(noise_ceiling(stack, method=ours)))
+    return [[what, f"{error:.0e}"] for what, error in worst.items()]
+
+
+def make_animals(count: int = 11, units: int = 91, repeats: int = 60) -> list[TrialBlock]:
+    """Sessions of the size of the Rodgers recordings: 999 units over 11 animals."""
+    rng = np.random.default_rng(1)
+    latent = rng.normal(size=(6, 4))
+    labels = np.repeat(np.arange(6), repeats)
+    blocks = []
+    for animal in range(count):
+        means = latent @ rng.normal(size=(4, units))
+        responses = means[labels] + 4 * rng.normal(size=(len(labels), units))
+        blocks.append(TrialBlock(responses, labels, [f"{animal}/{i}" for i in range(len(labels))]))
+    return blocks
+
+
+class Stopwatch:
+    """Wall and processor seconds of what happens inside."""
+
+    def __enter__(self) -> Stopwatch:
+        self._start = time.perf_counter(), time.process_time()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.wall, self.processor = time.perf_counter() - self._start[0], time.process_time() - self._start[1]
+
+
+def score_rows() -> list[list[str]]:
+    """Time a whole score and sixty-four models on one brain side."""
+    rng = np.random.default_rng(2)
+    blocks = make_animals()
+    models = {f"m{j}": {f"l{i}": rdm(rng.normal(size=(6, 12))) for i in range(12)} for j in range(64)}
+    rows = []
+
+    def add(what: str, goal: str, *parts: Stopwatch) -> None:
+        rows.append([what, f"{sum(p.wall for p in parts):.2f}", f"{sum(p.processor for p in parts):.2f}", goal])
+
+    with Stopwatch() as brain:
+        subjects = [subject_rdm(f"a{i}", [block], 6, draws=1000, draw_splits=20) for i, block in enumerate(blocks)]
+    add("brain side: 11 animals, 1,000 splits, 1,000 draws × 20 splits", "", brain)
+    with Stopwatch() as one:
+        score = score_rdms(models["m0"], subjects, name="m0", stimuli=STIMULI)
+        between = score_animals(subjects, stimuli=STIMULI)
+    add("one model: 12 layers, 720 orders, bootstrap; animal to animal, 10,000 orders", "", one)
+    add("**full score**", "3", brain, one)
+    with Stopwatch() as many:
+        compare_models(models, subjects, stimuli=STIMULI)
+    add("**64 models, corrected and paired, with the brain side**", "60", brain, many)
+    errors = score.provenance["statistics"]["monte_carlo_error"]
+    print("Monte-Carlo errors:", {key: f"{value:.2g}" for key, value in errors.items()}, between.status)
+    return rows
+
+
+def large_row() -> list[str]:
+    """Time and measure the RDM of 2,000 stimuli and 100,000 units, float32."""
+    responses = np.empty((2000, 100_000), dtype=np.float32)
+    rng = np.random.default_rng(3)
+    for row in responses:
+        rng.standard_normal(out=row, dtype=np.float32)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with Stopwatch() as watch:
+        rdm(responses)
+    extra = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**20
+    what = "RDM of 2,000 stimuli × 100,000 units, float32"
+    return [what, f"{watch.wall:.1f}", f"{watch.processor:.1f}", f"{extra:.2f} GiB above the input (2)"]
+
+
+def device_rows(device: str) -> Iterator[list[str]]:
+    """Time numpy and a torch device on the same numbers, small jobs first; one row as soon as it is known."""
+    import torch
+
+    rng = np.random.default_rng(4)
+    trials, labels, folds = rng.normal(size=(600, 999)), np.repeat(np.arange(6), 100), np.tile(np.arange(5), 120)
+    crossnobis = partial(rdm, labels=labels, method="crossnobis", folds=folds)
+    shrunk = partial(crossnobis, precision="shrinkage_diag")
+
+    def row(what: str, plain: Callable[[], np.ndarray], *moved: Callable[[], np.ndarray]) -> list[str]:
+        with Stopwatch() as first:
+            expected = plain()
+        # A run of seconds needs no second one to be timed.
+        slow = first.wall if first.wall > 1 else median_seconds(plain, 3)
+        error = max(np.abs(expected - job()).max() for job in moved)
+        times = [median_seconds(job, 5) for job in moved]
+        cells = [f"{slow * 1e3:.3g}", *(f"{t * 1e3:.3g}" for t in times), *["–"] * (2 - len(times))]
+        return [what, *cells, f"{slow / min(times):.1f}×", f"{error:.0e}"]
+
+    def both(what: str, job: Callable[..., np.ndarray], given: np.ndarray) -> list[str]:
+        there = torch.from_numpy(given).to(device)
+        return row(what, partial(job, given), partial(job, given, device=device), partial(job, there))
+
+    def permutations(stimuli: int) -> list[str]:
+        brain = np.stack([rdm(rng.normal(size=(stimuli, 40))) for _ in range(11)])
+        model = brain.mean(axis=0) + rdm(rng.normal(size=(stimuli, 40)))
+
+        def null(device: str | None) -> np.ndarray:
+            return permutation_test(model, brain, device=device).null
+
+        return row(f"10,000 permutations of {stimuli} stimuli, 11 animals", partial(null, None), partial(null, device))
+
+    yield both("noise precision, 600 trials × 999", partial(noise_precision, labels=labels), trials)
+    yield both("crossnobis, 600 trials × 999", crossnobis, trials)
+    yield both("crossnobis, shrinkage_diag, 600 trials × 999", shrunk, trials)
+    yield permutations(50)
+    bins = rng.normal(size=(600, 22_000)).astype(np.float32)
+    yield both("crossnobis, shrinkage_diag, 600 trials × 22,000", shrunk, bins)
+    for stimuli, units in ((200, 2000), (2000, 20_000)):
+        wide = rng.normal(size=(stimuli, units)).astype(np.float32)
+        size = f"{stimuli:,} × {units:,} float32"
+        yield both(f"correlation, {size}", rdm, wide)
+        yield both(f"sqeuclidean, {size}", partial(rdm, method="sqeuclidean"), wide)
+        yield both(f"poisson, {size}", partial(rdm, method="poisson"), np.abs(wide))
+    yield permutations(200)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--large", action="store_true")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--parity", action="store_true")
+    parser.add_argument("--device")
+    options = parser.parse_args()
+    if options.parity:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            body = table(["quantity", "largest relative difference"], parity_rows())
+        print(body)
+        if options.write:
+            command = "python -m benchmarks.scores.metrics --parity --write"
+            write_section("Metrics: parity with rsatoolbox", command, body, subject="scores")
+        return
+    if options.device:
+        columns = ["job", "numpy ms", f"{options.device} ms", "already there ms", "ratio", "largest difference"]
+        print(table(columns, []), flush=True)
+        rows = []
+        for row in device_rows(options.device):
+            print(table(columns, [row]).splitlines()[-1], flush=True)
+            rows.append(row)
+        if options.write:
+            command = f"python -m benchmarks.scores.metrics --device {options.device} --write"
+            write_section(
+                f"Metrics on a torch device ({options.device})", command, table(columns, rows), subject="scores"
+            )
+        return
+    large = [large_row()] if options.large else []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        first = table(["job", "rsatoolbox ms", "ours ms", "ratio", "goal", "largest difference"], rsatoolbox_rows())
+    second = table(["job", "s", "processor s", "goal"], score_rows() + large)
+    body = f"{first}\n\n{second}"
+    print(body)
+    if options.write:
+        write_section(
+            "Metrics beside rsatoolbox", "python -m benchmarks.scores.metrics --large --write", body, subject="scores"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""The Rodgers stimuli on whiskers and on a hand: dissimilarities of the input and of an encoder's features.
+
+python -m benchmarks.tactile.hand_stimuli [--model zhuang-intersection-ln-small] [--write]
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.report import table, write_section
+from brainbench import load_model
+from brainbench.cli.stimuli.hand import objects_of
+from brainbench.metrics import compare, rdm
+from brainbench.stimuli import load_stimuli
+from brainbench.stimuli.stimulus_set import hash_stimulus_set
+from robotics_bridge.exploration.procedures import PROCEDURES
+from robotics_bridge.exploration.record import record_exploration
+
+PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-rdms.png"
+
+
+def hand_input(procedure: str) -> np.ndarray:
+    found = record_exploration(objects_of("rodgers", 0.055), [procedure])
+    dataset = found.dataset()
+    dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
+    return load_stimuli(dataset).input
+
+
+def views(name: str, stimuli: np.ndarray) -> dict[str, np.ndarray]:
+    """Normalised input and encoder features, over time and places."""
+    model, values = load_model(name), torch.from_numpy(stimuli)
+    with torch.no_grad():
+        shown = {"input": model.normaliser(values), "encoder": model.encode(values)}
+    return {row: value.flatten(1).numpy() for row, value in shown.items()}
+
+
+def draw(rdms: dict[tuple[str, str], np.ndarray], labels: list[str], columns: list[str], rows: list[str]) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(
+        len(rows), len(columns), figsize=(2.3 * len(columns) + 1.2, 2.3 * len(rows) + 0.6), layout="constrained"
+    )
+    upper = np.triu_indices(6, 1)
+    for row, axis_row in zip(rows, axes, strict=True):
+        for column, axis in zip(columns, axis_row, strict=True):
+            square = np.zeros((6, 6))
+            square[upper] = rdms[column, row]
+            square += square.T
+            axis.imshow(square / square.max(), cmap="magma", vmin=0, vmax=1)
+            axis.set_xticks([])
+            axis.set_yticks(
+                range(6) if column == columns[0] else [], labels if column == columns[0] else [], fontsize=7
+            )
+            if row == rows[0]:
+                axis.set_title(column, fontsize=8)
+            if column == columns[0]:
+                axis.set_ylabel(row, fontsize=8)
+    figure.savefig(PICTURE, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--model", default="zhuang-intersection-ln-small")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    whiskers = load_stimuli("rodgers", backend="rod")
+    inputs = {"whiskers": whiskers.input}
+    inputs |= {f"hand, {name.replace('_', ' ')}": hand_input(name) for name in PROCEDURES}
+    rows = ["input", "encoder"]
+    rdms = {}
+    for column, stimuli in inputs.items():
+        for row, values in views(options.model, stimuli).items():
+            rdms[column, row] = np.asarray(rdm(values))
+            print(column, row, rdms[column, row].round(3), flush=True)
+    lines = []
+    for column in list(inputs)[1:]:
+        found = [f"{float(compare(rdms[column, row], rdms['whiskers', row])):+.2f}" for row in rows]
+        lines.append([column, *found])
+        print(*lines[-1], flush=True)
+    draw(rdms, list(whiskers.labels), list(inputs), rows)
+    if options.write:
+        body = (
+            f"Six Rodgers stimuli (convex or concave, three distances), untrained `{options.model}`, all time steps, "
+            "1 − Pearson; Pearson of the hand's dissimilarities with the whiskers' (15 pairs: |r| < .45 is chance).\n\n"
+            + table(["stimuli", "input", "encoder"], lines)
+        )
+        write_section(
+            "Hand and whisker stimuli", "python -m benchmarks.tactile.hand_stimuli --write", body, subject="tactile"
+        )
+
+
+if __name__ == "__main__":
+    main()
