@@ -154,7 +154,7 @@ def main() -> None:
     with ProcessPoolExecutor(arguments.workers) as pool:
         results = dict(zip(subjects(), pool.map(partial(measure, backend=backend), subjects()), strict=True))
     text, broken = report(results)
-    title = "Whisker presets against mechanics" + ("" if backend == "mujoco" else f" ({backend})")
+    title = f"Whisker presets against mechanics ({backend})"
     write_section(title, f"python -m benchmarks.whiskers.validation --backend {backend}", text, subject="whiskers")
     print(text)
     raise SystemExit(bool(broken))
