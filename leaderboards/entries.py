@@ -18,8 +18,8 @@ from functools import cached_property
 
 from brainbench.core.files import content_hash
 from brainbench.core.records import Interval, ModelCard, Score, Status
+from brainbench.core.statistics import is_finite, t_interval
 from leaderboards import provenance
-from leaderboards.figures.marks import known
 from leaderboards.ranking import Board, RankedRecord, animals_of, rank_ranges
 from leaderboards.store import record_name
 
@@ -183,7 +183,7 @@ def _entry(
 
 def _interval(scores: Sequence[Score]) -> Interval | None:
     if len(scores) == 1:
-        return scores[0].interval if known(scores[0].interval) else None
+        return scores[0].interval if is_finite(scores[0].interval) else None
     animals: dict[str, list[float]] = defaultdict(list)
     for score in scores:
         for subject in score.subjects:
@@ -195,17 +195,10 @@ def _interval(scores: Sequence[Score]) -> Interval | None:
     seeds = [score.value for score in scores]
     if not all(map(math.isfinite, seeds)):
         return None
-    half = math.hypot(_half(means), _half(seeds))
+    half = math.hypot(*((span.high - span.low) / 2 for span in map(t_interval, (means, seeds)) if span))
     middle = _mean(seeds)
     text = f"t over {len(means)} animals and {len(scores)} seeds, added in squares"
     return Interval(middle - half, middle + half, 0.95, text)
-
-
-def _half(values: Sequence[float]) -> float:
-    """Return half the width of the 95 % t interval of a mean."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -17,14 +17,14 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.core.records import Interval, ResultRecord, Score
+from brainbench.core.statistics import is_finite, t_interval
 from leaderboards import provenance
-from leaderboards.figures.marks import known
 from leaderboards.store import record_name
 
 if TYPE_CHECKING:
@@ -147,17 +147,13 @@ def paired_difference(one: Score, other: Score, level: float = 0.95) -> tuple[fl
 
     None with fewer than :data:`PAIRED_ANIMALS` of them.
     """
-    from scipy.special import stdtrit
-
     first, second = ({item.subject: item.value for item in x.subjects if item.status == "ok"} for x in (one, other))
     difference = np.array([first[name] - second[name] for name in sorted(first.keys() & second.keys())])
     difference = difference[np.isfinite(difference)]
-    count = len(difference)
-    if count < PAIRED_ANIMALS:
+    interval = t_interval(difference, level, over="animals")
+    if interval is None or len(difference) < PAIRED_ANIMALS:
         return None
-    mean = float(difference.mean())
-    reach = float(stdtrit(count - 1, (1 + level) / 2) * difference.std(ddof=1) / math.sqrt(count))
-    return mean, Interval(mean - reach, mean + reach, level, f"paired t over {count} animals"), count
+    return float(difference.mean()), replace(interval, method=f"paired {interval.method}"), len(difference)
 
 
 def pairs_rule(animals: Sequence[Mapping[str, float]]) -> str:
@@ -178,6 +174,7 @@ def _compare_pairs(
 ) -> None:
     """Overwrite ``above`` [N, N] for the pairs that a paired test can compare."""
     from scipy.special import stdtr
+    from scipy.stats import false_discovery_control
 
     names = sorted({name for values in animals for name in values})
     table = np.array([[values.get(name, math.nan) for name in names] for values in animals]).reshape(len(animals), -1)
@@ -195,10 +192,12 @@ def _compare_pairs(
         p[i, tested] = 2 * stdtr(shared[tested] - 1.0, -t)
         higher[i, tested] = mean > 0
     known = np.isfinite(p)
-    values = np.sort(p[np.triu(known, 1)])
-    passed = np.flatnonzero(values <= FALSE_DISCOVERY_RATE * np.arange(1, len(values) + 1) / max(len(values), 1))
-    limit = values[passed[-1]] if len(passed) else -1.0
-    above[known] = ((p <= limit) & higher)[known]
+    pairs = np.triu(known, 1)
+    adjusted = np.ones_like(p)
+    if pairs.any():
+        adjusted[pairs] = false_discovery_control(p[pairs])
+    adjusted = np.minimum(adjusted, adjusted.T)
+    above[known] = ((adjusted <= FALSE_DISCOVERY_RATE) & higher)[known]
 
 
 def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
@@ -235,7 +234,7 @@ def _unranked(record: ResultRecord, comparable: bool) -> str:
     score = record.score
     if score.status != "ok":
         return score.status
-    if not known(score.interval):
+    if not is_finite(score.interval):
         return "no interval"
     return "" if comparable else "recordings not identified"
 

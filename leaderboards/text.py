@@ -9,8 +9,8 @@ from dataclasses import fields
 from typing import Any
 
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
-from leaderboards import provenance as _origin
-from leaderboards.figures.marks import known
+from brainbench.core.statistics import is_finite
+from leaderboards import provenance
 from leaderboards.ranking import PAIRED_ANIMALS, paired_difference
 
 STATUS = {
@@ -98,11 +98,11 @@ def comparisons(record: ResultRecord) -> list[str]:
     others = list(record.baselines.items())
     if record.animal_to_animal is not None:
         others.append(("animal-to-animal", record.animal_to_animal))
-    if score.status != "ok" or score.interval is None or not known(score.interval):
+    if score.status != "ok" or score.interval is None or not is_finite(score.interval):
         return []
     sentences = []
     for name, other in others:
-        if other.status != "ok" or other.interval is None or not known(other.interval):
+        if other.status != "ok" or other.interval is None or not is_finite(other.interval):
             reason = "has no interval" if other.status == "ok" else f"is {other.status}"
             sentences.append(f"Cannot be compared with {name}, which {reason}.")
         elif (paired := paired_difference(score, other)) is not None:
@@ -127,14 +127,14 @@ def methods(record: ResultRecord) -> str:
     """Return a paragraph for a paper's methods section, made only of what the record states."""
     score = record.score
     text = (
-        f"The model {score.name} was compared with {_origin.recordings_name(score)} "
+        f"The model {score.name} was compared with {provenance.recordings_name(score)} "
         f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
         "by representational similarity analysis"
     )
     text += f" ({score.metric})" if score.metric else ""
     text += f", with noise correction by the estimator '{score.estimator}'."
-    if _origin.time_rule(score):
-        text += f" Time axis: {_origin.time_rule(score)}."
+    if provenance.time_rule(score):
+        text += f" Time axis: {provenance.time_rule(score)}."
     if score.layer_rule:
         text += f" Layer: {score.layer_rule}."
     if score.interval:
@@ -176,7 +176,7 @@ def loading(record: ResultRecord) -> str:
     if card is None or card.family in ("features computed elsewhere", ""):
         return f"# {name}: activations that were computed elsewhere; the record names no model to load."
     if card.family == "user module":
-        path = _origin.settings(record.score).get("model")
+        path = provenance.settings(record.score).get("model")
         shown = path if isinstance(path, str) else name
         made = f"model = load_user_model({shown!r}, seed={card.seed or 0})"
         return f"from brainbench.models.user_models import load_user_model\n\n{made}"

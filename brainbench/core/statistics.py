@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -70,6 +71,11 @@ def newcombe_interval(
     low = math.hypot(share - one.low, two.high - other)
     high = math.hypot(one.high - share, other - two.low)
     return Interval(share - other - low, share - other + high, level, f"Newcombe over {over}")
+
+
+def is_finite(interval: Interval | None) -> TypeGuard[Interval]:
+    """Return whether there is an interval and both its ends are numbers."""
+    return interval is not None and math.isfinite(interval.low) and math.isfinite(interval.high)
 
 
 def check_level(level: float) -> None:

@@ -10,8 +10,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from brainbench.core.records import Interval
+from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry, twins
-from leaderboards.figures.marks import known
 from leaderboards.figures.plots import (
     SHOWN,
     WIDTH,
@@ -62,7 +62,7 @@ def fit_per_model(board: Board, entries: Sequence[Entry]) -> Figure:
     scale = score_scale(values, intervals, 250, WIDTH - 20)
     drawing = Drawing(WIDTH, 44 + 19 * (len(rows) + len(base)), f"{title}: {len(rows)} models, best first")
     draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
-    animals = next((b.score for b in base if b.kind == "animals" and known(b.score.interval)), None)
+    animals = next((b.score for b in base if b.kind == "animals" and is_finite(b.score.interval)), None)
     draw_band(drawing, scale, animals.interval if animals else None, 30, drawing.height - 8)
     colour = colours(entry.card.objective or "not stated" for entry in rows)
     y = 44.0
@@ -292,7 +292,7 @@ def layers_of(entry: Entry) -> Drawing | None:
         return None
     values = [layer.value for row in entry.rows for layer in row.record.score.layers]
     intervals = [layer.interval for layer in layers] if entry.seeds == 1 else []
-    ends = [end for i in intervals if i and known(i) for end in (i.low, i.high)]
+    ends = [end for i in intervals if i and is_finite(i) for end in (i.low, i.high)]
     scale = score_scale(values, [Interval(min(ends), max(ends))] if ends else [], 132, 470)
     drawing = Drawing(490, 44 + 20 * len(layers), f"Score of {len(layers)} layers of {entry.name}")
     draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected score")

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from brainbench.core.records import Interval, Score
+from brainbench.core.statistics import is_finite
 
 MARGIN = 4.0
 """Percent of the cell kept free on each side, so that marks at the ends are not cut."""
@@ -56,7 +57,7 @@ class Axis:
 
     def mark(self, value: float, interval: Interval | None = None, points: Sequence[float] = ()) -> Mark:
         """Place a value with its interval and the single observations behind it; NaN is not drawn."""
-        span = (interval.low, interval.high) if interval and known(interval) else None
+        span = (interval.low, interval.high) if interval and is_finite(interval) else None
         seen = [item for item in (value, *(span or ()), *points) if math.isfinite(item)]
         return Mark(
             x=self.at(value) if self.low <= value <= self.high else None,
@@ -66,11 +67,6 @@ class Axis:
             more_left=any(item < self.low for item in seen),
             more_right=any(item > self.high for item in seen),
         )
-
-
-def known(interval: Interval | None) -> bool:
-    """Tell whether there is an interval and both its ends are numbers."""
-    return interval is not None and math.isfinite(interval.low) and math.isfinite(interval.high)
 
 
 def axis_of(values: Iterable[float]) -> Axis:
@@ -88,7 +84,7 @@ def score_axis(scores: Iterable[Score]) -> Axis:
     values: list[float] = []
     for score in scores:
         values.append(score.value)
-        if score.status == "ok" and score.interval and known(score.interval):
+        if score.status == "ok" and score.interval and is_finite(score.interval):
             values += [score.interval.low, score.interval.high]
     return axis_of(values)
 

@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+import numpy as np
+
 from brainbench.core.records import Interval
+from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry, twins
-from leaderboards.figures.marks import colour_at, known
+from leaderboards.figures.marks import colour_at
 from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, tick_text
 from leaderboards.text import number, span
 
@@ -37,19 +40,16 @@ def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, fl
 
     r is NaN when either variable is constant.
     """
-    n = len(x)
-    mx, my = math.fsum(x) / n, math.fsum(y) / n
-    sxx = math.fsum((a - mx) ** 2 for a in x)
-    syy = math.fsum((b - my) ** 2 for b in y)
-    sxy = math.fsum((a - mx) * (b - my) for a, b in zip(x, y, strict=True))
-    if sxx == 0 or syy == 0:
+    from scipy.stats import linregress, pearsonr
+
+    if min(x) == max(x) or min(y) == max(y):
         return math.nan, math.nan, math.nan, None
-    r = max(-1.0, min(1.0, sxy / math.sqrt(sxx * syy)))
+    slope, start, r = np.array(linregress(x, y))[:3].tolist()
     interval = None
-    if n > 3 and abs(r) < 1:
-        half = 1.959964 / math.sqrt(n - 3)
-        interval = Interval(math.tanh(math.atanh(r) - half), math.tanh(math.atanh(r) + half), 0.95, "Fisher's z")
-    return sxy / sxx, my - sxy / sxx * mx, r, interval
+    if len(x) > 3 and abs(r) < 1:
+        ends = pearsonr(x, y).confidence_interval(0.95)
+        interval = Interval(float(ends.low), float(ends.high), 0.95, "Fisher's z")
+    return slope, start, r, interval
 
 
 def scatter(
@@ -201,7 +201,7 @@ def draw_matrix(
 
 def score_scale(values: Sequence[float], intervals: Sequence[Interval | None], start: float, end: float) -> Scale:
     """Return an axis from 0 to 1 that widens for values, and for interval ends as far as −1 and 1.5."""
-    ends = [end_ for i in intervals if i and known(i) for end_ in (i.low, i.high)]
+    ends = [end_ for i in intervals if i and is_finite(i) for end_ in (i.low, i.high)]
     finite = [value for value in (*values, *ends) if math.isfinite(value)]
     low, high = max(min([0.0, *finite]), -1.0), min(max([1.0, *finite]), 1.5)
     return Scale(low, high + 0.02, start, end)
@@ -217,7 +217,7 @@ def draw_axis(drawing: Drawing, scale: Scale, top: float, bottom: float, label: 
 
 def draw_band(drawing: Drawing, scale: Scale, interval: Interval | None, top: float, bottom: float) -> None:
     """Draw an interval as a band over the whole height."""
-    if interval is not None and known(interval):
+    if interval is not None and is_finite(interval):
         drawing.rect(
             scale.at(interval.low), top, scale.at(interval.high) - scale.at(interval.low), bottom - top, "band"
         )
@@ -225,7 +225,7 @@ def draw_band(drawing: Drawing, scale: Scale, interval: Interval | None, top: fl
 
 def draw_interval(drawing: Drawing, scale: Scale, interval: Interval | None, y: float, kind: str) -> None:
     """Draw an interval as a line with its ends."""
-    if interval is not None and known(interval):
+    if interval is not None and is_finite(interval):
         drawing.line(scale.at(interval.low), y, scale.at(interval.high), y, f"span {kind}")
 
 

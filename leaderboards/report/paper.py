@@ -16,7 +16,7 @@ from brainbench.core.errors import DataError, unknown_name
 from brainbench.core.files import write_text
 from brainbench.core.records import ResultRecord
 from leaderboards import provenance
-from leaderboards import text as _words
+from leaderboards import text as words
 from leaderboards.entries import Entry, entries_of
 from leaderboards.figures.architecture import diagram
 from leaderboards.figures.charts import Figure, board_figures, layers_of
@@ -128,14 +128,14 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     """Return a paragraph for a paper's methods section, made only of what the records state."""
     score = max(entries, key=lambda entry: len(entry.score.layers)).score
     if len(board.rows) == 1:
-        return _words.methods(board.rows[0].record)
+        return words.methods(board.rows[0].record)
     seeds = max(entry.seeds for entry in entries)
     versions = sorted({version for row in board.rows if (version := provenance.version(row.record.score))})
     settings = provenance.settings(score)
     text = (
-        f"{_words.plural(len(entries), 'model')} ({_words.plural(len(board.rows), 'record')}) were compared with "
-        f"{board.recordings} ({_words.plural(len(score.subjects), 'animal')}, "
-        f"{_words.plural(len(board.conditions), 'stimulus', 'stimuli')})"
+        f"{words.plural(len(entries), 'model')} ({words.plural(len(board.rows), 'record')}) were compared with "
+        f"{board.recordings} ({words.plural(len(score.subjects), 'animal')}, "
+        f"{words.plural(len(board.conditions), 'stimulus', 'stimuli')})"
     )
     text += f" by {board.metric}" if board.metric else ""
     text += f", with noise correction by the estimator '{board.estimator}'."
@@ -144,7 +144,7 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     text += f" They were simulated at the fidelity '{fidelity}'." if isinstance(fidelity, str) else ""
     text += f" Time axis: {board.time}." if board.time else ""
     text += f" Layer: {score.layer_rule}." if score.layer_rule else ""
-    text += f" Interval of a record: {_words.level(score.interval)}." if score.interval else ""
+    text += f" Interval of a record: {words.level(score.interval)}." if score.interval else ""
     if seeds > 1:
         text += (
             f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, "
@@ -198,14 +198,14 @@ def _models(entries: Sequence[Entry]) -> PaperTable:
         (
             entry.name,
             entry.rank,
-            _words.number(entry.value),
-            _words.span(entry.interval),
-            _words.number(entry.spread) if entry.seeds > 1 else "",
-            _words.probability(entry.p),
-            _words.number(entry.r),
+            words.number(entry.value),
+            words.span(entry.interval),
+            words.number(entry.spread) if entry.seeds > 1 else "",
+            words.probability(entry.p),
+            words.number(entry.r),
             entry.score.layer or "",
-            _words.count(entry.card.parameters),
-            "" if entry.card.top1 is None else _words.number(entry.card.top1),
+            words.count(entry.card.parameters),
+            "" if entry.card.top1 is None else words.number(entry.card.top1),
             entry.status,
         )
         for entry in entries
@@ -217,7 +217,7 @@ def _models(entries: Sequence[Entry]) -> PaperTable:
 
 def _baselines(board: Board) -> PaperTable:
     rows = [
-        (item.name, _words.number(item.score.value), _words.span(item.score.interval), item.score.status)
+        (item.name, words.number(item.score.value), words.span(item.score.interval), item.score.status)
         for item in board.baselines
     ]
     return PaperTable("Baselines and animal-to-animal.", ("baseline", "score", "interval", "status"), tuple(rows))
@@ -227,8 +227,8 @@ def _animals(entry: Entry) -> PaperTable:
     columns = ("animal", "score", "raw r", "reliability", "units", "trials", "layer", "status")
     rows = [
         (
-            item.subject, _words.number(item.value), _words.number(item.r), _words.number(item.reliability, 2),
-            _words.count(item.units), _words.count(item.trials), item.layer or "", item.status,
+            item.subject, words.number(item.value), words.number(item.r), words.number(item.reliability, 2),
+            words.count(item.units), words.count(item.trials), item.layer or "", item.status,
         )
         for item in entry.score.subjects
     ]  # fmt: skip
@@ -236,7 +236,7 @@ def _animals(entry: Entry) -> PaperTable:
 
 
 def _card(entry: Entry) -> PaperTable:
-    rows = (*_words.card_rows(entry.card), *_words.training_rows(entry.card))
+    rows = (*words.card_rows(entry.card), *words.training_rows(entry.card))
     return PaperTable("The model.", ("statement", "value"), tuple(rows))
 
 
@@ -262,7 +262,7 @@ def _write_figures(paper: Paper, path: Path) -> list[Path]:
 def _markdown(paper: Paper, path: Path) -> str:
     lines = [f"# {_escape(paper.title)}", ""]
     if paper.synthetic:
-        lines += [f"> **{_words.SYNTHETIC}**", ""]
+        lines += [f"> **{words.SYNTHETIC}**", ""]
     for place, section in enumerate(paper.sections, start=1):
         lines += [
             f"## {_escape(section.title)}",

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.files import to_plain
-from leaderboards import text as _words
+from leaderboards import text as words
 from leaderboards.figures import marks
 
 if TYPE_CHECKING:
@@ -67,13 +67,13 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for helper in (_words.number, _words.probability, _words.count, _words.span, _words.level):
+    for helper in (words.number, words.probability, words.count, words.span, words.level):
         environment.filters[helper.__name__] = helper
     environment.globals |= {
-        "STATUS": _words.STATUS,
+        "STATUS": words.STATUS,
         "MARGIN": marks.MARGIN,
-        "SYNTHETIC": _words.SYNTHETIC,
-        "p_sentence": _words.p_sentence,
+        "SYNTHETIC": words.SYNTHETIC,
+        "p_sentence": words.p_sentence,
         "colour_stops": marks.colour_stops(),
     }
     return environment

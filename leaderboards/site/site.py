@@ -15,12 +15,13 @@ from typing import Any
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, write_text
 from brainbench.core.records import ModelGraph, ResultRecord
-from leaderboards import text as _words
+from brainbench.core.statistics import is_finite
+from leaderboards import text as words
 from leaderboards.audit import remarks
 from leaderboards.entries import Entry, entries_of
 from leaderboards.figures.architecture import diagram, layer_order
 from leaderboards.figures.charts import board_figures, layers_of
-from leaderboards.figures.marks import MARGIN, Axis, axis_of, known
+from leaderboards.figures.marks import MARGIN, Axis, axis_of
 from leaderboards.ranking import Board, rank
 from leaderboards.schema import record_schema
 from leaderboards.site.downloads import boards_csv, boards_parquet, boards_table, records_zip
@@ -115,9 +116,9 @@ def _numbered(figure: Any, number: int) -> Any:
 def _count(listed: Sequence[tuple[Board, Sequence[Entry]]]) -> str:
     models = sum(len(entries) for _, entries in listed)
     results = sum(len(board.rows) for board, _ in listed)
-    text = f"{_words.plural(models, 'model')}"
-    text += f", {_words.plural(results, 'record')}" if results != models else ""
-    return text + (f" on {_words.plural(len(listed), 'board')}." if len(listed) != 1 else ".")
+    text = f"{words.plural(models, 'model')}"
+    text += f", {words.plural(results, 'record')}" if results != models else ""
+    return text + (f" on {words.plural(len(listed), 'board')}." if len(listed) != 1 else ".")
 
 
 def _write_models(root: Path, listed: Sequence[tuple[Board, Sequence[Entry]]]) -> set[Path]:
@@ -141,11 +142,11 @@ def model_view(board: Board, entry: Entry) -> dict[str, Any]:
     axis = _axis(entry)
     graph: ModelGraph | None = entry.card.graph or layer_order(record.score)
     card = entry.card
-    task = [("top-1", _words.number(card.top1)), ("interval", _words.span(card.accuracy_interval))]
-    task += [("top-5", _words.number(card.top5))] if card.top5 is not None else []
+    task = [("top-1", words.number(card.top1)), ("interval", words.span(card.accuracy_interval))]
+    task += [("top-5", words.number(card.top5))] if card.top5 is not None else []
     if card.twin_top1 is not None:
-        span = _words.span(card.twin_interval)
-        task.append(("untrained twin, top-1", f"{_words.number(card.twin_top1)} {span}".strip()))
+        span = words.span(card.twin_interval)
+        task.append(("untrained twin, top-1", f"{words.number(card.twin_top1)} {span}".strip()))
     task += [("data (hash)", card.accuracy_data or ""), ("collapsed", "yes" if card.collapsed else "no")]
     return report_view(record) | {
         "title": f"{entry.name}: brainbench leaderboard",
@@ -153,12 +154,12 @@ def model_view(board: Board, entry: Entry) -> dict[str, Any]:
         "board": board,
         "seeds": [(row, axis.mark(row.record.score.value, row.record.score.interval)) for row in entry.rows],
         "seed_axis": axis,
-        "loading": _words.loading(record),
+        "loading": words.loading(record),
         "graph": drawn(diagram(graph, entry.name)) if graph else None,
         "connected": card.graph is not None,
         "layer_chart": drawn(layers_of(entry)),
         "task": [(label, text) for label, text in task if text],
-        "training": _words.training_rows(card),
+        "training": words.training_rows(card),
         "file_name": entry.rows[0].file_name,
     }
 
@@ -167,7 +168,7 @@ def _axis(entry: Entry) -> Axis:
     ends = [
         end
         for row in entry.rows
-        if (interval := row.record.score.interval) and known(interval)
+        if (interval := row.record.score.interval) and is_finite(interval)
         for end in (interval.low, interval.high)
     ]
     return axis_of([*(row.record.score.value for row in entry.rows), *ends])

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from brainbench.core.statistics import is_finite
 from leaderboards import provenance
 from leaderboards.entries import Entry
-from leaderboards.figures.marks import known, score_axis
+from leaderboards.figures.marks import score_axis
 from leaderboards.ranking import Baseline, Board, RankedRecord
 
 COLUMNS: tuple[dict[str, Any], ...] = (
@@ -52,7 +53,7 @@ def compact(listed: Sequence[tuple[Board, Sequence[Entry]]]) -> list[dict[str, A
         scores = [entry.score for entry in entries] + [baseline.score for baseline in board.baselines]
         axis = score_axis(scores)
         animals = next((b.score for b in board.baselines if b.kind == "animals" and b.score.status == "ok"), None)
-        interval = animals.interval if animals and known(animals.interval) else None
+        interval = animals.interval if animals and is_finite(animals.interval) else None
         rows = _rows(board, entries)
         found.append(
             {
@@ -128,7 +129,7 @@ def _model_row(entry: Entry) -> dict[str, Any]:
 
 def _run(row: RankedRecord) -> list[Any]:
     score = row.record.score
-    interval = score.interval if known(score.interval) else None
+    interval = score.interval if is_finite(score.interval) else None
     return [
         row.record.card.seed if row.record.card else None,
         _short(score.value),
@@ -145,7 +146,7 @@ def _run(row: RankedRecord) -> list[Any]:
 
 def _baseline_row(baseline: Baseline) -> dict[str, Any]:
     score = baseline.score
-    interval = score.interval if known(score.interval) else None
+    interval = score.interval if is_finite(score.interval) else None
     return {
         "kind": baseline.kind,
         "model": baseline.name,

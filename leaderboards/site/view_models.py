@@ -9,9 +9,10 @@ from itertools import combinations
 from typing import Any
 
 from brainbench.core.records import LayerScore, ResultRecord, Score
+from brainbench.core.statistics import is_finite
 from leaderboards import provenance, text
 from leaderboards.figures.architecture import diagram
-from leaderboards.figures.marks import Axis, Mark, axis_of, known, rdm_picture, score_axis
+from leaderboards.figures.marks import Axis, Mark, axis_of, rdm_picture, score_axis
 from leaderboards.site.page import drawn
 from leaderboards.store import record_name
 
@@ -130,7 +131,7 @@ def _wider(axis: Axis, values: Iterable[float]) -> Axis:
 
 def _band(score: Score | None) -> tuple[float, float] | None:
     interval = score.interval if score and score.status == "ok" else None
-    return (interval.low, interval.high) if interval and known(interval) else None
+    return (interval.low, interval.high) if interval and is_finite(interval) else None
 
 
 def _ends(score: Score) -> tuple[float, float] | None:
