@@ -8,13 +8,13 @@ cannot read it by pointing its own name at this machine (DNS rebinding).
 from __future__ import annotations
 
 import logging
-import mimetypes
 import os
 import socket
 from functools import partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any, ClassVar
 from urllib.parse import unquote, urlsplit
 
 from brainbench.core.errors import DataFileNotFoundError, UsageError
@@ -57,7 +57,7 @@ def make_server(folder: str | os.PathLike[str], *, host: str = "127.0.0.1", port
         )
     try:
         kind = _Server6 if ":" in host else ThreadingHTTPServer
-        return kind((host, port), partial(_Handler, root=root, host=host))
+        return kind((host, port), partial(_Handler, directory=os.fspath(root), host=host))
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UsageError(f"The address {host}:{port} cannot be had ({reason}); choose another with --port.") from error
@@ -67,40 +67,32 @@ class _Server6(ThreadingHTTPServer):
     address_family = socket.AF_INET6
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(SimpleHTTPRequestHandler):
     """Answers GET and HEAD with files of one folder."""
 
     server_version = "brainbench"
     sys_version = ""
     timeout = 30
+    extensions_map: ClassVar = {**SimpleHTTPRequestHandler.extensions_map, **_TYPES}
 
-    def __init__(self, *arguments: object, root: Path, host: str, **options: object) -> None:
-        self._root, self._host = root, host
-        super().__init__(*arguments, **options)  # pyright: ignore[reportArgumentType]
+    def __init__(self, *arguments: Any, host: str, **options: Any) -> None:
+        self._host = host
+        super().__init__(*arguments, **options)
 
-    def do_GET(self) -> None:
-        self._answer(body=True)
-
-    def do_HEAD(self) -> None:
-        self._answer(body=False)
-
-    def _answer(self, *, body: bool) -> None:
+    def send_head(self) -> Any:
+        """Refuse foreign names, hidden files and links that lead out; the rest is the standard library's."""
         if not self._is_ours():
             self.send_error(HTTPStatus.FORBIDDEN, "This server answers to its own address only")
-            return
-        path = self._file()
-        if path is None:
+            return None
+        if not self._is_inside():
             self.send_error(HTTPStatus.NOT_FOUND)
-            return
-        content = path.read_bytes()
-        kind = _TYPES.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Content-Security-Policy", _POLICY if path.suffix == ".html" else _LOCKED)
-        self.end_headers()
-        if body:
-            self.wfile.write(content)
+            return None
+        return super().send_head()
+
+    def list_directory(self, path: Any) -> None:
+        """List nothing: a folder without a first page is not there."""
+        del path
+        self.send_error(HTTPStatus.NOT_FOUND)
 
     def _is_ours(self) -> bool:
         """Tell whether the request names this server by the address it listens on, or a loopback name."""
@@ -108,20 +100,19 @@ class _Handler(BaseHTTPRequestHandler):
         everywhere = self._host in ("0.0.0.0", "::", "")
         return everywhere or named == self._host or (self._host in LOOPBACK and named in LOOPBACK)
 
-    def _file(self) -> Path | None:
-        """Return the file that the address names, inside the folder and not hidden."""
-        parts = [part for part in unquote(urlsplit(self.path).path).split("/") if part]
+    def _is_inside(self) -> bool:
+        """Tell whether the address names something inside the folder that is not hidden."""
+        parts = unquote(urlsplit(self.path).path).split("/")
         if any(part.startswith(".") or "\\" in part or "\0" in part for part in parts):
-            return None
-        path = self._root.joinpath(*parts)
-        path = path / "index.html" if path.is_dir() else path
-        try:
-            inside = path.resolve().is_relative_to(self._root)  # a link could lead out
+            return False
+        try:  # a link could lead out
+            return Path(self.translate_path(self.path)).resolve().is_relative_to(self.directory)
         except OSError:
-            return None
-        return path if inside and path.is_file() else None
+            return False
 
     def end_headers(self) -> None:
+        page = Path(self.translate_path(self.path)).suffix in (".html", "") and self._is_inside()
+        self.send_header("Content-Security-Policy", _POLICY if page else _LOCKED)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         super().end_headers()
