@@ -19,7 +19,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.report import table, write_section
-from brainbench.metrics import TrialBlock, compare, equivalence_test, rdm, score_animals, subject_rdm
+from brainbench.metrics import Trials, compare, equivalence_test, rdm, score_animals, subject_rdm
 from brainbench.metrics.inference.bootstrap import _factors, _scores, animal_counts, ceilings
 from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
 from brainbench.metrics.inference.multiple import sign_flip_p, step_down
@@ -166,7 +166,7 @@ def crossnobis(simulations: int) -> Result:
         ]
         found: dict[tuple[str, str], list[float]] = {kind: [] for kind in kinds if kind[1] != "full" or units == 10}
         for _ in range(simulations):
-            block = TrialBlock(rng.normal(size=(len(labels), units)) @ spread.T, labels)
+            block = Trials(rng.normal(size=(len(labels), units)) @ spread.T, labels)
             for (method, noise), values in found.items():
                 values.append(subject_rdm("a", [block], 6, method=method, noise=noise, splits=1).rdm.mean())
         for (method, noise), values in found.items():
@@ -207,7 +207,7 @@ def make_pool(
     for index in range(count):
         means = (latent + individual * rng.normal(size=latent.shape)) @ rng.normal(size=(4, units))
         responses = means[labels] + noise * rng.normal(size=(len(labels), units))
-        block = TrialBlock(responses, labels, [str(trial) for trial in range(len(labels))])
+        block = Trials(responses, labels, [str(trial) for trial in range(len(labels))])
         subjects.append(subject_rdm(str(index), [block], 6, splits=100, draws=draws, draw_splits=10))
         truth.append(float(compare(model, rdm(means))))
     # Over many units the correlation distance depends on the latent directions alone.
@@ -416,7 +416,7 @@ def faults(simulations: int) -> Result:
             for study in range(simulations):
                 geometry = ResponseGeometry.from_features(np.random.default_rng(study).normal(size=(6, 4)))
                 animals = simulate(geometry, design, seed=study, faults=given)
-                blocks = [[TrialBlock(b.responses[:, 0], b.labels, b.keys) for b in a.blocks] for a in animals]
+                blocks = [[Trials(b.responses[:, 0], b.labels, b.keys) for b in a.blocks] for a in animals]
                 score = score_animals([subject_rdm(str(i), block, 6, splits=50) for i, block in enumerate(blocks)])
                 values.append(score.value)
                 reliable.append(score.reliability)

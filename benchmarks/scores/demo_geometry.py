@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brainbench.datasets import blocks, open_recordings
 from brainbench.datasets.synthetic.demo import ensure_demo, read_truth
-from brainbench.metrics import TrialBlock, rdm, score_animals, subject_rdm
+from brainbench.metrics import Trials, rdm, score_animals, subject_rdm
 from brainbench.stimuli import load_stimuli
 
 UNITS = np.array([1e-4] * 3 + [1e-6] * 3)
@@ -68,7 +68,7 @@ def main() -> None:
     labels = truth["labels"]
     animals = []
     for name, sessions in blocks(open_recordings(folder)).items():
-        trials = [TrialBlock(responses[:, 0], codes, keys) for responses, codes, keys in sessions]
+        trials = [Trials(item.responses[:, 0], item.labels, item.keys) for item in sessions]
         animals.append(subject_rdm(name, trials, len(labels)))
     print(f"{'animal':8} {'reliability':>11} {'own truth':>9} {'shared':>6}", *(f"{name:>16}" for name in raw))
     for animal in animals:

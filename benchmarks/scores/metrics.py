@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.report import table, write_section
 from brainbench.metrics import (
-    TrialBlock,
+    Trials,
     bootstrap_ceiling,
     bootstrap_comparisons,
     compare_models,
@@ -211,7 +211,7 @@ def parity_rows() -> list[list[str]]:
     return [[what, f"{error:.0e}"] for what, error in worst.items()]
 
 
-def make_animals(count: int = 11, units: int = 91, repeats: int = 60) -> list[TrialBlock]:
+def make_animals(count: int = 11, units: int = 91, repeats: int = 60) -> list[Trials]:
     """Sessions of the size of the Rodgers recordings: 999 units over 11 animals."""
     rng = np.random.default_rng(1)
     latent = rng.normal(size=(6, 4))
@@ -220,7 +220,7 @@ def make_animals(count: int = 11, units: int = 91, repeats: int = 60) -> list[Tr
     for animal in range(count):
         means = latent @ rng.normal(size=(4, units))
         responses = means[labels] + 4 * rng.normal(size=(len(labels), units))
-        blocks.append(TrialBlock(responses, labels, [f"{animal}/{i}" for i in range(len(labels))]))
+        blocks.append(Trials(responses, labels, [f"{animal}/{i}" for i in range(len(labels))]))
     return blocks
 
 

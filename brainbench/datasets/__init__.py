@@ -12,7 +12,7 @@ from brainbench.datasets.inspection import Inspection, inspect
 from brainbench.datasets.layouts.registry import RecordingLayout, get_recipe, list_recipes, register_recipe
 from brainbench.datasets.recordings import open_recordings
 from brainbench.datasets.sessions import Session, make_session
-from brainbench.datasets.trials.blocks import SessionBlock, block_covariates, blocks
+from brainbench.datasets.trials.blocks import blocks
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.pooling import pooled
 from brainbench.datasets.trials.selection import Rule, Selection
@@ -27,10 +27,8 @@ __all__ = [
     "Rule",
     "Selection",
     "Session",
-    "SessionBlock",
     "WhiskingDataset",
     "Window",
-    "block_covariates",
     "blocks",
     "check",
     "export",

@@ -9,6 +9,7 @@ The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`spli
 
 from __future__ import annotations
 
+from brainbench.core.trials import Trials
 from brainbench.metrics.animal_to_animal import pairwise_consistency, score_animals
 from brainbench.metrics.inference.bootstrap import (
     DRAWS,
@@ -42,7 +43,7 @@ from brainbench.metrics.reliability.noise_correction import (
     noise_corrected,
     spearman_brown,
 )
-from brainbench.metrics.reliability.split_half import SUBJECT_METHODS, SplitHalf, TrialBlock, split_half
+from brainbench.metrics.reliability.split_half import SUBJECT_METHODS, SplitHalf, split_half
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 from brainbench.metrics.reliability.units import reliable_units, unit_reliability
 from brainbench.metrics.score import score_rdms
@@ -66,7 +67,7 @@ __all__ = [
     "PermutationTest",
     "SplitHalf",
     "SubjectRDM",
-    "TrialBlock",
+    "Trials",
     "bootstrap_ceiling",
     "bootstrap_comparisons",
     "bootstrap_score",

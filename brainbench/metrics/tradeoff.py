@@ -16,11 +16,11 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
+from brainbench.core.trials import Trials
 from brainbench.metrics.inference.bootstrap import bootstrap_score
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, permuted_pairs
-from brainbench.metrics.reliability.split_half import TrialBlock
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 from brainbench.metrics.score import score_rdms
 
@@ -138,12 +138,12 @@ def _p_near_five_percent() -> tuple[Floats, Floats, float]:
     return model, brain, float(np.quantile(_relabelled(model, brain, 20_000, 2), 0.95))
 
 
-def _data(animals: int, units: int, trials: int, noise: float) -> tuple[list[TrialBlock], Floats]:
+def _data(animals: int, units: int, trials: int, noise: float) -> tuple[list[Trials], Floats]:
     rng = np.random.default_rng(0)
     latent = rng.normal(size=(6, 4))
     labels = np.repeat(np.arange(6), trials)
     blocks = []
     for animal in range(animals):
         responses = (latent @ rng.normal(size=(4, units)))[labels] + noise * rng.normal(size=(len(labels), units))
-        blocks.append(TrialBlock(responses, labels, [f"{animal}/{trial}" for trial in range(len(labels))]))
+        blocks.append(Trials(responses, labels, [f"{animal}/{trial}" for trial in range(len(labels))]))
     return blocks, rdm((latent + 0.3 * rng.normal(size=latent.shape)) @ rng.normal(size=(4, 500)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,26 +49,19 @@ class NeuralResponses:
         self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
     ) -> tuple[Any, ...]:
         """Every animal prepared by a metric (RSA by default) over the labels ``kept``, in that order."""
-        from brainbench.datasets import block_covariates, blocks
-        from brainbench.metrics import TrialBlock, get_metric
+        from brainbench.datasets import blocks
+        from brainbench.metrics import get_metric
 
         metric = metric or get_metric("rsa")
         index = np.full(len(self.vocabulary), -1)
         index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
         animals = []
-        known = block_covariates(self.dataset)
         for subject, sessions in blocks(self.dataset).items():
-            trials = []
-            for (responses, labels, keys), covariates in zip(sessions, known[subject], strict=True):
-                rows = index[labels] >= 0
-                trials.append(
-                    TrialBlock(
-                        without_time(responses[rows], time),
-                        index[labels][rows],
-                        [key for key, row in zip(keys, rows, strict=True) if row],
-                        {name: values[rows] for name, values in covariates.items()},
-                    )
-                )
+            kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
+            trials = [
+                replace(item, responses=without_time(item.responses, time), labels=index[item.labels])
+                for item in kept_trials
+            ]
             animals.append(metric.animal(subject, trials, len(kept), stimuli=kept, seed=seed, draws=draws))
         return tuple(animals)
 

@@ -11,7 +11,7 @@ from brainbench.core.errors import DataError
 from brainbench.datasets import blocks, check, inspect, make_session, open_recordings, pooled, write_recordings
 from brainbench.datasets.sessions import SessionTable
 from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, as_recordings, simulate
-from brainbench.metrics import TrialBlock, subject_rdm
+from brainbench.metrics import Trials, subject_rdm
 from tests.factories.recordings import make_simple_session
 
 
@@ -21,7 +21,7 @@ def make_geometry(stimuli):
 
 def result(dataset, subject):
     """What the metrics say about an animal of a data set."""
-    trials = [TrialBlock(item.responses[:, 0], item.labels, item.keys) for item in blocks(dataset)[subject]]
+    trials = [Trials(item.responses[:, 0], item.labels, item.keys) for item in blocks(dataset)[subject]]
     labels = dataset.attrs["vocabulary"]
     return subject_rdm(subject, trials, len(labels), stimuli=labels, splits=20)
 

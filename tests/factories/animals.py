@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.metrics import SubjectRDM, TrialBlock, rdm, spearman_brown
+from brainbench.metrics import SubjectRDM, Trials, rdm, spearman_brown
 
 STIMULI = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 
@@ -19,7 +19,7 @@ def make_block(latent, seed=0, units=20, repeats=8, noise=1.0, keys=True, gap=()
     means = latent @ rng.normal(size=(latent.shape[1], units))
     labels = rng.permutation(np.repeat([k for k in range(len(latent)) if k not in gap], repeats))
     responses = means[labels] + noise * rng.normal(size=(len(labels), units))
-    return TrialBlock(responses, labels, [f"{seed}/{trial}" for trial in range(len(labels))] if keys else None)
+    return Trials(responses, labels, [f"{seed}/{trial}" for trial in range(len(labels))] if keys else None)
 
 
 def make_subject(name, brain_rdm, reliability=0.9, splits=20, seed=0, **extra):

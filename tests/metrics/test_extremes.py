@@ -11,7 +11,7 @@ import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.metrics import (
-    TrialBlock,
+    Trials,
     compare,
     noise_corrected,
     rdm,
@@ -26,7 +26,7 @@ LABELS = np.repeat(np.arange(6), 8)
 
 
 def _animal(responses, labels=LABELS, **options):
-    return subject_rdm("a", [TrialBlock(responses, labels)], 6, stimuli=STIMULI, splits=20, draws=20, **options)
+    return subject_rdm("a", [Trials(responses, labels)], 6, stimuli=STIMULI, splits=20, draws=20, **options)
 
 
 def _score(*animals, layer=None):

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import MODULATION, Design, draw_session, entropy, stimulus_means, subject_name
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
 from brainbench.datasets.synthetic.truth import correlation_rdm
-from brainbench.datasets.trials.blocks import SessionBlock
 
 __all__ = [
     "FAULTS",
@@ -53,7 +53,7 @@ class SyntheticAnimal:
     """One animal's trials, and the truth about it."""
 
     subject: str
-    blocks: tuple[SessionBlock, ...]
+    blocks: tuple[Trials, ...]
     """Sessions: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``."""
     truth: NDArray[np.float64] = field(repr=False)
     """[P] correlation-distance RDM of its units' expected rates, free of noise."""
@@ -177,26 +177,26 @@ def calibrate(
     return replace(design, modulation=middle)
 
 
-def _zero_fill(block: SessionBlock, stimuli: int) -> SessionBlock:
+def _zero_fill(block: Trials, stimuli: int) -> Trials:
     """Give every trial a response of zero to each stimulus that it did not show."""
     trials, bins, units = block.responses.shape
     filled = np.zeros((trials, stimuli, bins, units))
     filled[np.arange(trials), block.labels] = block.responses
-    keys = tuple(f"{key}/{stimulus}" for key in block.keys for stimulus in range(stimuli))
+    keys = tuple(f"{key}/{stimulus}" for key in block.keys or () for stimulus in range(stimuli))
     labels = np.tile(np.arange(stimuli), trials)
-    return SessionBlock(filled.reshape(trials * stimuli, bins, units), labels, keys)
+    return Trials(filled.reshape(trials * stimuli, bins, units), labels, keys)
 
 
-def _first_appearance(block: SessionBlock, stimuli: int) -> SessionBlock:
+def _first_appearance(block: Trials, stimuli: int) -> Trials:
     """Number the stimuli in the order in which the session shows them."""
     _, first = np.unique(block.labels, return_index=True)
     order = block.labels[np.sort(first)]
     number = np.full(stimuli, -1)
     number[order] = np.arange(len(order))
-    return block._replace(labels=number[block.labels])
+    return replace(block, labels=number[block.labels])
 
 
-FAULTS: dict[str, Callable[[SessionBlock, int], SessionBlock]] = {
+FAULTS: dict[str, Callable[[Trials, int], Trials]] = {
     "first-appearance": _first_appearance,
     "zero-fill": _zero_fill,
 }

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
-from brainbench.datasets.trials.blocks import SessionBlock
 
 MODULATION = 0.4
 """Largest modulation: beyond it too many rates would be cut off at zero for the truth to hold."""
@@ -78,7 +78,7 @@ class DrawnSession:
     """[R] stimulus of each trial."""
     expected: NDArray[np.float64]
     """[K, U] expected rate, Hz."""
-    block: SessionBlock
+    block: Trials
 
 
 def draw_session(
@@ -109,10 +109,10 @@ def draw_session(
         rates *= random.gamma(1 / design.dispersion, design.dispersion, rates.shape)
     counts = random.poisson(rates * design.window)
     keys = tuple(f"{subject_name(animal)}/{session_name(session)}/{row}" for row in range(len(labels)))
-    return DrawnSession(counts, labels, expected, SessionBlock(counts[:, None] / design.window, labels, keys))
+    return DrawnSession(counts, labels, expected, Trials(counts[:, None] / design.window, labels, keys))
 
 
-def stimulus_means(block: SessionBlock, stimuli: int) -> NDArray[np.float64]:
+def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
     """Mean response [K, U] to every stimulus; NaN where there is no trial."""
     member = np.zeros((stimuli, len(block.labels)))
     member[block.labels, np.arange(len(block.labels))] = 1.0

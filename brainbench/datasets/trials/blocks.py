@@ -1,36 +1,26 @@
-"""Hand trials to the metrics: one block per session, because units differ between sessions."""
+"""Hand trials to the metrics: one :class:`Trials` per session, because units differ between sessions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_recordings
+from brainbench.core.trials import Trials
 from brainbench.datasets.trials.covariates import COVARIATES
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-class SessionBlock(NamedTuple):
-    """Trials and units that were recorded together. Letters: R trials, T time bins, U units."""
+def blocks(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
+    """Return firing rates [R, T, U] in Hz of every session by subject, both in the order of the data set.
 
-    responses: NDArray[np.float64]
-    """[R, T, U] firing rate, Hz; NaN where a unit was not recorded in a trial."""
-    labels: NDArray[np.int64]
-    """[R] index into the data set's vocabulary."""
-    keys: tuple[str, ...]
-    """[R] a name for each trial, unique in the data set and independent of its order."""
-
-
-def blocks(dataset: xr.Dataset) -> dict[str, tuple[SessionBlock, ...]]:
-    """Split recordings into blocks, by subject and session in the order of the data set.
-
-    Trials and units without any recorded value are left out. A session without a trial left gives no
-    block; a subject without a block does not appear.
+    Covariates are those of :mod:`brainbench.datasets.trials.covariates` that the data set holds. Trials and units
+    without any recorded value are left out, and so are sessions and subjects without a trial left.
 
     Raises:
         DataError: ``dataset`` is not a recordings data set.
@@ -40,33 +30,18 @@ def blocks(dataset: xr.Dataset) -> dict[str, tuple[SessionBlock, ...]]:
     position = {label: index for index, label in enumerate(dataset.attrs["vocabulary"])}
     labels = np.array([position[label] for label in dataset["stimulus"].values.astype(str).tolist()], dtype=np.int64)
     ids = dataset["trial_id"].values.astype(str)
-    found: dict[str, list[SessionBlock]] = {}
+    known = [name for name in COVARIATES if name in dataset.coords]
+    found: dict[str, list[Trials]] = {}
     for subject, session, rows, counts in _sessions(dataset):
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
         found.setdefault(subject, []).append(
-            SessionBlock(
+            Trials(
                 responses=counts / seconds[:, :, None],
                 labels=labels[rows],
                 keys=_unique([f"{subject}/{session}/{ids[row]}" for row in rows]),
+                covariates={name: dataset[name].values[rows].astype(np.float64) for name in known},
             )
         )
-    return {subject: tuple(items) for subject, items in found.items()}
-
-
-def block_covariates(dataset: xr.Dataset) -> dict[str, tuple[dict[str, NDArray[np.float64]], ...]]:
-    """Return what else is known of the trials of each block: name → [R]; see
-    :mod:`brainbench.datasets.trials.covariates`.
-
-    Subjects and sessions are those of :func:`blocks`, in the same order.
-
-    Raises:
-        DataError: ``dataset`` is not a recordings data set.
-    """
-    check_recordings(dataset)
-    known = [name for name in COVARIATES if name in dataset.coords]
-    found: dict[str, list[dict[str, NDArray[np.float64]]]] = {}
-    for subject, _, rows, _ in _sessions(dataset):
-        found.setdefault(subject, []).append({name: dataset[name].values[rows].astype(np.float64) for name in known})
     return {subject: tuple(items) for subject, items in found.items()}
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.split_half import TrialBlock, usable_sessions
+from brainbench.metrics.reliability.split_half import usable_sessions
 from brainbench.metrics.stimulus_labels import stimulus_means
 
 
@@ -37,7 +38,7 @@ class AnimalPatterns:
 
 
 def animal_patterns(
-    subject: str, blocks: Sequence[TrialBlock], n_stimuli: int, *, stimuli: Sequence[str] | None = None
+    subject: str, blocks: Sequence[Trials], n_stimuli: int, *, stimuli: Sequence[str] | None = None
 ) -> AnimalPatterns:
     """Average an animal's trials, leaving out by the rules of :mod:`brainbench.metrics.reliability.split_half`.
 
@@ -70,7 +71,7 @@ class OfMeanResponses:
     def animal(
         self,
         subject: str,
-        blocks: Sequence[TrialBlock],
+        blocks: Sequence[Trials],
         n_stimuli: int,
         *,
         stimuli: Sequence[str] | None = None,

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from brainbench.core.trials import Trials
 from brainbench.metrics.measures.animal_patterns import AnimalPatterns, animal_patterns
 from brainbench.metrics.measures.nuisance import partial_correlations, variance_partition
 from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, upper
-from brainbench.metrics.reliability.split_half import TrialBlock
 from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
 
 
@@ -42,7 +42,7 @@ class PartialRSA(PatternMetric):
     def animal(
         self,
         subject: str,
-        blocks: Sequence[TrialBlock],
+        blocks: Sequence[Trials],
         n_stimuli: int,
         *,
         stimuli: Sequence[str] | None = None,
@@ -80,7 +80,7 @@ class PartialRSA(PatternMetric):
         return {"variance_partition": {**shares, "nuisances": nuisances}}
 
 
-def _nuisances(blocks: Sequence[TrialBlock], count: int) -> tuple[dict[str, Floats], str]:
+def _nuisances(blocks: Sequence[Trials], count: int) -> tuple[dict[str, Floats], str]:
     """Return the RDM of every covariate with a value for all stimuli and a difference between some."""
     names = list(dict.fromkeys(name for block in blocks for name in block.covariates))
     labels = [stimulus_codes(block.labels, count)[0] for block in blocks]

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.records import Score
-from brainbench.metrics.reliability.split_half import TrialBlock
+from brainbench.core.trials import Trials
 
 
 class Metric(Protocol):
@@ -36,7 +36,7 @@ class Metric(Protocol):
     def animal(
         self,
         subject: str,
-        blocks: Sequence[TrialBlock],
+        blocks: Sequence[Trials],
         n_stimuli: int,
         *,
         stimuli: Sequence[str] | None = None,

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from numpy.typing import ArrayLike
 
 from brainbench.core.records import Score
+from brainbench.core.trials import Trials
 from brainbench.metrics.animal_to_animal import score_animals
 from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.rdms.dissimilarity import rdm
-from brainbench.metrics.reliability.split_half import TrialBlock
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 from brainbench.metrics.score import score_rdms
 
@@ -31,7 +31,7 @@ class RSA:
     def animal(
         self,
         subject: str,
-        blocks: Sequence[TrialBlock],
+        blocks: Sequence[Trials],
         n_stimuli: int,
         *,
         stimuli: Sequence[str] | None = None,

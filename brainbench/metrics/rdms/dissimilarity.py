@@ -35,7 +35,7 @@ POISSON_PRIOR_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
-class _Trials:
+class _Responses:
     """What a method may use: responses of K stimuli as given, and for labelled trials their codes."""
 
     responses: Array
@@ -172,7 +172,7 @@ def _prepare(
     folds: ArrayLike | None,
     precision: ArrayLike | str | None,
     device: Any,
-) -> _Trials:
+) -> _Responses:
     where = find_device(device, responses, precision)
     if labels is None:
         matrix, codes = response_matrix(responses, "stimuli"), None
@@ -185,19 +185,19 @@ def _prepare(
             raise UsageError(f"There are {len(matrix)} trials but {len(codes)} labels; give one label per trial.")
     if count < 2:
         raise UsageError(f"An RDM compares at least 2 stimuli; received {count}.")
-    return _Trials(matrix, count, codes, folds, precision, where)
+    return _Responses(matrix, count, codes, folds, precision, where)
 
 
-def _correlation(given: _Trials) -> Array:
+def _correlation(given: _Responses) -> Array:
     return correlation_distances(given.patterns(), missing=given.missing, device=given.device)
 
 
-def _sqeuclidean(given: _Trials) -> Array:
+def _sqeuclidean(given: _Responses) -> Array:
     patterns = given.patterns()
     return product_distances(patterns, patterns, missing=given.missing, device=given.device)
 
 
-def _mahalanobis(given: _Trials) -> Array:
+def _mahalanobis(given: _Responses) -> Array:
     if given.precision is None:
         return _sqeuclidean(given)
     patterns = given.placed()
@@ -207,7 +207,7 @@ def _mahalanobis(given: _Trials) -> Array:
     return products_from_gram(left @ right.T, patterns.shape[1])
 
 
-def _crossnobis(given: _Trials) -> Array:
+def _crossnobis(given: _Responses) -> Array:
     if given.codes is None or given.folds is None:
         raise UsageError(
             "method='crossnobis' needs labels and folds: one stimulus and one cross-validation fold per trial."
@@ -234,7 +234,7 @@ def _crossnobis(given: _Trials) -> Array:
     return products_from_gram(gram, units) / (number * (number - 1))
 
 
-def _crossnobis_of_present(given: _Trials, means: Array) -> Array:
+def _crossnobis_of_present(given: _Responses, means: Array) -> Array:
     """Average over the pairs of folds in which both stimuli have a value."""
     xp, (folds, _, units) = library(means), means.shape
     left = right = means
@@ -254,7 +254,7 @@ def _crossnobis_of_present(given: _Trials, means: Array) -> Array:
     return xp.where(found > 0, total / xp.where(found > 0, found, 1.0), np.nan)
 
 
-def _poisson(given: _Trials) -> Array:
+def _poisson(given: _Responses) -> Array:
     patterns = given.placed()
     known = patterns[~library(patterns).isnan(patterns)]
     low = float(known.min()) if len(known) else 0.0
@@ -269,7 +269,7 @@ def poisson_rates(rates: Array) -> Array:
     return (rates + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
 
 
-_METHODS: dict[str, Callable[[_Trials], Array]] = {
+_METHODS: dict[str, Callable[[_Responses], Array]] = {
     "correlation": _correlation,
     "sqeuclidean": _sqeuclidean,
     "mahalanobis": _mahalanobis,

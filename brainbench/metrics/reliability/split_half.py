@@ -1,6 +1,6 @@
 """Split-half reliability of an animal's RDM, from its trials.
 
-An animal is a sequence of sessions (:class:`TrialBlock`) with different units. Units of all sessions
+An animal is a sequence of sessions (:class:`Trials`) with different units. Units of all sessions
 are joined after averaging trials, so an RDM spans them all.
 
 Rules for what cannot be split:
@@ -17,14 +17,14 @@ numbers of trials leave it unbiased.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.records import Interval
+from brainbench.core.trials import Trials
 from brainbench.metrics.inference.resampling import resample
 from brainbench.metrics.rdms.comparison import check_comparison, compare
 from brainbench.metrics.rdms.pairs import Floats, Ints
@@ -46,21 +46,6 @@ DRAW_SPLITS = 20
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
 _DRAWS_BYTES = 1 << 28
-
-
-@dataclass(frozen=True)
-class TrialBlock:
-    """Trials of one session: the same units recorded together."""
-
-    responses: ArrayLike
-    """[R, F] responses (units, or units × time bins); NaN is missing."""
-    labels: ArrayLike
-    """[R] stimulus of each trial, integers 0 … K−1."""
-    keys: Sequence[str] | None = None
-    """[R] unique names of the trials, from which the random splits are drawn; None draws them from the
-    trials' content. Either way the order of trials, sessions and units is irrelevant."""
-    covariates: Mapping[str, ArrayLike] = field(default_factory=dict, repr=False)
-    """What else was measured in every trial, such as contacts or licks: name → [R], NaN where unknown."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +76,7 @@ class SplitHalf:
 
 
 def split_half(
-    blocks: Sequence[TrialBlock],
+    blocks: Sequence[Trials],
     n_stimuli: int,
     *,
     stimuli: Sequence[str] | None = None,
@@ -201,7 +186,7 @@ def _draws(
 
 
 def usable_sessions(
-    blocks: Sequence[TrialBlock], count: int, names: list[str], *, least: int
+    blocks: Sequence[Trials], count: int, names: list[str], *, least: int
 ) -> tuple[list[Session], str | None, tuple[str, ...]]:
     """Check the sessions, leave out what cannot be split and say what.
 
@@ -267,7 +252,7 @@ def _without_noise(
     return kept, None, notes
 
 
-def trial_hashes(block: TrialBlock, responses: Floats, codes: Ints) -> Hashes:
+def trial_hashes(block: Trials, responses: Floats, codes: Ints) -> Hashes:
     """Return one hash per trial, of its key or of its content.
 
     Raises:

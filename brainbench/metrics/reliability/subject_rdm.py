@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.records import Interval
+from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.split_half import DRAW_SPLITS, SPLITS, TrialBlock, split_half
+from brainbench.metrics.reliability.split_half import DRAW_SPLITS, SPLITS, split_half
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class SubjectRDM:
 
 def subject_rdm(
     subject: str,
-    blocks: Sequence[TrialBlock],
+    blocks: Sequence[Trials],
     n_stimuli: int,
     *,
     stimuli: Sequence[str] | None = None,
@@ -77,7 +78,7 @@ def subject_rdm(
 
     Args:
         subject: Name of the animal.
-        blocks: Its sessions; see :class:`TrialBlock` and the rules of :mod:`brainbench.metrics.reliability.split_half`.
+        blocks: Its sessions; see :class:`Trials` and the rules of :mod:`brainbench.metrics.reliability.split_half`.
         n_stimuli: K.
         stimuli: Names of the stimuli, for messages.
         method: RDM method: ``correlation``, ``sqeuclidean``, ``mahalanobis``, ``crossnobis`` or ``poisson``.

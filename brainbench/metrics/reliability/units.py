@@ -13,11 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from brainbench.core.errors import UsageError
+from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.halves import Session, split_members, weighted_patterns
 from brainbench.metrics.reliability.noise_correction import spearman_brown
-from brainbench.metrics.reliability.split_half import TrialBlock, trial_hashes
+from brainbench.metrics.reliability.split_half import trial_hashes
 from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes
 
 UNIT_GATE = 0.5
@@ -28,7 +29,7 @@ _CHUNK = 20
 
 
 def unit_reliability(
-    blocks: Sequence[TrialBlock], n_stimuli: int, *, splits: int = _SPLITS, seed: int = 0
+    blocks: Sequence[Trials], n_stimuli: int, *, splits: int = _SPLITS, seed: int = 0
 ) -> tuple[Floats, ...]:
     """Return the reliability of every unit's tuning [F], for each session; NaN where it has none.
 
@@ -60,8 +61,8 @@ def unit_reliability(
 
 
 def reliable_units(
-    blocks: Sequence[TrialBlock], n_stimuli: int, *, least: float = UNIT_GATE, splits: int = _SPLITS, seed: int = 0
-) -> tuple[tuple[TrialBlock, ...], str]:
+    blocks: Sequence[Trials], n_stimuli: int, *, least: float = UNIT_GATE, splits: int = _SPLITS, seed: int = 0
+) -> tuple[tuple[Trials, ...], str]:
     """Return the sessions with the units whose reliability is at least ``least``, and what was left out in words.
 
     A session without such a unit is left out.
@@ -74,7 +75,7 @@ def reliable_units(
     for block, value in zip(blocks, values, strict=True):
         good = value >= least
         if good.any():
-            kept.append(TrialBlock(np.asarray(block.responses)[:, good], block.labels, block.keys, block.covariates))
+            kept.append(Trials(np.asarray(block.responses)[:, good], block.labels, block.keys, block.covariates))
     every = sum(len(value) for value in values)
     left = sum(int((~(value >= least)).sum()) for value in values)
     return tuple(kept), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

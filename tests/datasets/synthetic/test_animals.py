@@ -21,7 +21,7 @@ from brainbench.datasets.synthetic.animals import (
     write_files,
 )
 from brainbench.datasets.synthetic.demo import read_truth
-from brainbench.metrics import TrialBlock, noise_ceiling, rdm, subject_rdm
+from brainbench.metrics import Trials, noise_ceiling, rdm, subject_rdm
 
 SMALL = Design(animals=3, sessions=2, units=12, trials=5)
 
@@ -317,7 +317,7 @@ def test_no_unit_fires_within_its_refractory_time():
 
 def test_trial_blocks_take_simulated_sessions_as_they_are():
     animal = simulate(make_geometry(), Design(animals=1))[0]
-    trials = [TrialBlock(block.responses[:, 0], block.labels, block.keys) for block in animal.blocks]
+    trials = [Trials(block.responses[:, 0], block.labels, block.keys) for block in animal.blocks]
     found = subject_rdm(animal.subject, trials, 6, splits=50)
     np.testing.assert_allclose(found.rdm, measured([animal])[0])
     assert found.reliability > 0.8

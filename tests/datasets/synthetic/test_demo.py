@@ -34,8 +34,8 @@ def correlation(first, second):
 def mean_rdm(sessions):
     """RDM of condition means over all units of a subject, as nothing in the package computes it."""
     means = [
-        np.stack([np.nanmean(responses[labels == index, 0], axis=0) for index in range(6)])
-        for responses, labels, _ in sessions
+        np.stack([np.nanmean(item.responses[item.labels == index, 0], axis=0) for index in range(6)])
+        for item in sessions
     ]
     return 1 - np.corrcoef(np.concatenate(means, axis=1))[np.triu_indices(6, 1)]
 
@@ -43,13 +43,14 @@ def mean_rdm(sessions):
 def half_rdms(sessions, seed):
     halves: tuple[list, list] = ([], [])
     random = np.random.default_rng(seed)
-    for responses, labels, keys in sessions:
+    for trials in sessions:
+        labels = trials.labels
         chosen = np.zeros(len(labels), dtype=bool)
         for index in range(6):
             rows = random.permutation(np.flatnonzero(labels == index))
             chosen[rows[: len(rows) // 2]] = True
         for half, part in zip(halves, (chosen, ~chosen), strict=True):
-            half.append((responses[part], labels[part], keys))
+            half.append(trials.take(part))
     return [mean_rdm(half) for half in halves]
 
 

@@ -30,10 +30,18 @@ def test_each_session_is_one_block_of_rates(tmp_path):
     assert labels == dataset["stimulus"].values[12:24].tolist()
 
 
-def test_a_block_unpacks_into_responses_labels_and_keys(tmp_path):
-    responses, labels, keys = blocks(make_dataset(tmp_path))["m2"][0]
-    assert len(responses) == len(labels) == len(set(keys)) == 12
-    assert keys[0] == "m2/1/5"
+def test_a_session_holds_one_response_label_and_key_per_trial(tmp_path):
+    trials = blocks(make_dataset(tmp_path))["m2"][0]
+    assert len(trials.responses) == len(trials.labels) == len(set(trials.keys)) == 12
+    assert trials.keys[0] == "m2/1/5"
+
+
+def test_trials_are_taken_with_all_that_belongs_to_them(tmp_path):
+    trials = blocks(make_dataset(tmp_path))["m2"][0]
+    some = trials.take(trials.labels > 0)
+    assert some.keys == tuple(key for key, label in zip(trials.keys, trials.labels, strict=True) if label)
+    np.testing.assert_array_equal(some.responses, trials.responses[trials.labels > 0])
+    np.testing.assert_array_equal(trials.take([3, 1]).labels, trials.labels[[3, 1]])
 
 
 def test_units_lost_in_some_trials_stay_missing_there(tmp_path):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import (
-    TrialBlock,
+    Trials,
     bootstrap_ceiling,
     bootstrap_score,
     compare,
@@ -77,13 +77,13 @@ def test_missing_entries_are_drawn_as_missing():
 def test_the_order_of_trials_sessions_units_and_stimuli_changes_no_draw(seed, method):
     rng = np.random.default_rng(seed)
     blocks = [make_block(make_latent(), seed=j, repeats=8) for j in range(2)]
-    blocks = [TrialBlock(np.abs(block.responses), block.labels, block.keys) for block in blocks]
+    blocks = [Trials(np.abs(block.responses), block.labels, block.keys) for block in blocks]
     order = rng.permutation(6)
 
     def shuffled(block):
         rows, columns = rng.permutation(len(block.labels)), rng.permutation(block.responses.shape[1])
         labels = np.argsort(order)[block.labels][rows]
-        return TrialBlock(block.responses[np.ix_(rows, columns)], labels, [block.keys[row] for row in rows])
+        return Trials(block.responses[np.ix_(rows, columns)], labels, [block.keys[row] for row in rows])
 
     options = {"method": method, "splits": 5, "draws": 20, "noise": "diag"}
     first = subject_rdm("a", blocks, 6, **options)
@@ -97,7 +97,7 @@ def test_the_order_of_trials_sessions_units_and_stimuli_changes_no_draw(seed, me
 def test_halves_of_a_draw_share_no_trial():
     """Trials of pure noise agree with their own copies; halves that held copies would look reliable."""
     rng = np.random.default_rng(0)
-    block = TrialBlock(rng.normal(size=(96, 40)), np.repeat(np.arange(6), 16), [str(i) for i in range(96)])
+    block = Trials(rng.normal(size=(96, 40)), np.repeat(np.arange(6), 16), [str(i) for i in range(96)])
     found = subject_rdm("a", [block], 6, splits=200, draws=200)
     assert abs(np.nanmean(found.draws_r) - found.split_half_r.mean()) < 0.1
     assert abs(np.nanmean(found.draws_r)) < 0.15

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from brainbench.metrics import TrialBlock, get_metric
+from brainbench.metrics import Trials, get_metric
 from brainbench.metrics.measures.classifier import decode
 from brainbench.metrics.measures.decoding import label_properties
 
@@ -23,7 +23,7 @@ def _make_animals(metric, number=4, noise=0.5, units=30):
     rng = np.random.default_rng(0)
     labels = np.repeat(np.arange(6), 8)
     trials = [_make_axes(rng, units)[labels] + noise * rng.normal(size=(48, units)) for _ in range(number)]
-    return [metric.animal(f"m{i}", [TrialBlock(block, labels)], 6) for i, block in enumerate(trials)]
+    return [metric.animal(f"m{i}", [Trials(block, labels)], 6) for i, block in enumerate(trials)]
 
 
 def test_labels_name_their_properties_in_any_number_of_parts():

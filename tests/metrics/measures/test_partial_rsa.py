@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brainbench.metrics import TrialBlock, get_metric, rdm
+from brainbench.metrics import Trials, get_metric, rdm
 from brainbench.metrics.measures.nuisance import partial_correlations, variance_partition
 
 STIMULI = list("abcdefg")
@@ -24,9 +24,7 @@ def _make_blocks(latent, *, number=4, seed=0):
     for _ in range(number):
         means = np.concatenate([latent @ rng.normal(size=(latent.shape[1], 60)), np.tile(4 * COUNTER, (1, 3))], axis=1)
         trials = means[LABELS] + 0.3 * rng.normal(size=(len(LABELS), means.shape[1]))
-        blocks.append(
-            TrialBlock(trials, LABELS, None, {"contacts": TOUCHES[LABELS] + 0.1 * rng.normal(size=len(LABELS))})
-        )
+        blocks.append(Trials(trials, LABELS, None, {"contacts": TOUCHES[LABELS] + 0.1 * rng.normal(size=len(LABELS))}))
     return blocks
 
 
@@ -91,7 +89,7 @@ def test_recordings_without_covariates_are_undefined_in_words():
     trials = np.random.default_rng(4).normal(size=(len(LABELS), 9))
     constant = {"licks": np.ones(len(LABELS)), "choice": np.full(len(LABELS), np.nan)}
     for seen, told in (({}, "differ between stimuli"), (constant, r"(licks, choice do not)")):
-        animal = metric.animal("m", [TrialBlock(trials, LABELS, None, seen)], 7)
+        animal = metric.animal("m", [Trials(trials, LABELS, None, seen)], 7)
         score = _score(metric, [animal], np.eye(7))
         assert score.status == "undefined"
         assert "no contacts, licks or choices" in score.reasons[-1]

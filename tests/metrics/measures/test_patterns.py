@@ -11,7 +11,7 @@ from scipy.linalg import orthogonal_procrustes
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import (
     PatternMetric,
-    TrialBlock,
+    Trials,
     compare,
     find_metric,
     get_metric,
@@ -74,7 +74,7 @@ def test_the_order_of_stimuli_and_animals_and_the_scale_of_features_are_irreleva
     first, second = [], []
     for index in range(3):
         block = make_block(latent, seed=index)
-        moved = TrialBlock(block.responses, np.argsort(order)[block.labels], block.keys)
+        moved = Trials(block.responses, np.argsort(order)[block.labels], block.keys)
         first.append(metric.animal(f"m{index}", [block], 6))
         second.append(metric.animal(f"m{index}", [moved], 6))
     one = _score(metric, {"a": features}, first)
@@ -109,7 +109,7 @@ def test_ridge_is_nested_cross_validation_done_by_hand(count):
     x = rng.normal(size=(count, 9))
     labels = np.repeat(np.arange(count), 5)
     responses = (x @ rng.normal(size=(9, 7)))[labels] + rng.normal(size=(len(labels), 7))
-    animal = animal_patterns("a", [TrialBlock(responses, labels)], count)
+    animal = animal_patterns("a", [Trials(responses, labels)], count)
 
     def predict(train, test, penalty):
         a, mean = x[train] - x[train].mean(axis=0), animal.patterns[train].mean(axis=0)
@@ -135,7 +135,7 @@ def test_ridge_is_nested_cross_validation_done_by_hand(count):
 def test_the_noise_of_the_means_is_that_of_trials():
     rng = np.random.default_rng(7)
     labels = np.repeat(np.arange(6), 400)
-    block = TrialBlock(rng.normal(size=(2400, 3)) * [1.0, 2.0, 3.0], labels)
+    block = Trials(rng.normal(size=(2400, 3)) * [1.0, 2.0, 3.0], labels)
     animal = animal_patterns("a", [block], 6)
     np.testing.assert_allclose(animal.noise.mean(axis=0), np.array([1, 4, 9]) / 400, rtol=0.1)
     expected = np.stack([block.responses[labels == k].var(axis=0, ddof=1) / 400 for k in range(6)])
@@ -149,7 +149,7 @@ def test_a_perfect_encoder_of_noisy_trials_is_worth_one_and_raw_variance_is_not(
     values, raw = [], []
     for _ in range(8):
         responses = (latent @ rng.normal(size=(2, 30)))[labels] + 2.5 * rng.normal(size=(120, 30))
-        animal = animal_patterns("a", [TrialBlock(responses, labels)], 20)
+        animal = animal_patterns("a", [Trials(responses, labels)], 20)
         values.append(RidgeEncoding().compare(latent, animal))
         raw.append(RidgeEncoding().compare(latent, dataclasses.replace(animal, noise=0 * animal.noise)))
     assert np.mean(values) == pytest.approx(1, abs=0.15)
@@ -205,7 +205,7 @@ def test_what_cannot_be_scored_is_undefined_or_unreliable_in_words():
     alone = _score(metric, {"a": latent}, [lacking])
     assert alone.reasons[0] == "no animal can be used"
     labels = np.repeat(np.arange(6), 8)
-    silent = [TrialBlock(np.random.default_rng(i).normal(size=(48, 4)), labels) for i in range(3)]
+    silent = [Trials(np.random.default_rng(i).normal(size=(48, 4)), labels) for i in range(3)]
     noise = [metric.animal(str(i), [block], 6) for i, block in enumerate(silent)]
     unreliable = _score(metric, {"a": latent}, noise)
     assert unreliable.status in ("unreliable", "undefined")

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.metrics import TrialBlock, compare, rdm, spearman_brown, split_half
+from brainbench.metrics import Trials, compare, rdm, spearman_brown, split_half
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability import halves as _halves
 from brainbench.metrics.reliability.halves import members
@@ -25,7 +25,7 @@ def _shuffled(block, rng, units=True, stimuli=None):
     columns = rng.permutation(block.responses.shape[1]) if units else np.arange(block.responses.shape[1])
     labels = block.labels if stimuli is None else np.argsort(stimuli)[block.labels]
     keys = None if block.keys is None else [block.keys[row] for row in rows]
-    return TrialBlock(block.responses[np.ix_(rows, columns)], labels[rows], keys)
+    return Trials(block.responses[np.ix_(rows, columns)], labels[rows], keys)
 
 
 def test_the_mean_over_random_splits_is_the_mean_over_all_splits():
@@ -75,7 +75,7 @@ def test_the_order_of_trials_sessions_units_and_stimuli_is_irrelevant(seed, keys
 def test_order_is_irrelevant_for_sparse_counts_whose_trials_hold_the_same_values(seed):
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(4), 6)
-    block = TrialBlock(rng.poisson(0.7, size=(24, 12)).astype(float) + np.eye(4, 12)[labels], labels)
+    block = Trials(rng.poisson(0.7, size=(24, 12)).astype(float) + np.eye(4, 12)[labels], labels)
     expected = split_half([block], 4, splits=20)
     found = split_half([_shuffled(block, rng, stimuli=rng.permutation(4))], 4, splits=20)
     np.testing.assert_allclose(np.sort(found.rdm), np.sort(expected.rdm), atol=1e-12)
@@ -113,7 +113,7 @@ def test_a_noiseless_animal_is_perfectly_reliable_whatever_the_trial_counts():
     latent = make_latent(3)
     clean = make_block(latent, noise=0.0, repeats=9)
     keep = np.r_[np.flatnonzero(clean.labels != 2), np.flatnonzero(clean.labels == 2)[:2]]
-    fewer = TrialBlock(clean.responses[keep], clean.labels[keep], [clean.keys[i] for i in keep])
+    fewer = Trials(clean.responses[keep], clean.labels[keep], [clean.keys[i] for i in keep])
     for block in (clean, fewer):
         found = split_half([block], 6, splits=50)
         assert found.reliability == pytest.approx(1.0, abs=1e-12)
@@ -127,7 +127,7 @@ def test_spearman_brown_predicts_the_agreement_with_an_independent_repetition():
         block = make_block(latent, seed=seed, units=40, repeats=24, noise=5.0)
         first = np.concatenate([np.flatnonzero(block.labels == k)[:12] for k in range(6)])
         second = np.setdiff1d(np.arange(144), first)
-        parts = [TrialBlock(block.responses[rows], block.labels[rows]) for rows in (first, second)]
+        parts = [Trials(block.responses[rows], block.labels[rows]) for rows in (first, second)]
         found = [split_half([part], 6, splits=100) for part in parts]
         agreement.append(float(compare(found[0].rdm, found[1].rdm)))
         predicted.append(np.mean([part.reliability for part in found]))
@@ -138,7 +138,7 @@ def test_spearman_brown_predicts_the_agreement_with_an_independent_repetition():
 @pytest.mark.parametrize("offset", [0.0, 30.0, 1e8])
 def test_products_of_trials_and_half_means_give_the_same_halves(method, offset, monkeypatch):
     blocks = [make_block(make_latent(9), seed=i, units=15 + i, repeats=3 + i, noise=2.0) for i in range(3)]
-    blocks = [TrialBlock(block.responses + offset, block.labels, block.keys) for block in blocks]
+    blocks = [Trials(block.responses + offset, block.labels, block.keys) for block in blocks]
     by_products = split_half(blocks, 6, method=method, splits=40)
     monkeypatch.setattr(_halves, "_from_products", lambda *_: None)
     by_means = split_half(blocks, 6, method=method, splits=40)
@@ -150,7 +150,7 @@ def test_missing_entries_are_left_out_of_the_means_of_both_halves():
     rng = np.random.default_rng(0)
     holes = block.responses.copy()
     holes[rng.random(holes.shape) < 0.1] = np.nan
-    found = split_half([TrialBlock(holes, block.labels, block.keys)], 6, splits=30)
+    found = split_half([Trials(holes, block.labels, block.keys)], 6, splits=30)
     np.testing.assert_allclose(found.rdm, split_half([block], 6, splits=2).rdm, atol=1e-12)
     assert found.reliability > 0.99
 
@@ -159,10 +159,10 @@ def test_units_that_cannot_be_split_are_left_out_and_counted():
     block = make_block(make_latent(5), units=9, repeats=4)
     holes = block.responses.copy()
     holes[np.flatnonzero(block.labels == 1)[:3], 2] = np.nan
-    found = split_half([TrialBlock(holes, block.labels, block.keys)], 6, splits=10)
+    found = split_half([Trials(holes, block.labels, block.keys)], 6, splits=10)
     assert found.units == 8
     assert found.notes == ("1 units or bins left out: recorded in fewer than 2 trials of some stimulus",)
-    without = TrialBlock(np.delete(block.responses, 2, axis=1), block.labels, block.keys)
+    without = Trials(np.delete(block.responses, 2, axis=1), block.labels, block.keys)
     np.testing.assert_allclose(found.r, split_half([without], 6, splits=10).r, atol=1e-12)
 
 
@@ -170,7 +170,7 @@ def test_a_session_with_a_single_trial_of_a_stimulus_is_left_out_in_words():
     good = make_block(make_latent(6), seed=1)
     bad = make_block(make_latent(6), seed=2)
     keep = np.r_[np.flatnonzero(bad.labels != 5), np.flatnonzero(bad.labels == 5)[:1]]
-    bad = TrialBlock(bad.responses[keep], bad.labels[keep])
+    bad = Trials(bad.responses[keep], bad.labels[keep])
     found = split_half([good, bad], 6, stimuli=STIMULI, splits=10)
     np.testing.assert_allclose(found.rdm, split_half([good], 6, splits=10).rdm, atol=1e-12)
     assert found.notes == ("1 of 2 sessions left out: fewer than 2 trials of concave-far (1)",)
@@ -190,14 +190,14 @@ def test_an_animal_without_sessions_has_no_trials_of_anything():
 
 
 def test_silent_units_make_the_rdm_undefined_in_words():
-    found = split_half([TrialBlock(np.zeros((12, 5)), np.repeat(np.arange(6), 2))], 6, splits=5)
+    found = split_half([Trials(np.zeros((12, 5)), np.repeat(np.arange(6), 2))], 6, splits=5)
     assert "constant across units" in found.problem
 
 
 @pytest.mark.parametrize("method", ["sqeuclidean", "poisson"])
 def test_other_distances_split_too(method):
     block = make_block(make_latent(8), noise=1.0)
-    counts = TrialBlock(np.abs(block.responses), block.labels, block.keys)
+    counts = Trials(np.abs(block.responses), block.labels, block.keys)
     found = split_half([counts], 6, method=method, splits=20)
     np.testing.assert_allclose(found.rdm, rdm(counts.responses, counts.labels, method=method), rtol=1e-11)
     assert found.reliability > 0.5
@@ -210,15 +210,15 @@ def test_misuse_is_told_in_a_sentence():
     with pytest.raises(UsageError, match="Unknown noise covariance method"):
         split_half([block], 6, method="mahalanobis", noise="shrinkage")
     with pytest.raises(UsageError, match="keys repeat"):
-        split_half([TrialBlock(block.responses, block.labels, ["a"] * len(block.labels))], 6)
+        split_half([Trials(block.responses, block.labels, ["a"] * len(block.labels))], 6)
     with pytest.raises(UsageError, match="one key per trial"):
-        split_half([TrialBlock(block.responses, block.labels, ["a"])], 6)
+        split_half([Trials(block.responses, block.labels, ["a"])], 6)
     with pytest.raises(UsageError, match="run from 0 to 4; received 0 to 5"):
         split_half([block], 5)
     with pytest.raises(UsageError, match="integers 0 … K−1"):
-        split_half([TrialBlock(block.responses, np.array(STIMULI)[block.labels])], 6)
+        split_half([Trials(block.responses, np.array(STIMULI)[block.labels])], 6)
     with pytest.raises(DataError, match="infinite"):
-        split_half([TrialBlock(np.full((12, 2), np.inf), np.repeat(np.arange(6), 2))], 6)
+        split_half([Trials(np.full((12, 2), np.inf), np.repeat(np.arange(6), 2))], 6)
     with pytest.raises(DataError, match="never negative"):
         split_half([block], 6, method="poisson")
     with pytest.raises(dataclasses.FrozenInstanceError):

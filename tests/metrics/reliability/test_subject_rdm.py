@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from brainbench.metrics import TrialBlock, noise_precision, rdm, split_half, subject_rdm
+from brainbench.metrics import Trials, noise_precision, rdm, split_half, subject_rdm
 from brainbench.metrics.reliability.halves import Session, half_rdms, pattern_rdms, split_members
 from brainbench.metrics.reliability.trial_hashes import key_hashes
 from tests.factories.animals import make_block, make_latent
@@ -17,7 +17,7 @@ def _unbalanced(seed=0, units=12):
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(6), [5, 9, 12, 6, 4, 10])
     responses = rng.normal(size=(6, units))[labels] + rng.normal(size=(len(labels), units))
-    return TrialBlock(responses, labels, [f"{seed}/{i}" for i in range(len(labels))])
+    return Trials(responses, labels, [f"{seed}/{i}" for i in range(len(labels))])
 
 
 @pytest.mark.parametrize("noise", ["shrinkage_diag", "shrinkage_eye", "diag", "full"])
@@ -62,7 +62,7 @@ def test_crossnobis_is_zero_on_average_where_stimuli_are_alike(noise):
     labels = np.repeat(np.arange(6), [4, 5, 6, 7, 8, 9])
     found = []
     for _ in range(100):
-        block = TrialBlock(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
+        block = Trials(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
         found.append(subject_rdm("a", [block], 6, method="crossnobis", noise=noise, splits=1).rdm.mean())
     assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(100)
 
@@ -74,7 +74,7 @@ def test_crossnobis_is_zero_on_average_in_two_thousand_simulations(noise):
     labels = np.repeat(np.arange(6), [4, 5, 6, 8, 10, 12])
     found, biased = [], []
     for _ in range(2000):
-        block = TrialBlock(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
+        block = Trials(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
         found.append(subject_rdm("a", [block], 6, method="crossnobis", noise=noise, splits=1).rdm.mean())
         biased.append(subject_rdm("a", [block], 6, method="sqeuclidean", splits=1).rdm.mean())
     assert abs(np.mean(found)) < 3 * np.std(found) / np.sqrt(2000)
@@ -85,7 +85,7 @@ def test_crossnobis_is_zero_on_average_in_two_thousand_simulations(noise):
 def test_a_noiseless_rdm_does_not_depend_on_the_number_of_trials(method):
     patterns = np.random.default_rng(2).random(size=(6, 15))
     few, many = (np.repeat(np.arange(6), counts) for counts in ([4] * 6, [4, 9, 5, 12, 8, 6]))
-    found = [subject_rdm("a", [TrialBlock(patterns[x], x)], 6, method=method, splits=2).rdm for x in (few, many)]
+    found = [subject_rdm("a", [Trials(patterns[x], x)], 6, method=method, splits=2).rdm for x in (few, many)]
     np.testing.assert_allclose(*found, atol=1e-12)
 
 
@@ -94,7 +94,7 @@ def test_units_that_were_not_recorded_in_every_trial_leave_the_full_covariance_b
     responses = block.responses.copy()
     responses[0, 2] = np.nan
     responses[:, 5] = 3.0
-    gap = TrialBlock(responses, block.labels, block.keys)
+    gap = Trials(responses, block.labels, block.keys)
     diagonal = split_half([gap], 6, method="mahalanobis", noise="diag", splits=5)
     full = split_half([gap], 6, method="mahalanobis", noise="full", splits=5)
     assert diagonal.units == 7
@@ -108,10 +108,10 @@ def test_units_that_were_not_recorded_in_every_trial_leave_the_full_covariance_b
 def test_too_few_trials_for_a_covariance_are_a_problem_in_words():
     rng = np.random.default_rng(3)
     labels = np.repeat(np.arange(6), 4)
-    wide = TrialBlock(rng.normal(size=(24, 60)), labels)
+    wide = Trials(rng.normal(size=(24, 60)), labels)
     found = subject_rdm("a", [wide], 6, method="mahalanobis", noise="full")
     assert found.problem.startswith("no session has a noise covariance: The noise covariance of 60 units")
-    still = TrialBlock(np.repeat(rng.normal(size=(6, 5)), 4, axis=0), labels)
+    still = Trials(np.repeat(rng.normal(size=(6, 5)), 4, axis=0), labels)
     assert "no unit has noise" in subject_rdm("a", [still], 6, method="crossnobis").problem
 
 

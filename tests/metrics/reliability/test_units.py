@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import TrialBlock, reliable_units, subject_rdm, unit_reliability
+from brainbench.metrics import Trials, reliable_units, subject_rdm, unit_reliability
 
 
 def _make_block(seed=0, trials=20):
@@ -15,7 +15,7 @@ def _make_block(seed=0, trials=20):
     labels = np.repeat(np.arange(6), trials)
     tuned = rng.normal(size=(6, 10))[labels] + rng.normal(size=(len(labels), 10))
     responses = np.concatenate([tuned, rng.normal(size=(len(labels), 10)), np.zeros((len(labels), 1))], axis=1)
-    return TrialBlock(responses, labels, [f"{seed}/{i}" for i in range(len(labels))])
+    return Trials(responses, labels, [f"{seed}/{i}" for i in range(len(labels))])
 
 
 def test_a_units_reliability_is_signal_over_signal_and_noise():
@@ -38,7 +38,7 @@ def test_the_order_of_trials_and_units_is_irrelevant():
     block = _make_block()
     rng = np.random.default_rng(1)
     rows, columns = rng.permutation(120), rng.permutation(21)
-    moved = TrialBlock(block.responses[np.ix_(rows, columns)], block.labels[rows], [block.keys[row] for row in rows])
+    moved = Trials(block.responses[np.ix_(rows, columns)], block.labels[rows], [block.keys[row] for row in rows])
     np.testing.assert_allclose(unit_reliability([moved], 6)[0], unit_reliability([block], 6)[0][columns], atol=1e-12)
 
 
