@@ -49,14 +49,14 @@ class Loop(torch.nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         model, graph = self.model, self.model.encoder
         x = model.normaliser(x)
-        outputs = {name: x.new_zeros(len(x), *graph._shapes[name]) for name in graph.layers}
+        outputs = {name: x.new_zeros(len(x), *graph.shapes[name]) for name in graph.layers}
         memories, features = {}, []
         for t in range(x.shape[1]):
             new = {}
             for name in graph.layers:
                 node = graph.node(name)
                 inputs = [x[:, t]] if name in graph.spec.inputs else []
-                inputs += [outputs[edge.source] for edge in graph._predecessors[name]]
+                inputs += [outputs[edge.source] for edge in graph.spec.predecessors[name]]
                 y = node.operate(inputs)
                 if node.memory is not None:
                     y, memories[name] = node.memory(y, memories.get(name))

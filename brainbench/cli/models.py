@@ -19,13 +19,17 @@ def list_(
     """List the registered models with their sizes and the objectives that were published for them."""
     from fnmatch import fnmatchcase
 
+    from brainbench.models.architecture import Architecture
     from brainbench.models.recipes import list_recipes
     from brainbench.models.registry import describe_model, list_models
     from brainbench.models.training.checkpoints import shipped
 
     names = [*list_models(pattern), *(name for name in shipped() if fnmatchcase(name, pattern))]
     records = [describe_model(name) for name in names]
-    tags = {item.name: [recipe.partition(".")[2] for recipe in list_recipes(f"{item.name}.*")] for item in records}
+    tags = {
+        item.name: [str(Architecture.parse(recipe).tag) for recipe in list_recipes(f"{item.name}.*")]
+        for item in records
+    }
     rows = [
         [item.name, f"{item.parameters:,}", _millions(item.multiply_adds), item.family, ", ".join(tags[item.name])]
         for item in records

@@ -1,9 +1,10 @@
-"""Artificial networks of touch: temporal graphs, encoders, attenders, decoders, and how to get one by name.
+"""Artificial networks of touch: what turns a whisker array's forces and torques into activations.
 
-Public modules: :mod:`~brainbench.models.registry` (models by name), :mod:`~brainbench.models.user_models` (models
-from a user's file), :mod:`~brainbench.models.activations` (activations),
-:mod:`~brainbench.models.graph.temporal_graph` and
-:mod:`~brainbench.models.graph.spec` (temporal graphs), :mod:`~brainbench.models.cells`,
-:mod:`~brainbench.models.network` (encoder-attender-decoder), :mod:`~brainbench.models.heads.decoders`.
-Importing this package imports no framework.
+A name (:mod:`~brainbench.models.architecture`) is looked up in the :mod:`~brainbench.models.registry`, which builds an
+encoder (often a temporal graph of cells), an attender and a decoder into a :mod:`~brainbench.models.network`; its
+:mod:`~brainbench.models.activations` are what is compared with brains. Importing this package imports no framework.
 """
+
+from brainbench.models import zoo
+
+zoo.register()

@@ -21,8 +21,8 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError
-from brainbench.models.graph.tnn_state import load_named
 from brainbench.models.ops.layers import Conv2d, pair
+from brainbench.models.ops.parameters import load_named
 
 if TYPE_CHECKING:
     from brainbench.models.ops.gates import DeferredNormGrad

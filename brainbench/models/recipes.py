@@ -15,6 +15,7 @@ from functools import cache
 from itertools import product
 
 from brainbench.core.errors import unknown_name
+from brainbench.models.architecture import Architecture
 
 SOURCE = "thesis, tables 3.2-3.5"
 EPOCHS = 100
@@ -94,15 +95,14 @@ def recipe_for(architecture: str, objective: str) -> PublishedTraining:
         UsageError: there is no such objective.
     """
     known = _recipes()
-    full = architecture.replace("-small", "")
+    full = Architecture.parse(architecture).full
     if (name := f"{full}.{objective}") in known:
         return replace(known[name], architecture=architecture)
     objectives = tuple(dict.fromkeys(recipe.objective for recipe in known.values()))
     if objective not in objectives:
         raise unknown_name("objective", objective, objectives)
-    attender = full.partition("+")[2]
-    relative = f"zhuang{'+' + attender if attender in ('gpt', 'mamba') else ''}.{objective}"
-    if "-ln" in full and not attender and objective == "supervised":
+    relative = f"zhuang{'+' + full.attender if full.attender in ('gpt', 'mamba') else ''}.{objective}"
+    if full.layer_norm and not full.attender and objective == "supervised":
         relative = "zhuang-intersection-ln.supervised"
     return replace(known[relative], architecture=architecture, source=f"as {relative} of {SOURCE}")
 

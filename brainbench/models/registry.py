@@ -10,27 +10,24 @@ weights (:mod:`~brainbench.models.training.checkpoints`). Other packages add mod
 from __future__ import annotations
 
 import inspect
-import logging
 import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.plugins import load_entry_points
+from brainbench.models.architecture import OBJECTIVES, Architecture
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
 
 if TYPE_CHECKING:
     from torch import nn
 
-_log = logging.getLogger(__name__)
-
 ENTRY_POINTS = "brainbench.models"
-OBJECTIVES = ("supervised", "simclr", "simsiam", "ae")
-"""Tags of trained weights: the objective they were trained with."""
-
 _NAME = re.compile(r"[a-z0-9]+([-+][a-z0-9]+)*")
 
 
@@ -49,7 +46,8 @@ class ModelRecord:
     @property
     def source(self) -> str:
         """Top-level package that the code comes from."""
-        return self.build.__module__.partition(".")[0]
+        made = self.build.func if isinstance(self.build, partial) else self.build
+        return made.__module__.partition(".")[0]
 
 
 @dataclass(frozen=True)
@@ -72,9 +70,14 @@ class ModelDescription:
     trained: Mapping[str, Any] | None = None
     """For a name of trained weights: what their configuration says."""
 
+    @property
+    def architecture(self) -> Architecture:
+        """Parts of the architecture's name, without a tag."""
+        return replace(Architecture.parse(self.trained["architecture"] if self.trained else self.name), tag=None)
+
 
 _records: dict[str, ModelRecord] = {}
-_sources: set[str] = set()
+_loaded: set[str] = set()
 
 Factory = TypeVar("Factory", bound="Callable[..., nn.Module]")
 
@@ -109,7 +112,6 @@ def register_model(
         raise UsageError(f"A model name is lower-case letters and digits joined by '-' or '+'; received {name!r}.")
 
     def decorate(build: Factory) -> Factory:
-        _load_builtin()
         if name in _records:
             owner = _records[name].build
             raise UsageError(f"A model named {name!r} is already registered by {owner!r}; choose another name.")
@@ -124,13 +126,27 @@ def list_models(pattern: str = "*") -> list[str]:
     return [name for name in _known() if fnmatchcase(name, pattern)]
 
 
-def find_model(name: str) -> ModelRecord:
+def find_record(name: str) -> ModelRecord:
     """Return a copy of an architecture's record; a tag in the name is checked and left out.
 
     Raises:
         UsageError: no such model or tag; the message names the nearest.
     """
-    return replace(_known()[_split(name)[0]])
+    return replace(_known()[resolve_name(name).untrained])
+
+
+def resolve_name(name: str) -> Architecture:
+    """Return the parts of a name that exists.
+
+    Raises:
+        UsageError: no such model or tag; the message names the nearest.
+    """
+    parts, known = Architecture.parse(name), _known()
+    if parts.untrained not in known:
+        raise unknown_name("model", parts.untrained, known, hint="See them all with: brainbench models")
+    if parts.tag is not None and parts.tag not in OBJECTIVES:
+        raise unknown_name(f"weights tag of {parts.untrained!r}", parts.tag, OBJECTIVES)
+    return parts
 
 
 def load_model(
@@ -156,22 +172,22 @@ def load_model(
         if pretrained is not None:
             raise UsageError(f"{name!r} already names trained weights; pretrained is for registry names with a tag.")
         folder = find_folder(name)
-        architecture, tag = _split(read_config(folder)["architecture"])
+        parts = resolve_name(read_config(folder)["architecture"])
     else:
-        architecture, tag = _split(name)
-        if tag is None and pretrained is not None:
+        parts = resolve_name(name)
+        if parts.tag is None and pretrained is not None:
             raise UsageError(
                 f"Without a tag {name!r} is the untrained model; name the objective its weights were trained with, "
                 f"for example {name}.{OBJECTIVES[0]!s}, to load {os.fspath(pretrained)!r}."
             )
         if pretrained is not None and Path(pretrained).is_dir():
             folder = Path(pretrained)
-        elif tag is not None and pretrained is None:
+        elif parts.tag is not None and pretrained is None:
             folder = shipped().get(name)
             if folder is None:
                 raise UsageError(
-                    f"There are no weights for {name!r} yet; train them with: brainbench train {architecture} "
-                    f"--objective {tag}; or load the untrained model {architecture!r}."
+                    f"There are no weights for {name!r} yet; train them with: brainbench train {parts.untrained} "
+                    f"--objective {parts.tag}; or load the untrained model {parts.untrained!r}."
                 )
     if folder is not None:
         config = read_config(folder)
@@ -179,7 +195,7 @@ def load_model(
     from brainbench.models.ops.seeding import seeded
 
     with seeded(seed):
-        model = _build(architecture, options)
+        model = _build(parts.untrained, options)
     if pretrained is not None:
         load_weights(model, pretrained, what=name)
     return model.eval()
@@ -197,7 +213,7 @@ def describe_model(name: str) -> ModelDescription:
 
     folder = find_folder(name) if name.startswith(PREFIXES) else shipped().get(name)
     trained = read_config(folder) if folder is not None else None
-    record = find_model(trained["architecture"] if trained is not None else name)
+    record = find_record(trained["architecture"] if trained is not None else name)
     options = trained["options"] if trained is not None else {}
     with seeded(0):
         try:
@@ -229,44 +245,9 @@ def _build(architecture: str, options: Mapping[str, Any]) -> nn.Module:
     return build(**options)
 
 
-def _split(name: str) -> tuple[str, str | None]:
-    """Return (architecture, tag) of a name that exists."""
-    if name.endswith(".py") or any(mark in name for mark in "/\\:"):
-        raise UsageError(
-            f"{name!r} looks like a path, not a model's name; a model of your own is given as "
-            "path/to/file.py:make_model (load_user_model in Python)."
-        )
-    architecture, dot, tag = name.partition(".")
-    known = _known()
-    if architecture not in known:
-        raise unknown_name("model", architecture, known, hint="See them all with: brainbench models")
-    if dot and tag not in OBJECTIVES:
-        raise unknown_name(f"weights tag of {architecture!r}", tag, OBJECTIVES)
-    return architecture, tag if dot else None
-
-
 def _known() -> dict[str, ModelRecord]:
-    """Return the registry, filled on first use."""
-    _load_builtin()
-    if "entry points" not in _sources:
-        _sources.add("entry points")
-        _load_entry_points()
+    """Return the registry, with what other packages add entered on first use."""
+    if ENTRY_POINTS not in _loaded:
+        _loaded.add(ENTRY_POINTS)
+        load_entry_points(ENTRY_POINTS, lambda name, made: None)
     return _records
-
-
-def _load_builtin() -> None:
-    if "builtin" not in _sources:
-        _sources.add("builtin")
-        from brainbench.models import zoo
-
-        zoo.register()
-
-
-def _load_entry_points() -> None:
-    from importlib.metadata import entry_points
-
-    for entry in entry_points(group=ENTRY_POINTS):
-        try:
-            entry.load()
-        except Exception as error:  # noqa: BLE001 - another package's fault must not take our models away
-            _log.warning("The models of entry point %r (%s) could not be loaded: %s", entry.name, entry.value, error)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
+from brainbench.models.architecture import Architecture
 from brainbench.models.registry import register_model
 
 if TYPE_CHECKING:
@@ -16,11 +17,11 @@ if TYPE_CHECKING:
 LICENCE = "MIT"
 
 CELLS = {
-    "": ("time-decay", "time-decay memory"),
-    "-ugrnn": ("ugrnn", "UGRNN"),
-    "-intersection": ("intersection", "IntersectionRNN"),
-    "-gru": ("gru", "GRU"),
-    "-lstm": ("lstm", "LSTM"),
+    None: ("time-decay", "time-decay memory"),
+    "ugrnn": ("ugrnn", "UGRNN"),
+    "intersection": ("intersection", "IntersectionRNN"),
+    "gru": ("gru", "GRU"),
+    "lstm": ("lstm", "LSTM"),
 }
 """Name part → cell of :mod:`brainbench.models.cells` and words."""
 
@@ -40,97 +41,82 @@ CITATIONS = {
 ATTENDERS = (None, "gpt", "mamba")
 
 
-@dataclass(frozen=True)
-class Architecture:
-    """What a registry name says: an encoder, its memory and size, and an attender."""
+def family(item: Architecture) -> str:
+    """Return the encoder and attender, for grouping on leaderboards."""
+    base = f"{item.encoder}-feedforward" if item.cell == "feedforward" else item.encoder
+    return f"{base}+{item.attender}" if item.attender else base
 
-    encoder: str
-    """``zhuang``, ``resnet18`` or ``s4``."""
-    cell: str = ""
-    """Name part of a Zhuang encoder's cell (a key of :data:`CELLS`), or ``-feedforward``."""
-    layer_norm: bool = False
-    small: bool = False
-    attender: str | None = None
 
-    @property
-    def name(self) -> str:
-        """Registry name."""
-        name = f"{self.encoder}{self.cell}{'-ln' if self.layer_norm else ''}{'-small' if self.small else ''}"
-        return f"{name}+{self.attender}" if self.attender else name
+def description(item: Architecture) -> str:
+    """Return one line for people."""
+    if item.encoder == "resnet18":
+        text = "Residual network of every step alone"
+    elif item.encoder == "s4":
+        text = "Structured state-space encoder"
+    elif item.cell == "feedforward":
+        text = "Convolutional encoder without memory or feedback"
+    else:
+        text = f"Recurrent convolutional encoder, {CELLS[item.cell][1]}"
+    words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[item.attender]
+    return f"{text}{', LayerNorm' if item.layer_norm else ''}{words}{', 3/16 width' if item.small else ''}"
 
-    @property
-    def family(self) -> str:
-        """Encoder and attender, for grouping on leaderboards."""
-        base = f"{self.encoder}{self.cell if self.cell == '-feedforward' else ''}"
-        return f"{base}+{self.attender}" if self.attender else base
 
-    @property
-    def description(self) -> str:
-        """One line for people."""
-        if self.encoder == "resnet18":
-            text = "Residual network of every step alone"
-        elif self.encoder == "s4":
-            text = "Structured state-space encoder"
-        elif self.cell == "-feedforward":
-            text = "Convolutional encoder without memory or feedback"
-        else:
-            text = f"Recurrent convolutional encoder, {CELLS[self.cell][1]}"
-        words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[self.attender]
-        return f"{text}{', LayerNorm' if self.layer_norm else ''}{words}{', 3/16 width' if self.small else ''}"
+def citation(item: Architecture) -> str:
+    """Return the papers of the encoder and the attender."""
+    return "; ".join(CITATIONS[part] for part in (item.encoder, item.attender) if part)
 
-    @property
-    def citation(self) -> str:
-        """Papers of the encoder and the attender."""
-        return "; ".join(CITATIONS[part] for part in (self.encoder, self.attender) if part)
 
-    def build(
-        self, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological"
-    ) -> EncoderAttenderDecoder:
-        """Build the network with new random weights.
+def build(
+    item: Architecture, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological"
+) -> EncoderAttenderDecoder:
+    """Build the network with new random weights.
 
-        Args:
-            classes: Number of outputs.
-            decoder: ``linear``, ``mlp`` or ``all-steps``.
-            unroll: ``biological`` or ``full``, for a Zhuang encoder.
+    Args:
+        item: One of :func:`architectures`.
+        classes: Number of outputs.
+        decoder: ``linear``, ``mlp`` or ``all-steps``.
+        unroll: ``biological`` or ``full``, for a Zhuang encoder.
 
-        Raises:
-            UsageError: an option does not exist or does not fit.
-        """
-        from brainbench.models.heads.decoders import make_decoder
-        from brainbench.models.network import EncoderAttenderDecoder
+    Raises:
+        UsageError: an option does not exist or does not fit.
+    """
+    from brainbench.models.heads.decoders import make_decoder
+    from brainbench.models.network import EncoderAttenderDecoder
 
-        encoder = self._encoder()
-        attender = self._attender(encoder.features)
-        features = encoder.features if attender is None else attender.features
-        return EncoderAttenderDecoder(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
+    encoder = _encoder(item)
+    attender = _attender(item, encoder.features)
+    features = encoder.features if attender is None else attender.features
+    return EncoderAttenderDecoder(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
 
-    def _encoder(self) -> Encoder:
-        if self.encoder == "resnet18":
-            from brainbench.models.encoders.resnet import ResNet18Encoder
 
-            return ResNet18Encoder(small=self.small)
-        if self.encoder == "s4":
-            from brainbench.models.encoders.s4 import S4Encoder
+def _encoder(item: Architecture) -> Encoder:
+    if item.encoder == "resnet18":
+        from brainbench.models.encoders.resnet import ResNet18Encoder
 
-            return S4Encoder(small=self.small)
-        from brainbench.models.encoders.zhuang import ZhuangEncoder
-        from brainbench.models.graph.temporal_graph import TemporalGraph
+        return ResNet18Encoder(small=item.small)
+    if item.encoder == "s4":
+        from brainbench.models.encoders.s4 import S4Encoder
 
-        feedforward = self.cell == "-feedforward"
-        cell = "time-decay" if feedforward else CELLS[self.cell][0]
-        return TemporalGraph(ZhuangEncoder(cell, self.layer_norm, self.small, feedforward=feedforward).spec())
+        return S4Encoder(small=item.small)
+    from brainbench.models.encoders.zhuang import ZhuangEncoder
+    from brainbench.models.graph.temporal_graph import TemporalGraph
 
-    def _attender(self, features: int) -> Attender | None:
-        if self.attender == "gpt":
-            from brainbench.models.attenders.gpt import GPTAttender
+    feedforward = item.cell == "feedforward"
+    cell = "time-decay" if feedforward else CELLS[item.cell][0]
+    return TemporalGraph(ZhuangEncoder(cell, item.layer_norm, item.small, feedforward=feedforward).spec())
 
-            # As published, the ResNet's transformer is half as wide as its features.
-            return GPTAttender(features, features // 2 if self.encoder == "resnet18" else features)
-        if self.attender == "mamba":
-            from brainbench.models.attenders.mamba import MambaAttender
 
-            return MambaAttender(features)
-        return None
+def _attender(item: Architecture, features: int) -> Attender | None:
+    if item.attender == "gpt":
+        from brainbench.models.attenders.gpt import GPTAttender
+
+        # As published, the ResNet's transformer is half as wide as its features.
+        return GPTAttender(features, features // 2 if item.encoder == "resnet18" else features)
+    if item.attender == "mamba":
+        from brainbench.models.attenders.mamba import MambaAttender
+
+        return MambaAttender(features)
+    return None
 
 
 def architectures() -> Iterator[Architecture]:
@@ -140,7 +126,7 @@ def architectures() -> Iterator[Architecture]:
             for cell in CELLS:
                 for layer_norm in (False, True):
                     yield Architecture("zhuang", cell, layer_norm, small, attender)
-            yield Architecture("zhuang", "-feedforward", small=small, attender=attender)
+            yield Architecture("zhuang", "feedforward", small=small, attender=attender)
             for encoder in ("resnet18", "s4"):
                 yield Architecture(encoder, small=small, attender=attender)
 
@@ -148,6 +134,5 @@ def architectures() -> Iterator[Architecture]:
 def register() -> None:
     """Enter every architecture into the registry."""
     for item in architectures():
-        register_model(
-            item.name, family=item.family, description=item.description, citation=item.citation, licence=LICENCE
-        )(item.build)
+        text = {"family": family(item), "description": description(item), "citation": citation(item)}
+        register_model(str(item), licence=LICENCE, **text)(partial(build, item))

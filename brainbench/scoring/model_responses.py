@@ -133,13 +133,11 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     from brainbench.models.registry import describe_model, load_model
 
     known = describe_model(model)
-    architecture = (known.trained or {}).get("architecture", model).partition(".")[0]
-    encoder, _, attender = architecture.replace("-small", "").partition("+")
     card = ModelCard(
         model,
         family=known.family,
-        encoder=encoder,
-        attender=attender or "none",
+        encoder=known.architecture.memory_encoder,
+        attender=known.architecture.attender or "none",
         objective="untrained",
         multiply_adds=known.multiply_adds,
         seed=seed,

@@ -3,16 +3,17 @@ from collections import Counter
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.models.architecture import OBJECTIVES, Architecture
 from brainbench.models.recipes import find_recipe, list_recipes, recipe_for
-from brainbench.models.registry import OBJECTIVES, describe_model, list_models
+from brainbench.models.registry import describe_model, list_models
 from brainbench.models.training.optimizers import OPTIMIZERS, SCHEDULES
 
 
 def test_there_are_as_many_recipes_as_published():
-    counts = Counter(name.partition(".")[2] for name in list_recipes())
+    counts = Counter(Architecture.parse(name).tag for name in list_recipes())
     assert counts == {"supervised": 20, "simclr": 12, "simsiam": 12, "simsiam-warmup": 12, "ae": 12}
-    supervised = Counter(name.partition(".")[0].partition("+")[2] for name in list_recipes("*.supervised"))
-    assert supervised == {"": 10, "gpt": 7, "mamba": 3}
+    supervised = Counter(Architecture.parse(name).attender for name in list_recipes("*.supervised"))
+    assert supervised == {None: 10, "gpt": 7, "mamba": 3}
 
 
 @pytest.mark.parametrize("name", list_recipes())

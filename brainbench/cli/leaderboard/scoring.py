@@ -89,6 +89,7 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     Raises:
         UsageError: an architecture does not exist.
     """
+    from brainbench.models.architecture import Architecture, is_path
     from brainbench.models.registry import list_models
     from brainbench.models.training.checkpoints import shipped
 
@@ -96,10 +97,11 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     found: dict[str, None] = {}
     for pattern in patterns:
         plain = not any(mark in pattern for mark in "*?[")
-        if plain and (pattern in names or any(mark in pattern for mark in "/\\:") or "." in pattern):
+        if plain and (pattern in names or is_path(pattern) or Architecture.parse(pattern).tag is not None):
             found[pattern] = None
             continue
-        hits = [name for name in names if fnmatchcase(name, pattern) and ("." in name) == ("." in pattern)]
+        trained = Architecture.parse(pattern).tag is not None
+        hits = [name for name in (shipped() if trained else list_models()) if fnmatchcase(name, pattern)]
         if plain and not hits:
             raise unknown_name("model", pattern, names)
         found |= dict.fromkeys(hits)

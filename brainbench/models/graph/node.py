@@ -26,20 +26,17 @@ class NodeModule(nn.Module):
         self.before = activation(node.operation.activation if node.operation is not None else None)
         self.after = nn.Sequential(activation(node.activation), *_pool(node.pool))
 
-    def gather(self, inputs: list[torch.Tensor]) -> torch.Tensor:
-        """Resize inputs [B, C, H, W] to the node's grid and concatenate them on channels."""
-        fitted = [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
-        return fitted[0] if len(fitted) == 1 else torch.cat(fitted, 1)
+    def resized(self, inputs: list[torch.Tensor]) -> list[torch.Tensor]:
+        """Return the inputs [B, C, H, W] on the node's grid."""
+        return [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
 
     def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
-        """Return what the memory sees [B, ...]."""
+        """Join the resized inputs on channels and operate on them; return what the memory sees [B, ...]."""
+        inputs = self.resized(inputs)
         if isinstance(self.operation, Conv2d) and not (self.training and self.dropout.p):
-            fitted = [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
-            return self.before(self.operation.join(fitted))
-        x = self.dropout(self.gather(inputs))
-        if isinstance(self.operation, Linear):
-            x = x.flatten(1)
-        return self.before(self.operation(x))
+            return self.before(self.operation.join(inputs))
+        x = self.dropout(inputs[0] if len(inputs) == 1 else torch.cat(inputs, 1))
+        return self.before(self.operation(x.flatten(1) if isinstance(self.operation, Linear) else x))
 
 
 def _operation(node: Node, shape: Shape) -> tuple[nn.Module, int]:

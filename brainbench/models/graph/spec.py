@@ -236,9 +236,16 @@ class GraphSpec:
         """Nodes by name."""
         return {node.name: node for node in self.nodes}
 
-    def predecessors(self, name: str) -> tuple[Edge, ...]:
-        """Return the edges into a node, sorted by the name of their source."""
-        return tuple(sorted((edge for edge in self.edges if edge.target == name), key=lambda edge: edge.source))
+    @cached_property
+    def predecessors(self) -> Mapping[str, tuple[Edge, ...]]:
+        """Edges into each node, sorted by the name of their source."""
+        ordered = sorted(self.edges, key=lambda edge: edge.source)
+        return {node.name: tuple(edge for edge in ordered if edge.target == node.name) for node in self.nodes}
+
+    def delays(self, unroll: Unroll) -> dict[tuple[str, str], int]:
+        """Return how many steps each connection (source, target) takes: 1, or 0 within a step."""
+        check_unroll(unroll)
+        return {(e.source, e.target): 1 if unroll == "biological" or e.feedback else 0 for e in self.edges}
 
     def shapes(self, input_shape: Shape | None = None) -> tuple[dict[str, Shape], dict[str, Shape]]:
         """Return each node's concatenated input shape and output shape.
@@ -273,7 +280,7 @@ class GraphSpec:
             if name in self.inputs:
                 return stimulus[1:]
             source = max(
-                (e.source for e in self.predecessors(name) if not e.feedback), key=self.order.index, default=None
+                (e.source for e in self.predecessors[name] if not e.feedback), key=self.order.index, default=None
             )
             if source is None:
                 raise UsageError(f"Node {name!r} has only feedback inputs; say with shape_from whose grid it takes.")
@@ -286,7 +293,7 @@ class GraphSpec:
     def _channels(self, name: str, stimulus: Shape, outputs: Mapping[str, Shape]) -> int:
         seen = stimulus[0] if name in self.inputs else 0
         try:
-            return seen + sum(outputs[edge.source][0] for edge in self.predecessors(name))
+            return seen + sum(outputs[edge.source][0] for edge in self.predecessors[name])
         except KeyError as error:
             raise UsageError(
                 f"Node {name!r} has no operation and receives feedback from {error}; give it one."
@@ -294,7 +301,7 @@ class GraphSpec:
 
     def _check_grids(self, name: str, grid: Shape, stimulus: Shape, outputs: Mapping[str, Shape]) -> None:
         node = self.by_name[name]
-        arriving = {edge.source: outputs[edge.source][1:] for edge in self.predecessors(name)}
+        arriving = {edge.source: outputs[edge.source][1:] for edge in self.predecessors[name]}
         if name in self.inputs:
             arriving["the stimulus"] = stimulus[1:]
         for source, size in arriving.items():
@@ -311,32 +318,31 @@ class GraphSpec:
 
     def first_response(self, unroll: Unroll = "biological") -> dict[str, int]:
         """Return for each node the step at which it first responds to the stimulus at step 0."""
-        check_unroll(unroll)
-        delay = {edge: 1 if unroll == "biological" or edge.feedback else 0 for edge in self.edges}
+        delay = self.delays(unroll)
         first = dict.fromkeys(self.inputs, 0)
         for _ in self.nodes:
             for edge in self.edges:
                 if edge.source in first:
-                    step = first[edge.source] + delay[edge]
+                    step = first[edge.source] + delay[edge.source, edge.target]
                     first[edge.target] = min(step, first.get(edge.target, step))
         return {name: first[name] for name in self.order}
 
     def receptive_field(self, unroll: Unroll = "biological") -> int | None:
         """Return how many steps back the output can see, its own step included; None: all of them."""
-        check_unroll(unroll)
-        if any(node.memory is not None for node in self.nodes) or any(len(group) > 1 for group in self.groups()):
+        delay = self.delays(unroll)
+        if any(node.memory is not None for node in self.nodes) or any(len(group) > 1 for group in self.groups):
             return None
         if any(edge.source == edge.target for edge in self.edges):
             return None
         last = dict.fromkeys(self.inputs, 1)
-        for name in (name for group in self.groups() for name in group):
-            for edge in self.predecessors(name):
-                delay = 1 if unroll == "biological" or edge.feedback else 0
-                last[name] = max(last.get(name, 0), last[edge.source] + delay)
+        for name in (name for group in self.groups for name in group):
+            for edge in self.predecessors[name]:
+                last[name] = max(last.get(name, 0), last[edge.source] + delay[edge.source, name])
         return last[self.output]
 
+    @cached_property
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """Return the strongly connected components in the order in which they can be computed."""
+        """Strongly connected components in the order in which they can be computed."""
         reach = {node.name: {node.name} for node in self.nodes}
         for _ in self.nodes:
             for edge in self.edges:

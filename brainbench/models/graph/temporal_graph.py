@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -20,14 +20,12 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.models.cells import GatedCell, IntersectionRNN
 from brainbench.models.graph.node import NodeModule
 from brainbench.models.graph.spec import GraphSpec, Shape, Unroll, check_unroll
-from brainbench.models.graph.tnn_config import read_graph
-from brainbench.models.graph.tnn_state import check_named, copy_named
-from brainbench.models.graph.unrolling import delays, needed_steps
-from brainbench.models.ops import dispatch
+from brainbench.models.graph.tnn_import import read_graph
+from brainbench.models.graph.unrolling import Sweep, needed_steps
 from brainbench.models.ops.layers import Conv2d, Linear
+from brainbench.models.ops.parameters import check_named, copy_named
 
 _log = logging.getLogger(__name__)
 
@@ -48,7 +46,8 @@ class TemporalGraph(nn.Module):
     Args:
         spec: The graph. ``spec.input_shape`` (C, H, W) is what every step of the stimulus must have.
 
-    ``layers`` lists the nodes in feedforward order; :meth:`step` streams, :meth:`forward` takes a sweep.
+    ``layers`` lists the nodes in feedforward order, ``shapes`` what each gives at one step; :meth:`step` streams,
+    :meth:`forward` takes a sweep.
     """
 
     def __init__(self, spec: GraphSpec) -> None:
@@ -57,10 +56,8 @@ class TemporalGraph(nn.Module):
         self._open_grid = False
         self.spec = spec
         self.layers: tuple[str, ...] = spec.order
-        inputs, self._shapes = spec.shapes()
+        inputs, self.shapes = spec.shapes()
         self.nodes = nn.ModuleDict({name: NodeModule(spec.by_name[name], inputs[name]) for name in spec.order})
-        self._groups = spec.groups()
-        self._predecessors = {name: spec.predecessors(name) for name in spec.order}
 
     @classmethod
     def from_config(
@@ -94,7 +91,7 @@ class TemporalGraph(nn.Module):
     @property
     def features(self) -> int:
         """Number of output values of one step."""
-        return math.prod(self._shapes[self.spec.output])
+        return math.prod(self.shapes[self.spec.output])
 
     @property
     def latency(self) -> int:
@@ -127,7 +124,7 @@ class TemporalGraph(nn.Module):
     def tnn_parameters(self) -> dict[str, torch.Tensor]:
         """Return the parameters under PyTorchTNN's names."""
         renamed: dict[str, torch.Tensor] = {}
-        for name, node in self._items():
+        for name, node in self.named_nodes():
             renamed.update({f"{_tnn_owner(name, node)}.{key}": p for key, p in node.operation.named_parameters()})
             if node.memory is not None:
                 cell = node.memory.tnn_parameters()
@@ -137,7 +134,7 @@ class TemporalGraph(nn.Module):
     def _resized_by(self, state: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """Return the weights in ``state`` that differ from ours only as another stimulus shape would make them."""
         resized = {}
-        for name, node in self._items():
+        for name, node in self.named_nodes():
             key = f"{_tnn_owner(name, node)}.weight"
             follows = isinstance(node.operation, Linear) or name in self.spec.inputs
             if key in state and follows and isinstance(node.operation, (Conv2d, Linear)):
@@ -147,7 +144,7 @@ class TemporalGraph(nn.Module):
         return resized
 
     def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
-        for name, node in self._items():
+        for name, node in self.named_nodes():
             shape = resized.get(f"{_tnn_owner(name, node)}.weight")
             if shape is not None and isinstance(node.operation, (Conv2d, Linear)):
                 node.operation.weight = nn.Parameter(node.operation.weight.new_empty(shape))
@@ -166,7 +163,7 @@ class TemporalGraph(nn.Module):
             return
         spec = replace(self.spec, input_shape=shape)
         inputs, outputs = spec.shapes()
-        for name, node in self._items():
+        for name, node in self.named_nodes():
             if isinstance(node.operation, (Conv2d, Linear)):
                 dense = isinstance(node.operation, Linear)
                 needed = math.prod(inputs[name]) if dense else inputs[name][0]
@@ -176,13 +173,13 @@ class TemporalGraph(nn.Module):
                         f"{needed} values and has weights for {node.operation.weight.shape[1]}."
                     )
             node.grid = inputs[name][1:]
-        self.spec, self._shapes, self._open_grid = spec, outputs, False
+        self.spec, self.shapes, self._open_grid = spec, outputs, False
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of matrix products and convolutions in one step of one stimulus."""
         total = 0
-        for name, node in self._items():
-            places = math.prod(self._memory_grid(name))
+        for name, node in self.named_nodes():
+            places = math.prod(self.memory_grid(name))
             if isinstance(node.operation, (Conv2d, Linear)):
                 total += node.operation.weight.numel() * places
             if node.memory is not None:
@@ -206,15 +203,16 @@ class TemporalGraph(nn.Module):
             raise UsageError("The stimulus shape is still open; pass input_shape to TemporalGraph.from_config.")
         like = next(self.parameters())
         options = {"device": device or like.device, "dtype": dtype or like.dtype}
-        outputs = {name: torch.zeros(batch, *self._shapes[name], **options) for name in self.layers}
+        outputs = {name: torch.zeros(batch, *self.shapes[name], **options) for name in self.layers}
         memories = {
-            name: node.memory.initial_state(batch, *self._memory_grid(name), **options)
-            for name, node in self._items()
+            name: node.memory.initial_state(batch, *self.memory_grid(name), **options)
+            for name, node in self.named_nodes()
             if node.memory is not None
         }
         return GraphState(outputs, memories)
 
-    def _memory_grid(self, name: str) -> Shape:
+    def memory_grid(self, name: str) -> Shape:
+        """Return the grid on which a node remembers, which is that of what its operation gives."""
         node = self.spec.by_name[name]
         shape = (1, *self.node(name).grid)
         return (node.operation.output_shape(shape) if node.operation is not None else shape)[1:]
@@ -241,19 +239,16 @@ class TemporalGraph(nn.Module):
         memories: dict[str, torch.Tensor] = {}
         for name in self.layers:
             inputs = [x] if name in self.spec.inputs else []
-            for edge in self._predecessors[name]:
+            for edge in self.spec.predecessors[name]:
                 delayed = unroll == "biological" or edge.feedback
                 inputs.append((state.outputs if delayed else outputs)[edge.source])
-            outputs[name] = self._advance(name, self.node(name).operate(inputs), state.memories, memories)
+            outputs[name] = self.advance(name, self.node(name).operate(inputs), state.memories, memories)
         return outputs[self.spec.output], GraphState(outputs, memories)
 
-    def _advance(
-        self,
-        name: str,
-        x: torch.Tensor,
-        before: Mapping[str, torch.Tensor],
-        after: dict[str, torch.Tensor],
+    def advance(
+        self, name: str, x: torch.Tensor, before: Mapping[str, torch.Tensor], after: dict[str, torch.Tensor]
     ) -> torch.Tensor:
+        """Return a node's output [B, ...] for what its operation gave; read and write its memory's state by name."""
         node = self.node(name)
         if node.memory is not None:
             x, after[name] = node.memory(x, before.get(name))
@@ -297,8 +292,8 @@ class TemporalGraph(nn.Module):
             x = x.flatten(0, 1).to(memory_format=torch.channels_last).unflatten(0, x.shape[:2])
         output = self.spec.output
         whole, final = (wanted, {output}) if last else (wanted | {output}, set())
-        pass_ = _Pass(self, x, unroll, needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final))
-        kept = pass_.run(whole | final)
+        steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
+        kept = Sweep(self, x, unroll, steps).run(whole | final)
         y = kept[output][1]
         y = y[:, -1] if last else y
         if return_activations is False:
@@ -318,138 +313,14 @@ class TemporalGraph(nn.Module):
         return set(return_activations)
 
     @property
-    def _draws(self) -> bool:
-        """Whether nodes draw random numbers, which every stimulus then needs for itself."""
-        return self.training and any(node.dropout.p > 0 for _, node in self._items())
+    def draws_random(self) -> bool:
+        """True where nodes draw random numbers, which every stimulus then needs for itself."""
+        return self.training and any(node.dropout.p > 0 for _, node in self.named_nodes())
 
-    def _items(self) -> list[tuple[str, NodeModule]]:
+    def named_nodes(self) -> list[tuple[str, NodeModule]]:
+        """Return the names and modules of the nodes in feedforward order."""
         return [(name, self.node(name)) for name in self.layers]
 
 
 def _tnn_owner(name: str, node: NodeModule) -> str:
     return f"{name}._pre_memory.{'lin' if isinstance(node.operation, Linear) else 'conv'}"
-
-
-class _Pass:
-    """One sweep through a graph. Kept outputs are (first step, [B, steps, ...])."""
-
-    def __init__(
-        self, graph: TemporalGraph, x: torch.Tensor, unroll: Unroll, steps: Mapping[str, tuple[int, int]]
-    ) -> None:
-        self.graph, self.x, self.steps = graph, x, steps
-        self.batch = len(x)
-        self.delay = delays(graph.spec, unroll)
-        self.arrival = dict.fromkeys(graph.layers, 0) if graph._draws else graph.spec.first_response(unroll)
-        self.kept: dict[str, tuple[int, torch.Tensor]] = {}
-
-    def run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
-        """Compute every group of nodes in turn; drop what no later one reads."""
-        if torch.is_grad_enabled() and dispatch.usable(self.x):
-            from brainbench.models.ops.gates import recorded
-
-            with recorded(self._tapes()):
-                return self._run(wanted)
-        return self._run(wanted)
-
-    def _tapes(self) -> Iterator[tuple[nn.Module, Any]]:
-        """Yield what convolutions and gates write down for their gradients."""
-        from brainbench.models.ops.convolution import DeferredWeightGrad
-        from brainbench.models.ops.gates import DeferredNormGrad
-
-        for name, node in self.graph._items():
-            first, stop = self.steps[name]
-            operation, memory = node.operation, node.memory
-            if stop == first:
-                continue
-            stimuli = self.batch * (stop - first)
-            if isinstance(operation, Conv2d) and operation.fits(self.x):
-                yield operation, DeferredWeightGrad(operation, node.grid, stimuli)
-            if isinstance(memory, GatedCell):
-                grid = self.graph._memory_grid(name)
-                for conv in [part for part in memory.modules() if isinstance(part, Conv2d)]:
-                    yield conv, DeferredWeightGrad(conv, grid, stimuli)
-            if isinstance(memory, IntersectionRNN):
-                yield memory, DeferredNormGrad([memory.norm(gate) for gate in memory.gates] if memory.norms else [])
-
-    def _run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
-        groups = self.graph._groups
-        for position, group in enumerate(groups):
-            later = {name for other in groups[position + 1 :] for name in other}
-            read = {e.source for name in later for e in self.graph._predecessors[name]} | set(wanted)
-            cyclic = any(edge.source in group for name in group for edge in self.graph._predecessors[name])
-            if cyclic:
-                self._loop(group, read)
-            elif self.steps[group[0]][1]:
-                self._sweep(group[0])
-            for name in [name for name in self.kept if name not in read]:
-                del self.kept[name]
-        return self.kept
-
-    def _window(self, source: str, first: int, stop: int) -> torch.Tensor:
-        """Return the outputs of a node at steps first to stop [B, stop − first, ...]; before its first step, zeros."""
-        start, values = self.kept.get(source, (0, self.x.new_zeros(self.batch, 0, *self.graph._shapes[source])))
-        missing = max(0, -first)
-        part = values[:, max(first, 0) - start : max(stop, 0) - start]
-        if not missing:
-            return part
-        return torch.cat((part.new_zeros(self.batch, min(missing, stop - first), *values.shape[2:]), part), 1)
-
-    def _sweep(self, name: str) -> None:
-        """Compute a node outside every loop: all steps at once, but for its recurrence."""
-        graph = self.graph
-        node, (first, stop) = graph.node(name), self.steps[name]
-        count = stop - first
-        inputs = [self.x[:, first:stop].flatten(0, 1)] if name in graph.spec.inputs else []
-        for edge in graph._predecessors[name]:
-            lag = self.delay[edge.source, name]
-            inputs.append(self._window(edge.source, first - lag, stop - lag).flatten(0, 1))
-        y = node.operate(inputs)
-        if node.memory is not None:
-            projected = node.memory.project(y)
-            rows = [part.unflatten(0, (self.batch, count)) for part in (y, *projected)]
-            state, outputs = None, []
-            for t in range(count):
-                x, *shares = (row[:, t] for row in rows)
-                output, state = node.memory(x, state, tuple(shares))
-                outputs.append(output)
-            y = torch.stack(outputs, 1).flatten(0, 1)
-        self.kept[name] = first, node.after(y).unflatten(0, (self.batch, count))
-
-    def _loop(self, group: tuple[str, ...], read: Collection[str]) -> None:
-        """Compute nodes that feed back on one another step by step."""
-        graph = self.graph
-        previous = {name: self.x.new_zeros(1, *graph._shapes[name]) for name in group}
-        memories: dict[str, torch.Tensor] = {}
-        history: dict[str, list[torch.Tensor]] = {name: [] for name in group if name in read}
-        for t in range(max(self.steps[name][1] for name in group)):
-            current: dict[str, torch.Tensor] = {}
-            for name in group:
-                if t >= self.steps[name][1]:
-                    continue
-                # What the stimulus has not reached yet is the same for all: one row stands for the batch.
-                rows = self.batch if t >= self.arrival[name] else 1
-                inputs = [_rows(self.x[:, t], rows)] if name in graph.spec.inputs else []
-                for edge in graph._predecessors[name]:
-                    lag = self.delay[edge.source, name]
-                    if edge.source in previous:
-                        value = (previous if lag else current)[edge.source]
-                    else:
-                        value = self._window(edge.source, t - lag, t - lag + 1)[:, 0]
-                    inputs.append(_rows(value, rows))
-                if name in memories:
-                    memories[name] = _rows(memories[name], rows)
-                current[name] = graph._advance(name, graph.node(name).operate(inputs), memories, memories)
-            previous = {**previous, **current}
-            for name, outputs in history.items():
-                if name in current:
-                    outputs.append(current[name])
-        for name, outputs in history.items():
-            if outputs:
-                self.kept[name] = 0, torch.stack([_rows(output, self.batch) for output in outputs], 1)
-
-
-def _rows(values: torch.Tensor, rows: int) -> torch.Tensor:
-    """Give one row to all, or take one of rows that are equal."""
-    if len(values) == rows:
-        return values
-    return values[:1].expand(rows, *values.shape[1:])

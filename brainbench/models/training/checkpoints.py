@@ -119,7 +119,7 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    from brainbench.models.graph.tnn_state import load_named
+    from brainbench.models.ops.parameters import load_named
 
     if not Path(path).is_file():
         raise DataFileNotFoundError(f"There is no file of weights {os.fspath(path)!r} for {what!r}.")

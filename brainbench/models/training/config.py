@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.models.architecture import OBJECTIVES
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, TrainingSetting, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
 
@@ -29,7 +30,7 @@ class TrainingConfig:
     model: str
     """Registry name without a tag."""
     objective: str = "supervised"
-    """One of :data:`~brainbench.models.registry.OBJECTIVES`."""
+    """One of :data:`~brainbench.models.architecture.OBJECTIVES`."""
     optimizer: str = "sgd"
     """One of :data:`~brainbench.models.training.optimizers.OPTIMIZERS`."""
     schedule: str = "step"
@@ -66,8 +67,6 @@ class TrainingConfig:
     """Precision of the published weights: ``float32``, ``float16`` or ``bfloat16``."""
 
     def __post_init__(self) -> None:
-        from brainbench.models.registry import OBJECTIVES
-
         for kind, value, allowed in (
             ("objective", self.objective, OBJECTIVES),
             ("precision", self.precision, PRECISIONS),

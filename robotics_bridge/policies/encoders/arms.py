@@ -16,6 +16,7 @@ from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.models.architecture import Architecture
 from brainbench.models.cells import GRU
 from brainbench.models.registry import list_models
 from robotics_bridge import hands
@@ -95,7 +96,7 @@ class EncoderConfig:
         """
         if self.arm in ARMS:
             return ARMS[self.arm](self)
-        if ":" not in self.arm and self.arm.partition(".")[0] not in list_models():
+        if ":" not in self.arm and Architecture.parse(self.arm).untrained not in list_models():
             raise unknown_name(
                 "tactile encoder", self.arm, (*ARMS, *list_models()), hint="See networks with: brainbench models list"
             )

@@ -40,7 +40,7 @@ def test_the_graph_is_the_published_one_at_either_size(cell, small):
     inputs, outputs = spec.shapes()
     feedback = {(edge.source, edge.target) for edge in spec.edges if edge.feedback}
     assert feedback == {(f"conv{a}", f"conv{b}") for a, b in ((3, 2), (4, 2), (4, 3), (5, 3), (5, 4), (6, 4), (6, 5))}
-    assert {edge.source for edge in spec.predecessors("fc7")} == {"conv2", "conv4", "conv6"}
+    assert {edge.source for edge in spec.predecessors["fc7"]} == {"conv2", "conv4", "conv6"}
     widths = [18, 24, 48, 72, 72, 48] if small else [96, 128, 256, 384, 384, 256]
     assert [outputs[f"conv{i + 1}"] for i in range(6)] == [(width, 4, 6) for width in widths]
     assert outputs["fc7"] + outputs["fc8"] == ((192, 96) if small else (1024, 512))

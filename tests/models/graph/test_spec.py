@@ -112,8 +112,8 @@ def test_convolved_shapes_equal_pytorchs(kernel, stride, padding, grid):
 def test_feedback_alone_makes_no_group_but_a_loop_does():
     straight = _spec([Edge("a", "b"), Edge("b", "c")])
     looped = _spec([Edge("a", "b"), Edge("b", "c"), Edge("c", "b", feedback=True)])
-    assert straight.groups() == (("a",), ("b",), ("c",))
-    assert looped.groups() == (("a",), ("b", "c"))
+    assert straight.groups == (("a",), ("b",), ("c",))
+    assert looped.groups == (("a",), ("b", "c"))
 
 
 def test_an_unknown_memory_names_the_nearest():

@@ -6,7 +6,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.graph.spec import Convolution, Dense, Memory, Pool
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.graph.tnn_config import read_graph
+from brainbench.models.graph.tnn_import import read_graph
 
 
 def _node(name, shape_from, **changes):

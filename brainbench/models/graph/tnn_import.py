@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 from brainbench.core.errors import DataError, listing, unknown_name
@@ -95,13 +96,13 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
 
 
 def _acyclic(ends: list[tuple[str, str]]) -> bool:
-    left = list(ends)
-    while left:
-        sources = {source for source, _ in left}
-        rest = [end for end in left if end[1] in sources]
-        if len(rest) == len(left):
-            return False
-        left = rest
+    graph: dict[str, set[str]] = {}
+    for source, target in ends:
+        graph.setdefault(target, set()).add(source)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError:
+        return False
     return True
 
 

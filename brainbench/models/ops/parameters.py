@@ -1,4 +1,4 @@
-"""Parameters under PyTorchTNN's names, loaded into our modules."""
+"""Loading of named parameters into modules: all or nothing, and errors that say which do not fit."""
 
 from __future__ import annotations
 
