@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.rotations import conjugate, from_xyzw, multiply, rotate
@@ -18,7 +19,6 @@ from robotics_bridge.envs.actions import ActionMap
 from robotics_bridge.envs.actuators import Drives
 from robotics_bridge.envs.checkpoint import restore, saved
 from robotics_bridge.envs.contacts import Contacts
-from robotics_bridge.envs.cuda_graphs import Captured
 from robotics_bridge.envs.goal_state import GoalState
 from robotics_bridge.envs.observations import observe, shapes_of
 from robotics_bridge.envs.reset import Resets
@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 ENGINES = ("mujoco", "warp")
 _WILD = 1e4
 """Speed (m/s or rad/s) beyond which an environment counts as diverged."""
+_ADVICE = (
+    "Terms and watches of a task may not copy from the processor or wait for it (brainbench.core.rotations.constant "
+    "keeps constants on the device); change them, or make the environment with graphs=False."
+)
 
 
 class Env:
@@ -131,10 +135,15 @@ class Env:
         self._judge_part: Callable[[Env], Any] = Env._judge
         if self.device.type == "cuda" and graphs is not False:
             kept = [self._extent] if self.touch is None else [self._extent, self.touch.reading]
+            generators = [self._generator]
+            recorder = warp_recorder(self.world.warp_device, generators)
             self._aim_part, self._judge_part = (
-                Captured(part, self._generator, self.world.warp_device, kept=kept, required=bool(graphs))
+                CudaGraphStep(
+                    part, recorder, subject="The control step", advice=_ADVICE, generators=generators, kept=kept,
+                    required=bool(graphs),
+                )
                 for part in (Env._aim, Env._judge)
-            )
+            )  # fmt: skip
         self.observations: dict[str, torch.Tensor] = {}
         """Of the last step or reset."""
         self.reset()
@@ -193,7 +202,7 @@ class Env:
     @property
     def recorded(self) -> bool:
         """Whether what a control step does around physics is replayed as CUDA graphs by now."""
-        return isinstance(self._judge_part, Captured) and self._judge_part.recorded
+        return isinstance(self._judge_part, CudaGraphStep) and self._judge_part.recorded
 
     @property
     def object_pose(self) -> torch.Tensor:

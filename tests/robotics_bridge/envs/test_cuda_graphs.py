@@ -19,12 +19,12 @@ import torch
 from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from brainbench.core.cuda_graphs import CudaGraphStep, Recorder
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import constant
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.envs.cuda_graphs import Captured
 from robotics_bridge.envs.simulation import World
 from robotics_bridge.tasks.step_context import StepContext
 from robotics_bridge.tasks.task import Reward
@@ -149,28 +149,29 @@ def _tensors(tree: Any) -> list[torch.Tensor]:
     return [leaf for leaf in _pytree.tree_leaves(tree) if isinstance(leaf, torch.Tensor)]
 
 
-class _Imitated(Captured):
-    """A captured part whose graph is a tape."""
+def _tape_recorder(native: bool) -> Recorder:
+    """Record on a tape; physics of MuJoCo Warp is all launches, C MuJoCo is noted call by call."""
 
-    native = False
-    """Whether physics is MuJoCo Warp's, all of it launches; C MuJoCo is noted call by call."""
-
-    def _record(self, work: Callable[[], Any]) -> tuple[Any, Any]:
+    def record(work: Callable[[], Any]) -> tuple[Any, Any]:
         tape, wp = _Tape(), warp()
         with pytest.MonkeyPatch.context() as patch, tape:
             patch.setattr(wp, "launch", tape.note(wp.launch))
             patch.setattr(wp.array, "zero_", tape.note(wp.array.zero_))
-            for name in () if self.native else ("reset", "refresh", "apply_push"):
+            for name in () if native else ("reset", "refresh", "apply_push"):
                 patch.setattr(World, name, tape.note(getattr(World, name)))
             result = work()
         return tape, result
 
+    return record
 
-def _imitate(env: Env) -> tuple[_Imitated, _Imitated]:
+
+def _imitate(env: Env) -> tuple[CudaGraphStep, CudaGraphStep]:
     kept = [env._extent] if env.touch is None else [env._extent, env.touch.reading]
-    parts = (_Imitated(Env._aim, env._generator, None), _Imitated(Env._judge, env._generator, None, kept=kept))
-    for part in parts:
-        part.native = env.world.native
+    record, generators = _tape_recorder(env.world.native), [env._generator]
+    parts = (
+        CudaGraphStep(Env._aim, record, subject="It", generators=generators),
+        CudaGraphStep(Env._judge, record, subject="It", generators=generators, kept=kept),
+    )
     env._aim_part, env._judge_part = parts
     return parts
 
@@ -236,41 +237,6 @@ def test_what_a_step_returned_is_not_overwritten_by_the_next_but_for_touch() -> 
     _same(returned, kept)
 
 
-class _Broken(Captured):
-    """A captured part that is not let record: its recording and the one that heals end as CUDA's would."""
-
-    recordings = 0
-
-    def _record(self, work: Callable[[], Any]) -> tuple[Any, Any]:
-        del work
-        self.recordings += 1
-        try:
-            raise RuntimeError("Cannot copy between CPU and CUDA tensors during CUDA graph capture")
-        finally:
-            raise RuntimeError("operation failed due to a previous error during capture")
-
-
-def test_a_part_that_cannot_be_recorded_says_so_once_and_runs_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
-    generator = torch.Generator().manual_seed(1)
-    part = _Broken(lambda: torch.rand(2, generator=generator), generator, None)
-    with caplog.at_level(logging.WARNING):
-        drawn = [part() for _ in range(5)]
-    expected = torch.rand(5, 2, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(torch.stack(drawn), expected)
-    assert part.recordings == 2
-    assert not part.recorded
-    said = [r.getMessage() for r in caplog.records if "launch by launch" in r.getMessage()]
-    assert len(said) == 1
-    assert "Cannot copy between CPU and CUDA" in said[0]
-
-
-def test_a_recording_that_is_asked_for_and_fails_is_an_error_that_tells_what_to_do() -> None:
-    generator = torch.Generator()
-    part = _Broken(lambda: None, generator, None, required=True, warm=0)
-    with pytest.raises(UsageError, match=r"Cannot copy between CPU.*graphs=False"):
-        part()
-
-
 def test_an_environment_does_not_outlive_its_last_reference() -> None:
     # Its device memory would wait for Python's collector, and be freed in the middle of another recording.
     env = _make("in_palm_rotate", {}, threads=1)
@@ -309,7 +275,7 @@ def _waiting(m: StepContext) -> torch.Tensor:
 def test_a_replayed_part_is_the_eager_part(task: str) -> None:
     env = _make(task, {}, num_envs=64, device="cuda", graphs=True)
     part = env._judge_part
-    assert isinstance(part, Captured)
+    assert isinstance(part, CudaGraphStep)
     for _ in range(12):
         env.step(torch.randn(64, env.num_actions, device="cuda"))
         if not part.recorded:
