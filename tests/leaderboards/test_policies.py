@@ -9,13 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-import leaderboards
 from brainbench.cli import app
 from leaderboards import rank, read_records
 from leaderboards.entries import entries_of
 from tests.leaderboards.test_schema import VALIDATOR
 
-POLICIES = Path(leaderboards.__file__).parent / "policies"
+POLICIES = Path(__file__).parents[2] / "leaderboards" / "policies"
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 
-import leaderboards
 from leaderboards import rank, read_records
 from leaderboards.audit import remarks
 from leaderboards.entries import entries_of
 from tests.leaderboards.test_schema import VALIDATOR
 
-RESULTS = Path(leaderboards.__file__).parent / "results"
+RESULTS = Path(__file__).parents[2] / "leaderboards" / "results"
 
 
 @pytest.fixture(scope="module")
