@@ -28,7 +28,7 @@ from brainbench.stimuli import (
     get_recipe,
 )
 from brainbench.stimuli.engines.protocol import Trace
-from brainbench.stimuli.objects.placed_object import box, cylinder, sphere
+from brainbench.stimuli.objects.primitives import box, cylinder, sphere
 
 DURATION = 0.2
 FRAMES = Frames(0.001, 0.001, round(DURATION * 1e3) - 1)

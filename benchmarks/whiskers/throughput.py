@@ -26,7 +26,7 @@ from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
 if TYPE_CHECKING:
     from brainbench.stimuli.objects.collections import NamedObject
-    from brainbench.stimuli.objects.placed_object import Solid
+    from brainbench.stimuli.objects.solid import Solid
 
 
 def timed(wp: Any, device: Any, run: Callable[[], None], repeats: int = 3) -> float:

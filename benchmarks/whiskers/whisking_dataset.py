@@ -24,7 +24,7 @@ from brainbench.core.files import hash_arrays
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.objects.collections import NamedObject, resolve_objects
-from brainbench.stimuli.objects.placed_object import box
+from brainbench.stimuli.objects.primitives import box
 from brainbench.stimuli.sweeps import local_pool, simulation
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings

@@ -11,8 +11,9 @@ if TYPE_CHECKING:
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.motion.recorded import Recorded, load_trajectory
     from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation, Whisking
-    from brainbench.stimuli.objects.placed_object import PlacedObject, Solid
+    from brainbench.stimuli.objects.placed_object import PlacedObject
     from brainbench.stimuli.objects.shapenet import load_shapenet
+    from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.readout import to_frame, to_grid
     from brainbench.stimuli.scenes.frames import Frames
     from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, list_recipes
@@ -73,7 +74,7 @@ __getattr__, __dir__ = lazy_exports(
         "Recipe": ".scenes.scene_files",
         "Recorded": ".motion.recorded",
         "Scene": ".scenes.scene",
-        "Solid": ".objects.placed_object",
+        "Solid": ".objects.solid",
         "Spin": ".motion.trajectories",
         "Still": ".motion.trajectories",
         "Stimuli": ".sources",

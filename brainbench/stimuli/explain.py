@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.engines.job_schedule import JobSchedule
     from brainbench.stimuli.engines.protocol import Trace
-    from brainbench.stimuli.objects.placed_object import Solid
+    from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.scenes.scene import Scene
 
 ATTRIBUTE = "explanation"

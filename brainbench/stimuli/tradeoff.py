@@ -45,7 +45,8 @@ from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.figures.tradeoff import draw_bench, draw_collisions
 from brainbench.stimuli.objects.mesh_solids import touchable
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
-from brainbench.stimuli.objects.placed_object import PlacedObject, rodgers_solid
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.primitives import rodgers_solid
 from brainbench.stimuli.validation.bench_tests import peg, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 

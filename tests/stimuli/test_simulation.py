@@ -12,7 +12,9 @@ from brainbench.stimuli import simulation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject, euler_matrix, sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray

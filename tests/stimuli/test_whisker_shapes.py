@@ -11,7 +11,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.mujoco.engine import MujocoBackend
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import euler_matrix
+from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whisker_shapes import record

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.stimuli.engines import get_backend
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.objects.placed_object import PlacedObject, sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray

@@ -94,7 +94,7 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
     import math
 
     from brainbench.stimuli.objects.collections import resolve_objects
-    from brainbench.stimuli.objects.placed_object import rodgers_solid
+    from brainbench.stimuli.objects.primitives import rodgers_solid
     from brainbench.stimuli.scenes.recipes import get_recipe
     from robotics_bridge.exploration.record import Explored
     from robotics_bridge.physics import Geometry

@@ -92,7 +92,7 @@ def _member(
 ) -> tuple[dict[str, Any], Solid]:
     from brainbench.core.errors import unknown_name
     from brainbench.stimuli.objects import procedural
-    from brainbench.stimuli.objects.placed_object import shape_solid
+    from brainbench.stimuli.objects.mesh_solids import shape_solid
 
     family = name.removeprefix("family:")
     if family not in procedural.list_families():
@@ -110,7 +110,7 @@ def _file(
 ) -> tuple[dict[str, Any], Solid]:
     from brainbench.core.errors import UsageError
     from brainbench.geometry import UNITS, load_mesh
-    from brainbench.stimuli.objects.placed_object import mesh_solid
+    from brainbench.stimuli.objects.mesh_solids import mesh_solid
 
     if unit is None:
         raise UsageError(f"Mesh files carry no unit; say what the numbers in {source!r} are: --unit {'|'.join(UNITS)}.")

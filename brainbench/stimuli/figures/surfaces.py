@@ -54,7 +54,7 @@ class DrawnSurface:
 
 def object_surface(item: PlacedObject) -> DrawnSurface:
     """Return the surface of an object: its mesh, or what whiskers touch when it has none."""
-    from brainbench.stimuli.objects.placed_object import euler_matrix
+    from brainbench.stimuli.objects.placement import euler_matrix
 
     obstacle = item.obstacle()
     if item.solid.mesh is None and obstacle.surface is not None:

@@ -16,9 +16,9 @@ import numpy as np
 from brainbench.core.errors import DataFileNotFoundError, UsageError, unknown_name
 from brainbench.core.files import file_hash
 from brainbench.geometry import Mesh
-from brainbench.stimuli.objects.placed_object import Solid, mesh_solid, shape_solid
+from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
 from brainbench.stimuli.objects.procedural import DETAIL, describe_family, list_families, make
-from brainbench.stimuli.objects.solid import to_surface
+from brainbench.stimuli.objects.solid import Solid, to_surface
 
 PROCEDURAL_24 = (
     "arch", "basket", "bolt", "bottle", "bowl", "brick", "chair", "cone", "cross", "cylinder", "dumbbell", "ellipsoid",
@@ -64,7 +64,7 @@ def resolve_objects(
             ShapeNet tree); a mesh file, or a pattern of mesh files (``meshes/*.obj``). A file's class is its
             folder's name when its pattern spans several folders, otherwise its own name.
         unit: length unit of mesh files.
-        collision: what whiskers touch, one of :data:`brainbench.stimuli.objects.placed_object.COLLISIONS`; None
+        collision: what whiskers touch, one of :data:`brainbench.stimuli.objects.mesh_solids.COLLISIONS`; None
         takes what each
             kind of object has by default.
         surfaces: build shape families as their exact surface alone, without convex parts, which takes tens of

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import from_matrices
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -42,6 +43,14 @@ class ConvexPart:
     def bounds(self) -> NDArray[np.float64]:
         """Axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ConvexPart:
+        """Return the part rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        return ConvexPart(self.vertices @ rotation.T + translation)
+
+    def scaled(self, factor: float) -> ConvexPart:
+        """Return the part scaled about the origin."""
+        return ConvexPart(self.vertices * factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,18 +117,42 @@ class Sphere:
         """Axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.add(self.centre, [[-self.radius] * 3, [self.radius] * 3])
 
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Sphere:
+        """Return the ball rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        return Sphere(_placed(self.centre, rotation, translation), self.radius)
+
+    def scaled(self, factor: float) -> Sphere:
+        """Return the ball scaled about the origin."""
+        return Sphere(_scaled(self.centre, factor), self.radius * factor)
+
 
 @dataclass(frozen=True)
-class Capsule:
-    """All points within ``radius`` of the segment from ``start`` to ``end``."""
+class _Segment:
+    """What capsules and cylinders share: a radius around the segment from ``start`` to ``end``."""
 
     start: Vector
     end: Vector
     radius: float
 
     def __post_init__(self) -> None:
-        _check_size("capsule", radius=self.radius)
-        _check_segment("capsule", self.start, self.end)
+        name = type(self).__name__.lower()
+        _check_size(name, radius=self.radius)
+        _check_vector(name, start=self.start, end=self.end)
+        if tuple(self.start) == tuple(self.end):
+            raise UsageError(f"start and end of a {name} are the same point {tuple(self.start)}; use a Sphere.")
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
+        """Return the part rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        start, end = (_placed(point, rotation, translation) for point in (self.start, self.end))
+        return type(self)(start, end, self.radius)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the part scaled about the origin."""
+        return type(self)(_scaled(self.start, factor), _scaled(self.end, factor), self.radius * factor)
+
+
+class Capsule(_Segment):
+    """All points within ``radius`` of the segment from ``start`` to ``end``."""
 
     def bounds(self) -> NDArray[np.float64]:
         """Axis-aligned bounds [2, 3]: lowest and highest corner."""
@@ -127,17 +160,8 @@ class Capsule:
         return np.stack([ends.min(axis=0) - self.radius, ends.max(axis=0) + self.radius])
 
 
-@dataclass(frozen=True)
-class Cylinder:
+class Cylinder(_Segment):
     """A flat-ended cylinder around the segment from ``start`` to ``end``."""
-
-    start: Vector
-    end: Vector
-    radius: float
-
-    def __post_init__(self) -> None:
-        _check_size("cylinder", radius=self.radius)
-        _check_segment("cylinder", self.start, self.end)
 
     def bounds(self) -> NDArray[np.float64]:
         """Axis-aligned bounds [2, 3]: lowest and highest corner."""
@@ -167,6 +191,15 @@ class Box:
         """Axis-aligned bounds [2, 3]: lowest and highest corner."""
         reach = np.abs(rotation_matrix(self.quaternion)) @ np.array(self.half_sizes)
         return np.stack([np.array(self.centre) - reach, np.array(self.centre) + reach])
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Box:
+        """Return the box rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        turned = tuple(from_matrices(rotation @ rotation_matrix(self.quaternion)).tolist())
+        return Box(_placed(self.centre, rotation, translation), self.half_sizes, turned)
+
+    def scaled(self, factor: float) -> Box:
+        """Return the box scaled about the origin."""
+        return replace(self, centre=_scaled(self.centre, factor), half_sizes=_scaled(self.half_sizes, factor))
 
 
 Part = ConvexPart | Sphere | Capsule | Cylinder | Box
@@ -232,7 +265,9 @@ def _check_vector(shape: str, **vectors: Vector) -> None:
             raise UsageError(f"{name} of a {shape} must be three finite numbers (m); received {value!r}.")
 
 
-def _check_segment(shape: str, start: Vector, end: Vector) -> None:
-    _check_vector(shape, start=start, end=end)
-    if tuple(start) == tuple(end):
-        raise UsageError(f"start and end of a {shape} are the same point {tuple(start)}; use a Sphere.")
+def _placed(point: Vector, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Any:
+    return tuple((rotation @ np.asarray(point) + translation).tolist())
+
+
+def _scaled(vector: Vector, factor: float) -> Any:
+    return tuple(float(value) * factor for value in vector)

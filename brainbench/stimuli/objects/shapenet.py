@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import read_json
-from brainbench.stimuli.objects.placed_object import Solid, mesh_solid
+from brainbench.stimuli.objects.mesh_solids import mesh_solid
+from brainbench.stimuli.objects.solid import Solid
 
 if TYPE_CHECKING:
     from brainbench.geometry import DecompositionSettings
@@ -108,7 +109,7 @@ class ShapeNetModel:
         decomposition: DecompositionSettings | None = None,
     ) -> Solid:
         """Load and repair the mesh; the arguments are those of
-        :func:`brainbench.stimuli.objects.placed_object.mesh_solid`.
+        :func:`brainbench.stimuli.objects.mesh_solids.mesh_solid`.
 
         Raises:
             DataError: the mesh cannot be used, for the reason in the message.

@@ -13,7 +13,6 @@ import numpy as np
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_plain
 from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh
-from brainbench.stimuli.objects.placement import scale_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,7 +55,7 @@ class Solid:
         """Return the solid scaled about its origin."""
         if not (math.isfinite(factor) and factor > 0):
             raise UsageError(f"A solid is scaled by a positive factor; received {factor!r}.")
-        parts = tuple(scale_part(part, factor) for part in self.parts)
+        parts = tuple(part.scaled(factor) for part in self.parts)
         surface = self.surface and self.surface.scaled(factor)
         return replace(self, parts=parts, mesh=self.mesh and self.mesh.scaled(factor), surface=surface)
 

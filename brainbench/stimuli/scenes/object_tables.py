@@ -9,17 +9,10 @@ from pathlib import Path
 from brainbench.core.errors import unknown_name
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.objects import procedural
-from brainbench.stimuli.objects.placed_object import (
-    PlacedObject,
-    Solid,
-    box,
-    capsule,
-    cylinder,
-    mesh_solid,
-    rodgers_solid,
-    shape_solid,
-    sphere,
-)
+from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.primitives import box, capsule, cylinder, rodgers_solid, sphere
+from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.motion_tables import read_object_motion
 from brainbench.stimuli.scenes.toml_tables import MILLI, TomlTable, length, number, text, vector, whole
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
 
     from brainbench.stimuli.motion.recorded import Trajectory
-    from brainbench.stimuli.objects.placed_object import Solid
+    from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.scenes.scene_files import Recipe
 
 RECORDED = "rodgers-recorded"

@@ -14,7 +14,8 @@ import numpy as np
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject, euler_matrix
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.selection import match_whiskers
 

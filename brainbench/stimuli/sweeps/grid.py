@@ -17,7 +17,9 @@ import numpy as np
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.placed_object import PlacedObject, Solid, euler_matrix, move_part
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
@@ -233,5 +235,5 @@ def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.fl
         return solid.mesh.transformed(rotation).bounds
     if solid.surface is not None:
         return solid.surface.moved(rotation, np.zeros(3)).bounds()
-    corners = np.stack([move_part(part, rotation, np.zeros(3)).bounds() for part in solid.parts])
+    corners = np.stack([part.moved(rotation, np.zeros(3)).bounds() for part in solid.parts])
     return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])

@@ -16,7 +16,7 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
-from brainbench.stimuli.objects.placed_object import Solid
+from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.grid import Sweep, default_array
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes

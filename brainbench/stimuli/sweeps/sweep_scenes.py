@@ -13,7 +13,8 @@ from typing import Any, cast, overload
 import numpy as np
 
 from brainbench.core.errors import UsageError, listing
-from brainbench.stimuli.objects.placed_object import Solid, euler_matrix
+from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.sweeps.grid import Span, Sweep, SweepGrid, default_array

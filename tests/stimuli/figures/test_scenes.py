@@ -11,7 +11,8 @@ from brainbench.stimuli.figures import scenes as module
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.scenes import Picture, Style, film_times, render, still_time
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject, box, cylinder
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.primitives import box, cylinder
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.whisker_shapes import Recording, record

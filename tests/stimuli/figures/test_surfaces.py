@@ -7,8 +7,10 @@ from brainbench.geometry import Mesh
 from brainbench.stimuli.figures.surfaces import ball, corner_normals, object_surface, part_mesh, smoothed, tube
 from brainbench.stimuli.motion.trajectories import Spin, Translation
 from brainbench.stimuli.objects import procedural
+from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Sphere
-from brainbench.stimuli.objects.placed_object import PlacedObject, box, mesh_solid, rodgers_solid, shape_solid, sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.primitives import box, rodgers_solid, sphere
 
 START, END, R = (1e-3, 2e-3, -1e-3), (3e-3, -1e-3, 5e-3), 1.5e-3
 LENGTH = math.dist(START, END)

@@ -9,7 +9,9 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import Path, Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject, euler_matrix, sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate

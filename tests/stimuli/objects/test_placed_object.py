@@ -15,21 +15,11 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Path, Spin, Translation
 from brainbench.stimuli.objects import procedural
+from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid, shape_solids
 from brainbench.stimuli.objects.obstacle import TriangleMesh, rotation_matrix
-from brainbench.stimuli.objects.placed_object import (
-    RODGERS_CONTROL,
-    PlacedObject,
-    box,
-    capsule,
-    cylinder,
-    euler_matrix,
-    mesh_solid,
-    move_part,
-    rodgers_solid,
-    shape_solid,
-    shape_solids,
-    sphere,
-)
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.stimuli.objects.primitives import RODGERS_CONTROL, box, capsule, cylinder, rodgers_solid, sphere
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 SOLIDS = [sphere(2e-3), box((1e-3, 2e-3, 3e-3)), cylinder(1e-3, 5e-3), capsule(1e-3, 4e-3), rodgers_solid(segments=4)]
@@ -115,7 +105,7 @@ def test_expressing_an_object_in_another_frame_and_back_is_expressing_it_in_the_
     world = placed.obstacle().parts
     seen = placed.obstacle((frame, origin)).parts
     for there, here in zip(world, seen, strict=True):
-        np.testing.assert_allclose(move_part(here, frame, np.array(origin)).bounds(), there.bounds(), atol=1e-12)
+        np.testing.assert_allclose(here.moved(frame, np.array(origin)).bounds(), there.bounds(), atol=1e-12)
 
 
 def test_euler_angles_turn_about_fixed_x_then_y_then_z():

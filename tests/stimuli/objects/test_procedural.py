@@ -78,7 +78,7 @@ def test_no_surface_runs_through_itself(family):
 @pytest.mark.parametrize("family", ["bumpy", "chair", "vase"])
 def test_a_seed_repeats(family):
     first = procedural.make(family, 1, detail=2000)
-    procedural._make.cache_clear()
+    procedural.families._make.cache_clear()
     again = procedural.make(family, 1, detail=2000)
     assert again is not first
     assert again.mesh.content_hash == first.mesh.content_hash

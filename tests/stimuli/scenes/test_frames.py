@@ -11,7 +11,8 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Trace, base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject, sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.readout import to_axes
 from brainbench.stimuli.scenes.frames import Frames, clip_wrenches, low_pass
 from brainbench.stimuli.scenes.scene import Head, Scene

@@ -6,7 +6,8 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.recorded import Trajectory
-from brainbench.stimuli.objects.placed_object import box, euler_matrix, rodgers_solid
+from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.stimuli.objects.primitives import box, rodgers_solid
 from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, list_recipes
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 

@@ -3,7 +3,9 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.placed_object import PlacedObject, euler_matrix, sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
 

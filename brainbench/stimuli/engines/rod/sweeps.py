@@ -31,7 +31,7 @@ from brainbench.stimuli.engines.rod.packing import (
 )
 from brainbench.stimuli.engines.rod.scheduling import Slices, make_grips
 from brainbench.stimuli.engines.trust import MILLI
-from brainbench.stimuli.objects.placed_object import euler_matrix
+from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:

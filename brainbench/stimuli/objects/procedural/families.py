@@ -1,0 +1,143 @@
+"""Procedural shapes with class labels and seeds: objects for training and tests that need no download.
+
+>>> shape = make("torus", seed=3)
+>>> shape.label, round(shape.mesh.diagonal, 6), shape.mesh.diagnosis.watertight
+('torus', 1.0, True)
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.geometry import Mesh, convex_hull
+from brainbench.stimuli.objects.procedural import assembled, extruded, round, swept, turned
+from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+    from numpy.typing import NDArray
+
+DETAIL = (2_000, 20_000)
+"""Fewest and most triangles of a shape."""
+
+_FAMILIES: dict[str, Callable[[ShapeSampler, int], Body]] = {
+    **round.FAMILIES,
+    **turned.FAMILIES,
+    **swept.FAMILIES,
+    **extruded.FAMILIES,
+    **assembled.FAMILIES,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One member of a family: closed, outward, centred on its bounding box, of diagonal 1."""
+
+    mesh: Mesh
+    label: str
+    """Class label: the name of the family."""
+    parameters: Mapping[str, float | int | str]
+    """The proportions that were drawn, in the family's own unit."""
+    seed: int
+    part_points: tuple[NDArray[np.float64], ...] = ()
+    """Points [n, 3] of convex bodies that together fill the shape; empty where none are known."""
+
+    @functools.cached_property
+    def parts(self) -> tuple[Mesh, ...]:
+        """The convex bodies as meshes; empty where none are known (then use ``geometry.decompose``)."""
+        return tuple(convex_hull(points, self.label) for points in self.part_points)
+
+
+def list_families() -> tuple[str, ...]:
+    """Names that :func:`make` knows, in alphabetical order."""
+    return tuple(sorted(_FAMILIES))
+
+
+def describe_family(family: str) -> str:
+    """Return one sentence about a family.
+
+    Raises:
+        UsageError: there is no such family.
+    """
+    return (_family(family).__doc__ or "").strip().splitlines()[0]
+
+
+def make(family: str, seed: int = 0, *, detail: int = 4_000) -> Shape:
+    """Make one member of a family.
+
+    The same family, seed and detail give the same shape in every process; the seed alone chooses the
+    proportions, so shapes of different detail approximate the same solid.
+
+    Args:
+        family: see :func:`list_families`.
+        seed: zero or more.
+        detail: about how many triangles, within :data:`DETAIL`.
+
+    Raises:
+        UsageError: the family is unknown, or a number lies outside its range.
+    """
+    build = _family(family)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise UsageError(f"The seed of a shape is a whole number, zero or more; received {seed!r}.")
+    if not DETAIL[0] <= detail <= DETAIL[1]:
+        raise UsageError(
+            f"The detail of a shape lies between {DETAIL[0]} and {DETAIL[1]} triangles; received {detail!r}."
+        )
+    return _make(family, build, seed, int(detail))
+
+
+@functools.lru_cache(maxsize=64)
+def _make(family: str, build: Callable[[ShapeSampler, int], Body], seed: int, detail: int) -> Shape:
+    draw = ShapeSampler(np.random.default_rng([zlib.crc32(family.encode()), seed]))
+    body = build(draw, detail)
+    # Booleans leave slivers where faces nearly meet; collapsing what is below a millionth of the size removes them
+    # (as one original, or slivers between two operands would be kept as their seam).
+    low, high = np.split(np.array(body.solid.bounding_box()), 2)
+    clean = body.solid.as_original().simplify(1e-6 * float(np.linalg.norm(high - low)))
+    data = _refined(clean, detail).to_mesh64()
+    points = np.array(data.vert_properties[:, :3], dtype=float)
+    low, high = points.min(axis=0), points.max(axis=0)
+    size, centre = float(np.linalg.norm(high - low)), (low + high) / 2
+
+    def unit(vertices: np.ndarray) -> np.ndarray:
+        # Rounded, so that the last digit of a sine on another processor does not change the hash.
+        return np.round((vertices - centre) / size, 9) + 0.0
+
+    mesh = Mesh(unit(points), np.array(data.tri_verts, dtype=np.int64), family)
+    return Shape(mesh, family, dict(draw.drawn), seed, tuple(unit(part) for part in body.parts or ()))
+
+
+def _refined(solid: Manifold, detail: int) -> Manifold:
+    """Split long edges, which moves no surface, as little as gives about ``detail`` triangles."""
+    wanted = max(DETAIL[0], 0.95 * detail)
+    if solid.num_tri() >= wanted:
+        return solid
+    best, coarse, fine = solid, 40.0, 0.05
+    typical = math.sqrt(solid.surface_area() / detail)
+    for _ in range(16):
+        factor = math.sqrt(coarse * fine)
+        finer = solid.refine_to_length(factor * typical)
+        count = finer.num_tri()
+        if count > DETAIL[1]:
+            fine = factor
+        elif count < wanted:
+            coarse = factor
+            best = max(best, finer, key=lambda item: item.num_tri()) if best.num_tri() < wanted else best
+        else:
+            fine = factor
+            best = finer if best.num_tri() < wanted else min(best, finer, key=lambda item: item.num_tri())
+    return best
+
+
+def _family(name: str) -> Callable[[ShapeSampler, int], Body]:
+    if name not in _FAMILIES:
+        raise unknown_name("shape family", name, list_families())
+    return _FAMILIES[name]
