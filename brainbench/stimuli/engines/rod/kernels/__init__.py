@@ -78,17 +78,17 @@ def build_kernels(
     """
     most = contacts_for(capacity)
     common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda}
-    step = specialize("step", contacts=most, bounds=bounds, **common)
-    structs = sys.modules[step.ChainArrays.cls.__module__]
+    whole = {"contacts": most, "bounds": bounds, **common}
+    run, structs = specialize("step", **whole).run, specialize("state", **whole)
     if not sliced:
-        return Kernels(step.run, structs)
+        return Kernels(run, structs)
     # Threads of a group: for few contacts, for some and for many. A processor takes them one by one.
     sizes = (*GROUPS, (most, 8 if most <= 8 else 16)) if cuda else ((most, 1),)
     group = DISTANCE_GROUP if cuda else 1
     return Kernels(
-        step.run,
+        run,
         structs,
-        specialize("scheduling", contacts=most, bounds=bounds, **common).swap_queues,
+        specialize("scheduling", **whole).swap_queues,
         specialize("distance_queue", group_size=group, **common).measure_distances,
         group,
         tuple(

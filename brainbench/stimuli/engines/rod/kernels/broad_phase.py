@@ -8,10 +8,10 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import WIDEST
 
 from .algebra import first_axis, rotate, vec3
-from .motion import BodyMotion, MotionArrays, pose_at
+from .motion import BodyMotion, pose_at
 from .narrow_phase import LinkDistance, link_shape_distance
 from .parameters import real, sliced
-from .state import ChainArrays, ChainState, ContactCandidates, PausedWhiskers, ProximityState, ShapeArrays, StepOptions, WhiskerJob, WhiskerState, most_candidates, row
+from .state import ChainArrays, ChainState, ContactCandidates, MotionArrays, PausedWhiskers, ProximityState, ShapeArrays, StepOptions, WhiskerJob, WhiskerState, most_candidates, row
 
 
 @wp.struct

@@ -8,10 +8,10 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import LOOK_BOUNDS, WARP
 
 from .algebra import vec4
-from .motion import MotionArrays, pose_at
+from .motion import pose_at
 from .narrow_phase import link_shape_distance
 from .parameters import group_size, module_options, real
-from .state import ChainArrays, JobArrays, PausedWhiskers, ShapeArrays
+from .state import ChainArrays, JobArrays, MotionArrays, PausedWhiskers, ShapeArrays
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=module_options(), launch_bounds=LOOK_BOUNDS)

@@ -9,28 +9,7 @@ import warp as wp
 
 from .algebra import vec3, vec4
 from .parameters import real
-
-
-@wp.struct
-class MotionArrays:
-    first: wp.array(dtype=wp.int32)
-    """[track] index of the first knot."""
-    count: wp.array(dtype=wp.int32)
-    """[track] number of knots."""
-    start: wp.array(dtype=real)
-    """[track] time of the first knot."""
-    spacing: wp.array(dtype=real)
-    """[track] time between knots."""
-    place: wp.array(dtype=vec3)
-    """[knot] position."""
-    velocity: wp.array(dtype=vec3)
-    """[knot]"""
-    turn: wp.array(dtype=vec4)
-    """[knot] unit quaternion (w, x, y, z), without jumps of sign."""
-    spin: wp.array(dtype=vec3)
-    """[knot] angular velocity, world axes."""
-    surge: wp.array(dtype=vec3)
-    """[knot] angular acceleration, world axes."""
+from .state import MotionArrays
 
 
 @wp.struct

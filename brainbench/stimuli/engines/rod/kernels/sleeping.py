@@ -8,10 +8,10 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import NOTHING
 
 from .algebra import rotate, vec2, vec3
-from .motion import MotionArrays, pose_at
+from .motion import pose_at
 from .narrow_phase import link_shape_distance
 from .parameters import against, real, sliced
-from .state import ChainArrays, ChainState, PausedWhiskers, ProximityState, ShapeArrays, WhiskerJob, WhiskerState, row
+from .state import ChainArrays, ChainState, MotionArrays, PausedWhiskers, ProximityState, ShapeArrays, WhiskerJob, WhiskerState, row
 
 
 @wp.func(inline=True)

@@ -12,11 +12,11 @@ from .articulated_body import articulated_inertia, forward_kinematics, integrate
 from .broad_phase import count_near_links, find_candidates, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
-from .motion import MotionArrays, pose_at
+from .motion import pose_at
 from .parameters import against, bounds, module_options, real, sliced
 from .scheduling import next_job, pause, resume
 from .sleeping import check_rest
-from .state import ChainArrays, ChainState, ContactCandidates, ContactProblems, JobArrays, PausedWhiskers, ProximityState, ResultArrays, ShapeArrays, StepOptions, Twist, WhiskerJob, WhiskerState, row
+from .state import ChainArrays, ChainState, ContactCandidates, ContactProblems, JobArrays, MotionArrays, PausedWhiskers, ProximityState, ResultArrays, ShapeArrays, StepOptions, Twist, WhiskerJob, WhiskerState, row
 
 
 @wp.func(inline=True)
