@@ -77,27 +77,27 @@ def free(
         "load_force": np.zeros((0, 3)),
         "load_stop": np.zeros(0),
     }
-    out = kernels.Results()
+    out = kernels.structs.ResultArrays()
     out.wrench = wp.zeros((1, 1, 1, 6), dtype=real, device=device)
     out.contact = wp.zeros((1, 1, 1), dtype=real, device=device)
-    out.points, out.pressed = (wp.zeros((1, 1, 1), dtype=kernels.vec3, device=device) for _ in range(2))
+    out.points, out.pressed = (wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2))
     out.depth, out.failed, out.miss, out.load = (wp.zeros(lanes, dtype=real, device=device) for _ in range(4))
     for name in ("status", "steps", "touching", "crowded", "unsolved"):
         setattr(out, name, wp.zeros(lanes, dtype=wp.int32, device=device))
-    options = kernels.Options()
-    options.gravity = kernels.vec3(0.0, 0.0, -9.81e-3)
-    options.axes = kernels.mat33(*np.eye(3).ravel().tolist())
+    options = kernels.structs.StepOptions()
+    options.gravity = kernels.structs.vec3(0.0, 0.0, -9.81e-3)
+    options.axes = kernels.structs.mat33(*np.eye(3).ravel().tolist())
     readings = wp.array([steps * step * 1e3], dtype=real, device=device)
     inputs = [
         launcher._chains,
-        to_struct(kernels.Tracks, tracks.arrays(), device),
-        to_struct(kernels.Bodies, shapes.arrays(), device),
-        to_struct(kernels.Lanes, lane, device),
+        to_struct(kernels.structs.MotionArrays, tracks.arrays(), device),
+        to_struct(kernels.structs.ShapeArrays, shapes.arrays(), device),
+        to_struct(kernels.structs.JobArrays, lane, device),
         options,
         readings,
         out,
-        kernels.Grips(),
-        kernels.Paused(),
+        kernels.structs.ContactProblems(),
+        kernels.structs.PausedWhiskers(),
     ]
 
     def once() -> None:

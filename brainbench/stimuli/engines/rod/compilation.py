@@ -30,17 +30,17 @@ def load_kernels(
         device: a Warp device.
         real: ``warp.float32`` or ``warp.float64``.
         capacity: links that fit.
-        needs: what there is to touch (:func:`brainbench.stimuli.engines.rod.kernels.step.solver`); for a GPU only.
+        needs: what there is to touch (:func:`brainbench.stimuli.engines.rod.kernels.build_kernels`); for a GPU only.
         compiling: called with True before compiling and with False after it; not at all for kernels that Warp has kept.
-        **options: further arguments of ``solver``; of them a processor knows ``sliced``.
+        **options: further arguments of ``build_kernels``; of them a processor knows ``sliced``.
     """
-    from brainbench.stimuli.engines.rod.kernels.step import MAKING, solver
+    from brainbench.stimuli.engines.rod.kernels import BUILDING, build_kernels
 
-    with MAKING:
+    with BUILDING:
         if device.is_cuda:
-            kernels = solver(real, capacity, needs, cuda=True, **options)
+            kernels = build_kernels(real, capacity, needs, cuda=True, **options)
         else:
-            kernels = solver(real, capacity, sliced=options.get("sliced", False))
+            kernels = build_kernels(real, capacity, sliced=options.get("sliced", False))
     if device.is_cuda and options:  # compiled at their launch, for the blocks that it asks for
         return kernels
     block = 1 if device.is_cpu else None

@@ -244,12 +244,12 @@ def _simulate(
     readings = first.times * MILLI
     count, frames = len(lanes), len(readings)
     out = _results(kernels, real, device, (count, frames, capacity), record_shape)
-    options = kernels.Options()
+    options = kernels.structs.StepOptions()
     options.start = first.start * MILLI
     options.quasistatic = int(fidelity.solver == "quasistatic")
     weight = LIGHT if options.quasistatic else 1.0
-    options.gravity = kernels.vec3(*np.divide(first.gravity, MILLI * weight).tolist())
-    options.axes = kernels.mat33(*np.eye(3).ravel().tolist())
+    options.gravity = kernels.structs.vec3(*np.divide(first.gravity, MILLI * weight).tolist())
+    options.axes = kernels.structs.mat33(*np.eye(3).ravel().tolist())
     options.shape = int(record_shape)
     wp.launch(
         kernels.run,
@@ -260,7 +260,7 @@ def _simulate(
             wp.array(readings, dtype=real, device=device),
             out,
             make_grips(kernels, real, capacity, count, device),
-            kernels.Paused(),
+            kernels.structs.PausedWhiskers(),
         ],
         device=device,
     )
@@ -282,12 +282,12 @@ def _results(kernels: Any, real: Any, device: Any, sizes: tuple[int, int, int], 
     """Room for the results of (lanes, readings, links)."""
     wp = warp()
     count, frames, capacity = sizes
-    out = kernels.Results()
+    out = kernels.structs.ResultArrays()
     out.wrench = wp.zeros((count, frames, 1, 6), dtype=real, device=device)
     out.contact = wp.full((count, frames, 1), -1.0, dtype=real, device=device)
     points, pressed = ((frames, capacity + 1, count), (frames, 2, count)) if record_shape else ((1, 1, 1),) * 2
-    out.points = wp.zeros(points, dtype=kernels.vec3, device=device)
-    out.pressed = wp.zeros(pressed, dtype=kernels.vec3, device=device)
+    out.points = wp.zeros(points, dtype=kernels.structs.vec3, device=device)
+    out.pressed = wp.zeros(pressed, dtype=kernels.structs.vec3, device=device)
     for names, kind in ((_NUMBERS, real), (_COUNTS, wp.int32)):
         for name in names:
             setattr(out, name, wp.zeros(count, dtype=kind, device=device))
@@ -306,14 +306,14 @@ def batch_structs(batch: _Batch, kernels: Any, device: Any) -> list[Any]:
     }
     return [
         to_struct(
-            kernels.Chains,
+            kernels.structs.ChainArrays,
             Chains(batch.capacity, batch.chains, batch.fidelity.solver == "quasistatic").arrays(),
             device,
         ),
-        to_struct(kernels.Tracks, batch.tracks.arrays(), device),
-        to_struct(kernels.Bodies, batch.shapes.arrays(), device),
+        to_struct(kernels.structs.MotionArrays, batch.tracks.arrays(), device),
+        to_struct(kernels.structs.ShapeArrays, batch.shapes.arrays(), device),
         to_struct(
-            kernels.Lanes,
+            kernels.structs.JobArrays,
             {
                 "whisker": lanes[:, 0],
                 "scene": lanes[:, 1],

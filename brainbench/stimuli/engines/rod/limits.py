@@ -51,8 +51,8 @@ WARP = 32
 GROUPS = (2, 2), (4, 4)
 """Possible contacts of a whisker up to which a group of threads finds their forces on a GPU, and its threads; whiskers
 of more have groups of eight, or sixteen."""
-LOOKERS = 8
-"""Threads of a GPU that look at one link together: 1, 2, 4 or 8."""
+DISTANCE_GROUP = 8
+"""Threads of a GPU that find the distance of one link together: 1, 2, 4 or 8."""
 LOOK_BOUNDS = 128, 4
 """CUDA launch bounds of that kernel."""
 GRIP_BOUNDS = 128, 4
@@ -62,6 +62,9 @@ AFTER_LOOK, AFTER_GRIP, ANYHOW = 0, 1, 2
 
 NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 """What whiskers may touch: a kernel holds only the code that its scenes need."""
+
+SPHERE, CAPSULE, CYLINDER, BOX, MESH = range(5)
+"""Kinds of shapes: sizes are (radius, –, –), (radius, half length, –) twice, half edge lengths, and nothing."""
 
 OK, BENT, LOST = 0, 1, 2
 """How a whisker ended: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.stimuli.engines.rod.kernels.distances import BOX, CAPSULE, CYLINDER, MESH, SPHERE
-from brainbench.stimuli.engines.rod.limits import LIGHT
+from brainbench.stimuli.engines.rod.limits import BOX, CAPSULE, CYLINDER, LIGHT, MESH, SPHERE
 from brainbench.stimuli.engines.rod.mesh_bvh import spatial_order, tree_boxes
 from brainbench.stimuli.engines.trust import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh

@@ -44,9 +44,9 @@ class Slices:
         self.kernels, self.device, self.lanes, self.capacity = kernels, device, lanes, capacity
         self.recorded = device.is_cuda if recorded is None else recorded
         # Looks and contact forces of a slice need not wait for each other.
-        self.streams = [wp.Stream(device) if self.recorded else None for _ in kernels.settle]
+        self.streams = [wp.Stream(device) if self.recorded else None for _ in kernels.solve_contacts]
         self.looks = max(4 * lanes, capacity)
-        on = self.struct = kernels.Paused()
+        on = self.struct = kernels.structs.PausedWhiskers()
 
         def empty(*shape: int, kind: Any = real) -> Any:
             return wp.empty(shape, dtype=kind, device=device)
@@ -96,16 +96,16 @@ class Slices:
         for _ in range(ROUNDS):
             wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, block_dim=block)
             on.queue, on.after = on.after, on.queue
-            wp.launch(kernels.turn_over, 1, [on], device=device)
-            for (kernel, threads), stream in zip(kernels.settle, self.streams, strict=True):
+            wp.launch(kernels.swap_queues, 1, [on], device=device)
+            for (kernel, threads), stream in zip(kernels.solve_contacts, self.streams, strict=True):
                 # Whole warps: the threads of a group speak with each other.
                 many = -(-left * threads // WARP) * WARP
                 if stream is not None:
                     stream.wait_stream(device.stream)
                 wp.launch(kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=GRIP_BOUNDS[0])
-            looks = min(self.looks, self.capacity * left) * kernels.lookers
+            looks = min(self.looks, self.capacity * left) * kernels.distance_group
             looks = min(-(-looks // WARP) * WARP, LOOKING)
-            wp.launch(kernels.look_all, looks, [*inputs[:4], on, looks], device=device, block_dim=LOOK_BOUNDS[0])
+            wp.launch(kernels.measure_distances, looks, [*inputs[:4], on, looks], device=device, block_dim=LOOK_BOUNDS[0])
             for stream in self.streams:
                 if stream is not None:
                     device.stream.wait_stream(stream)
@@ -116,7 +116,7 @@ def make_grips(kernels: Any, real: Any, capacity: int, lanes: int, device: Any) 
     wp = warp()
     held, seen = contacts_for(capacity), contacts_for(capacity) + SPARE
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
-    gp = kernels.Grips()
+    gp = kernels.structs.ContactProblems()
 
     def empty(*shape: int, kind: Any = real) -> Any:
         return wp.empty(shape, dtype=kind, device=device)

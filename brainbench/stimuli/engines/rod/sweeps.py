@@ -53,7 +53,7 @@ class SweepResult:
     contact: Any
     """Warp array [sweep, reading, whisker] arc of the contact (m), negative without."""
     status: NDArray[np.int32]
-    """[sweep, whisker] as :data:`brainbench.stimuli.engines.rod.kernels.step.OK` and its neighbours."""
+    """[sweep, whisker] as :data:`brainbench.stimuli.engines.rod.limits.OK` and its neighbours."""
     steps: NDArray[np.int32]
     """[sweep, whisker] steps computed."""
     touching: NDArray[np.int32]
@@ -128,7 +128,7 @@ class SweepLauncher:
         bounds = bounds or (SLICED_BOUNDS if self.sliced else BOUNDS)
         self.kernels = load_kernels(self.device, self.real, self.capacity, against, bounds=bounds, sliced=self.sliced)
         self._chains = to_struct(
-            self.kernels.Chains, Chains(self.capacity, chains, self.quasistatic).arrays(), self.device
+            self.kernels.structs.ChainArrays, Chains(self.capacity, chains, self.quasistatic).arrays(), self.device
         )
         self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in chains])
         self.readings = grid.frames.readings * MILLI
@@ -178,23 +178,23 @@ class SweepLauncher:
             "load_force": np.zeros((0, 3)),
             "load_stop": np.zeros(0),
         }
-        out = kernels.Results()
+        out = kernels.structs.ResultArrays()
         frames, real = len(self.readings), self.real
         out.wrench = wp.zeros((count, frames, whiskers, 6), dtype=real, device=device)
         out.contact = wp.full((count, frames, whiskers), -1.0, dtype=real, device=device)
-        out.points, out.pressed = (wp.zeros((1, 1, 1), dtype=kernels.vec3, device=device) for _ in range(2))
+        out.points, out.pressed = (wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2))
         out.depth, out.failed, out.miss, out.load = (wp.zeros(len(row), dtype=real, device=device) for _ in range(4))
         names = ("status", "steps", "touching", "crowded", "unsolved")
         for name in names:
             setattr(out, name, wp.zeros(len(row), dtype=wp.int32, device=device))
-        options = kernels.Options()
-        options.axes = kernels.mat33(*self._head.ravel().tolist())
+        options = kernels.structs.StepOptions()
+        options.axes = kernels.structs.mat33(*self._head.ravel().tolist())
         options.quasistatic = int(self.quasistatic)
         inputs = [
             self._chains,
-            to_struct(kernels.Tracks, tracks.arrays(), device),
-            to_struct(kernels.Bodies, shapes.arrays(), device),
-            to_struct(kernels.Lanes, lanes, device),
+            to_struct(kernels.structs.MotionArrays, tracks.arrays(), device),
+            to_struct(kernels.structs.ShapeArrays, shapes.arrays(), device),
+            to_struct(kernels.structs.JobArrays, lanes, device),
             options,
             wp.array(self.readings, dtype=real, device=device),
             out,
@@ -206,7 +206,7 @@ class SweepLauncher:
             slices = Slices(kernels, real, self.capacity, len(row), device, **self.tuning)
             self.slices = slices.run(inputs, BLOCK)
         else:
-            wp.launch(kernels.run, len(row), [*inputs, kernels.Paused()], device=device, block_dim=BLOCK)
+            wp.launch(kernels.run, len(row), [*inputs, kernels.structs.PausedWhiskers()], device=device, block_dim=BLOCK)
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
         self.seconds = dict(zip(("objects", "upload", "kernel"), np.diff(clock).tolist(), strict=True))

@@ -1,1 +1,98 @@
-"""Warp kernels of the whisker solver. Units: mg, mm, ms, mN, µN·m."""
+"""Warp kernels of the whisker solver. Units: mg, mm, ms, mN, µN·m.
+
+``step`` runs whiskers from reading to reading. In each step ``articulated_body`` finds the motion of the chain and its
+accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances`` and ``mesh_bvh``) where it may
+touch something, ``contact_problem``, ``delassus`` and ``contact_solver`` the contact forces. ``sleeping`` skips
+whiskers at rest; on a GPU ``scheduling`` pauses whiskers while ``distance_queue`` and ``contact_queue`` work for them.
+
+The modules are ordinary Warp code for the types and sizes in ``parameters``. :func:`specialize` loads them once for
+each precision and size, like a template.
+"""
+
+import importlib
+import sys
+import threading
+from dataclasses import dataclass, field
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+from brainbench.stimuli.engines.rod.limits import DISTANCE_GROUP, GROUPS, MESHES, contacts_for
+
+BUILDING = threading.Lock()
+"""To be held while kernels are built: two threads at once would build their structures twice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kernels:
+    """Kernels of one precision and capacity, and the structures that they take."""
+
+    run: Any
+    """Takes every whisker to its last reading, or to where it pauses."""
+    structs: ModuleType
+    """Module of the structures (``kernels.state``) for these kernels."""
+    swap_queues: Any = None
+    """This and the next two only of kernels that pause."""
+    measure_distances: Any = None
+    distance_group: int = 1
+    """Threads that answer one distance query."""
+    solve_contacts: tuple[tuple[Any, int], ...] = ()
+    """Kernel and threads for one whisker, of each queue of contact problems."""
+    loading: threading.Lock = field(default_factory=threading.Lock)
+
+
+def specialize(module: str, **parameters: Any) -> ModuleType:
+    """Return a module of this package for given ``parameters``; the others keep their values."""
+    label = "_".join(str(getattr(value, "__name__", value)) for _, value in sorted(parameters.items()))
+    package = f"{__name__}_{label}"
+    if package not in sys.modules:
+        template = sys.modules[package] = ModuleType(package)
+        template.__path__ = __path__
+        given = vars(importlib.import_module(f"{package}.parameters"))
+        if unknown := set(parameters) - set(given):
+            raise TypeError(f"no such parameters: {sorted(unknown)}")
+        given.update(parameters)
+    return importlib.import_module(f"{package}.{module}")
+
+
+@cache
+def build_kernels(
+    real: type,
+    capacity: int,
+    against: int = MESHES,
+    bounds: tuple[int, int] | None = None,
+    sliced: bool = False,
+    cuda: bool = False,
+) -> Kernels:
+    """Return the kernels for chains of at most ``capacity`` links in one precision.
+
+    Args:
+        real: ``warp.float32`` or ``warp.float64``.
+        capacity: links that fit; a module is compiled for each.
+        against: what there is to touch, :data:`NOTHING`, :data:`PRIMITIVES` or :data:`MESHES`.
+        bounds: threads per block and blocks per multiprocessor that the CUDA compiler aims at.
+        sliced: whether a whisker pauses wherever it needs a distance from a mesh and wherever contact forces must be
+            found, so that both are done for all whiskers by kernels of their own and the threads of a block do alike
+            work; results are the same. One shape a scene.
+        cuda: compile for a GPU: with approximate divisions and roots, and groups of threads that find contact forces.
+    """
+    most = contacts_for(capacity)
+    common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda}
+    whole = {"contacts": most, "bounds": bounds, **common}
+    run, structs = specialize("step", **whole).run, specialize("state", **whole)
+    if not sliced:
+        return Kernels(run, structs)
+    # Threads of a group: for few contacts, for some and for many. A processor takes them one by one.
+    sizes = (*GROUPS, (most, 8 if most <= 8 else 16)) if cuda else ((most, 1),)
+    group = DISTANCE_GROUP if cuda else 1
+    return Kernels(
+        run,
+        structs,
+        specialize("scheduling", **whole).swap_queues,
+        specialize("distance_queue", group_size=group, **common).measure_distances,
+        group,
+        tuple(
+            (specialize("contact_queue", contacts=held, group_size=threads, queue=rank, **common).solve_queue, threads)
+            for rank, (held, threads) in enumerate(sizes)
+        ),
+    )

@@ -1,104 +1,95 @@
-"""Small vector algebra of the whisker kernels."""
+"""Vectors, quaternions and symmetric matrices of the solver's precision."""
 
-from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
+import warp as wp
 
-@cache
-def algebra(real: type) -> SimpleNamespace:
-    """Return ``sym``, ``sym_pair``, ``sine``, ``cosine``, ``first_axis``, ``rotate``, ``unrotate``, ``lower`` and
-    ``higher`` of a precision.
+from .parameters import real
 
-    Sine and cosine are series in single precision, good to 1e-7 up to 1.5 rad: joints bend no further. ``lower`` and
-    ``higher`` are the lesser and the greater of two numbers; Warp's own see to it on a processor, at four times the
-    cost, that a value that is no number loses.
-    """
-    import warp as wp
+vec2: Any = wp.types.vector(2, real)
+vec3: Any = wp.types.vector(3, real)
+vec4: Any = wp.types.vector(4, real)
+vec5: Any = wp.types.vector(5, real)
+vec6: Any = wp.types.vector(6, real)
+mat33: Any = wp.types.matrix((3, 3), real)
+single = real is wp.float32
 
-    vec3: Any = wp.types.vector(3, real)
-    vec4: Any = wp.types.vector(4, real)
-    vec6: Any = wp.types.vector(6, real)
-    single = real is wp.float32
 
-    @wp.func
-    def sym(a: vec6, x: vec3) -> vec3:
-        """Product of a symmetric matrix (xx yy zz xy xz yz) and a vector."""
-        return vec3(
-            a[0] * x[0] + a[3] * x[1] + a[4] * x[2],
-            a[3] * x[0] + a[1] * x[1] + a[5] * x[2],
-            a[4] * x[0] + a[5] * x[1] + a[2] * x[2],
-        )
-
-    @wp.func
-    def sym_pair(a: vec3, b: vec3, c: vec3, d: vec3) -> vec6:
-        """Symmetric matrix a bᵀ + c dᵀ, given that it is symmetric."""
-        return vec6(
-            a[0] * b[0] + c[0] * d[0],
-            a[1] * b[1] + c[1] * d[1],
-            a[2] * b[2] + c[2] * d[2],
-            a[0] * b[1] + c[0] * d[1],
-            a[0] * b[2] + c[0] * d[2],
-            a[1] * b[2] + c[1] * d[2],
-        )
-
-    @wp.func
-    def sine(x: real) -> real:
-        if wp.static(single):
-            y = x * x
-            return x * (
-                real(1.0)
-                + y
-                * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
-            )
-        return wp.sin(x)
-
-    @wp.func
-    def cosine(x: real) -> real:
-        if wp.static(single):
-            y = x * x
-            return real(1.0) + y * (
-                real(-0.5)
-                + y
-                * (real(1.0 / 24.0) + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0))))
-            )
-        return wp.cos(x)
-
-    @wp.func
-    def first_axis(z: vec3, along: vec3, angle: real) -> vec3:
-        """Axis of a joint's first hinge from that of its second, the link behind it and the second angle."""
-        x = wp.normalize(along)
-        return wp.cross(z, x) * cosine(angle) + x * sine(angle)
-
-    @wp.func
-    def rotate(q: vec4, x: vec3) -> vec3:
-        u = vec3(q[1], q[2], q[3])
-        t = real(2.0) * wp.cross(u, x)
-        return x + q[0] * t + wp.cross(u, t)
-
-    @wp.func
-    def unrotate(q: vec4, x: vec3) -> vec3:
-        u = vec3(-q[1], -q[2], -q[3])
-        t = real(2.0) * wp.cross(u, x)
-        return x + q[0] * t + wp.cross(u, t)
-
-    def chosen(name: str, sign: str) -> str:
-        return f"#if defined(__CUDA_ARCH__)\nreturn {name}(a, b);\n#else\nreturn a {sign} b ? a : b;\n#endif\n"
-
-    @wp.func_native(chosen("min", "<"))
-    def lower(a: real, b: real) -> real: ...
-
-    @wp.func_native(chosen("max", ">"))
-    def higher(a: real, b: real) -> real: ...
-
-    return SimpleNamespace(
-        sym=sym,
-        sym_pair=sym_pair,
-        sine=sine,
-        cosine=cosine,
-        first_axis=first_axis,
-        rotate=rotate,
-        unrotate=unrotate,
-        lower=lower,
-        higher=higher,
+@wp.func
+def symmetric_times(a: vec6, x: vec3) -> vec3:
+    """Product of a symmetric matrix (xx yy zz xy xz yz) and a vector."""
+    return vec3(
+        a[0] * x[0] + a[3] * x[1] + a[4] * x[2],
+        a[3] * x[0] + a[1] * x[1] + a[5] * x[2],
+        a[4] * x[0] + a[5] * x[1] + a[2] * x[2],
     )
+
+
+@wp.func
+def symmetric_outer(a: vec3, b: vec3, c: vec3, d: vec3) -> vec6:
+    """Symmetric matrix a bᵀ + c dᵀ, given that it is symmetric."""
+    return vec6(
+        a[0] * b[0] + c[0] * d[0],
+        a[1] * b[1] + c[1] * d[1],
+        a[2] * b[2] + c[2] * d[2],
+        a[0] * b[1] + c[0] * d[1],
+        a[0] * b[2] + c[0] * d[2],
+        a[1] * b[2] + c[1] * d[2],
+    )
+
+
+@wp.func
+def sine(x: real) -> real:
+    if wp.static(single):
+        y = x * x
+        return x * (
+            real(1.0)
+            + y
+            * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
+        )
+    return wp.sin(x)
+
+
+@wp.func
+def cosine(x: real) -> real:
+    if wp.static(single):
+        y = x * x
+        return real(1.0) + y * (
+            real(-0.5)
+            + y
+            * (real(1.0 / 24.0) + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0))))
+        )
+    return wp.cos(x)
+
+
+@wp.func
+def first_axis(z: vec3, along: vec3, angle: real) -> vec3:
+    """Axis of a joint's first hinge from that of its second, the link behind it and the second angle."""
+    x = wp.normalize(along)
+    return wp.cross(z, x) * cosine(angle) + x * sine(angle)
+
+
+@wp.func
+def rotate(q: vec4, x: vec3) -> vec3:
+    u = vec3(q[1], q[2], q[3])
+    t = real(2.0) * wp.cross(u, x)
+    return x + q[0] * t + wp.cross(u, t)
+
+
+@wp.func
+def unrotate(q: vec4, x: vec3) -> vec3:
+    u = vec3(-q[1], -q[2], -q[3])
+    t = real(2.0) * wp.cross(u, x)
+    return x + q[0] * t + wp.cross(u, t)
+
+
+def chosen(name: str, sign: str) -> str:
+    return f"#if defined(__CUDA_ARCH__)\nreturn {name}(a, b);\n#else\nreturn a {sign} b ? a : b;\n#endif\n"
+
+
+@wp.func_native(chosen("min", "<"))
+def minimum(a: real, b: real) -> real: ...
+
+
+@wp.func_native(chosen("max", ">"))
+def maximum(a: real, b: real) -> real: ...

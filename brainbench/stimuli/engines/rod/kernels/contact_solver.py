@@ -1,238 +1,479 @@
-"""Forces of rigid contacts with Coulomb friction: projected Gauss-Seidel, and all normal forces at once in between."""
+"""CONTACT SOLVER
+"""
 
-from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
-from brainbench.stimuli.engines.rod.kernels.contact_memory import grasps
-from brainbench.stimuli.engines.rod.kernels.single_contact import contact_alone
-from brainbench.stimuli.engines.rod.kernels.thread_groups import groups
+import warp as wp
+
+from brainbench.stimuli.engines.rod.limits import CLOSED, ROUNDS, SWEEPS
+
+from .algebra import vec2, vec3, vec4, vec6
+from .delassus import DelassusRows, NormalMatrix, PerContact1, SolverState, ThreadContacts, build_delassus, own_contacts, row, rows, select_contacts, tall
+from .parameters import capacity, contacts, group_size, real
+from .state import ContactProblems, PerLink2, most_candidates
+from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 
 
-@cache
-def relaxations(real: type, capacity: int, held: int, lanes: int) -> SimpleNamespace:
-    """Return ``rates``, ``sweep`` and ``share``; see :func:`~brainbench.stimuli.engines.rod.kernels.contacts`."""
-    import warp as wp
+@wp.func
+def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0: real, mu: real, tries: int) -> vec3:
+    """Forces of one contact alone (normal, two tangents), given the rates without it and its last slip."""
+    zero = real(0.0)
+    one = real(1.0)
+    nn = own6[0]
+    n1 = own6[1]
+    n2 = own6[2]
+    c11 = own6[3]
+    c12 = own6[4]
+    c22 = own6[5]
+    fn = zero
+    f1 = zero
+    f2 = zero
+    if bn < zero:
+        fn = -bn / nn
+        if mu > zero:
+            # Sticking: solve for all three, tangents eliminated first.
+            det = c11 * c22 - c12 * c12
+            stuck = int(0)
+            if det > real(1e-9) * c11 * c22:
+                tb1 = -(c22 * b1 - c12 * b2) / det
+                tb2 = -(c11 * b2 - c12 * b1) / det
+                ta1 = -(c22 * n1 - c12 * n2) / det
+                ta2 = -(c11 * n2 - c12 * n1) / det
+                stiff = nn + n1 * ta1 + n2 * ta2
+                if stiff > real(1e-6) * nn:
+                    tn = -(bn + n1 * tb1 + n2 * tb2) / stiff
+                    tf1 = tb1 + ta1 * tn
+                    tf2 = tb2 + ta2 * tn
+                    if tn >= zero and tf1 * tf1 + tf2 * tf2 <= mu * mu * tn * tn:
+                        fn = tn
+                        f1 = tf1
+                        f2 = tf2
+                        stuck = 1
+            if stuck == 0:
+                # Sliding: find the direction of slip by a fixed point.
+                f1 = p0
+                f2 = q0
+                pace = one / (c11 + c22)
+                for _ in range(tries):
+                    fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
+                    s1_ = f1 - pace * (b1 + n1 * fn + c11 * f1 + c12 * f2)
+                    s2_ = f2 - pace * (b2 + n2 * fn + c12 * f1 + c22 * f2)
+                    size = wp.sqrt(s1_ * s1_ + s2_ * s2_)
+                    bound = mu * fn
+                    if size > bound:
+                        s1_ = s1_ * (bound / size)
+                        s2_ = s2_ * (bound / size)
+                    moved_by = wp.abs(f1 - s1_) + wp.abs(f2 - s2_)
+                    f1 = s1_
+                    f2 = s2_
+                    if moved_by <= real(1e-4) * bound:
+                        break
+                fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
+    # Two contacts at one point may leave nothing to divide by.
+    if not (fn + wp.abs(f1) + wp.abs(f2) < real(1e6)):
+        fn = zero
+        f1 = zero
+        f2 = zero
+    return vec3(fn, f1, f2)
 
-    kept, group, at_contact = grasps(real, capacity, held, lanes), groups(real, lanes), contact_alone(real)
-    Own, Grasp, Table, Square, Own1, row = kept.Own, kept.Grasp, kept.Table, kept.Square, kept.Own1, kept.row
-    rows, tall = kept.rows, kept.tall
-    give, total, greatest, joined, most = group.give, group.total, group.greatest, group.joined, group.most
 
-    @wp.func(inline=True)
-    def rates(grasp: wp.ref[Grasp], own: wp.ref[Own], table: wp.ref[Table], refresh: int):
-        """Rates at the contacts, less those that would just close the gaps."""
-        if refresh == 1:
-            for k in range(grasp.each):
-                own.rate[3 * k] = row(own.free, 3 * k) - row(own.gap, k)
-                own.rate[3 * k + 1] = row(own.free, 3 * k + 1)
-                own.rate[3 * k + 2] = row(own.free, 3 * k + 2)
-        for e in range(grasp.span):
-            for b in range(3):
-                pull = give(row(own.force, wp.static(3 * tall) * e + b), e)
-                if refresh == 1:
-                    for r in range(3 * grasp.each):
-                        own.rate[r] = row(own.rate, r) + row(table, r * wp.static(rows) + 3 * e + b) * pull
+@wp.func(inline=True)
+def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], refresh: int):
+    """Rates at the contacts, less those that would just close the gaps."""
+    if refresh == 1:
+        for k in range(solver.own_count):
+            own.rate[3 * k] = row(own.free_rate, 3 * k) - row(own.closing_rate, k)
+            own.rate[3 * k + 1] = row(own.free_rate, 3 * k + 1)
+            own.rate[3 * k + 2] = row(own.free_rate, 3 * k + 2)
+    for e in range(solver.warp_contacts):
+        for b in range(3):
+            pull = broadcast(row(own.force, wp.static(3 * tall) * e + b), e)
+            if refresh == 1:
+                for r in range(3 * solver.own_count):
+                    own.rate[r] = row(own.rate, r) + row(table, r * wp.static(rows) + 3 * e + b) * pull
 
-    @wp.func(inline=True)
-    def sweep(grasp: wp.ref[Grasp], own: wp.ref[Own], table: wp.ref[Table], tries: int):
-        """One contact at a time."""
-        zero = real(0.0)
-        far_off = zero
-        by_now = zero
-        in_all = zero
-        for c in range(grasp.span):
-            d0 = zero
-            d1 = zero
-            d2 = zero
-            mine = wp.static(lanes == 1) or c == grasp.part
-            if mine and grasp.settled == 0 and c < grasp.contacts:
-                k = wp.static(tall) * c
-                n0 = row(own.force, 3 * k)
-                p0 = row(own.force, 3 * k + 1)
-                q0 = row(own.force, 3 * k + 2)
-                block = row(own.block, k)
-                missed = row(own.rate, 3 * k)
-                bn = missed - block[0] * n0 - block[1] * p0 - block[2] * q0
-                b1 = row(own.rate, 3 * k + 1) - block[1] * n0 - block[3] * p0 - block[4] * q0
-                b2 = row(own.rate, 3 * k + 2) - block[2] * n0 - block[4] * p0 - block[5] * q0
-                found = at_contact(block, bn, b1, b2, p0, q0, row(own.mu, k), tries)
-                own.force[3 * k] = found[0]
-                own.force[3 * k + 1] = found[1]
-                own.force[3 * k + 2] = found[2]
-                d0 = found[0] - n0
-                d1 = found[1] - p0
-                d2 = found[2] - q0
-                # By how much (mm) the forces so far miss the gap that they should leave.
-                if n0 == zero:
-                    missed = wp.min(missed, zero)
-                slipped = block[3] * wp.abs(d1) + block[5] * wp.abs(d2)
-                far_off = wp.max(far_off, grasp.h * (wp.abs(missed) + slipped))
-                by_now += wp.abs(d0) + wp.abs(d1) + wp.abs(d2)
-                in_all += found[0]
-            d0 = give(d0, c)
-            d1 = give(d1, c)
-            d2 = give(d2, c)
-            for r in range(3 * grasp.each):
-                e = r * wp.static(rows) + 3 * c
-                own.rate[r] = row(own.rate, r) + row(table, e) * d0 + row(table, e + 1) * d1 + row(table, e + 2) * d2
-        far_off = greatest(far_off)
-        by_now = total(by_now)
-        in_all = total(in_all)
-        if grasp.settled == 0:
-            grasp.change = far_off
-            grasp.moved = by_now
-            grasp.whole = in_all
-            if far_off <= real(1e-4) or by_now <= real(1e-4) * in_all:
-                grasp.settled = 1
 
-    @wp.func(inline=True)
-    def solve(
-        grasp: wp.ref[Grasp],
-        square: wp.ref[Square],
-        work: wp.ref[Square],
-        load: wp.ref[Own1],
-        asked: wp.ref[Own1],
-        pressing: int,
-    ):
-        """Gauss-Jordan, every contact its own row: normal forces of those that press."""
-        share = Own1()
-        part = grasp.part
-        each = grasp.each
-        span = grasp.span
+@wp.func(inline=True)
+def gauss_seidel_sweep(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], tries: int):
+    """One contact at a time."""
+    zero = real(0.0)
+    far_off = zero
+    by_now = zero
+    in_all = zero
+    for c in range(solver.warp_contacts):
+        d0 = zero
+        d1 = zero
+        d2 = zero
+        mine = wp.static(group_size == 1) or c == solver.thread
+        if mine and solver.converged == 0 and c < solver.contacts:
+            k = wp.static(tall) * c
+            n0 = row(own.force, 3 * k)
+            p0 = row(own.force, 3 * k + 1)
+            q0 = row(own.force, 3 * k + 2)
+            block = row(own.self_compliance, k)
+            missed = row(own.rate, 3 * k)
+            bn = missed - block[0] * n0 - block[1] * p0 - block[2] * q0
+            b1 = row(own.rate, 3 * k + 1) - block[1] * n0 - block[3] * p0 - block[4] * q0
+            b2 = row(own.rate, 3 * k + 2) - block[2] * n0 - block[4] * p0 - block[5] * q0
+            found = solve_single_contact(block, bn, b1, b2, p0, q0, row(own.friction, k), tries)
+            own.force[3 * k] = found[0]
+            own.force[3 * k + 1] = found[1]
+            own.force[3 * k + 2] = found[2]
+            d0 = found[0] - n0
+            d1 = found[1] - p0
+            d2 = found[2] - q0
+            # By how much (mm) the forces so far miss the gap that they should leave.
+            if n0 == zero:
+                missed = wp.min(missed, zero)
+            slipped = block[3] * wp.abs(d1) + block[5] * wp.abs(d2)
+            far_off = wp.max(far_off, solver.step * (wp.abs(missed) + slipped))
+            by_now += wp.abs(d0) + wp.abs(d1) + wp.abs(d2)
+            in_all += found[0]
+        d0 = broadcast(d0, c)
+        d1 = broadcast(d1, c)
+        d2 = broadcast(d2, c)
+        for r in range(3 * solver.own_count):
+            e = r * wp.static(rows) + 3 * c
+            own.rate[r] = row(own.rate, r) + row(table, e) * d0 + row(table, e + 1) * d1 + row(table, e + 2) * d2
+    far_off = group_max(far_off)
+    by_now = group_sum(by_now)
+    in_all = group_sum(in_all)
+    if solver.converged == 0:
+        solver.gap_error = far_off
+        solver.force_change = by_now
+        solver.force_sum = in_all
+        if far_off <= real(1e-4) or by_now <= real(1e-4) * in_all:
+            solver.converged = 1
+
+
+@wp.func(inline=True)
+def solve_normal_forces(
+    solver: wp.ref[SolverState],
+    square: wp.ref[NormalMatrix],
+    work: wp.ref[NormalMatrix],
+    load: wp.ref[PerContact1],
+    asked: wp.ref[PerContact1],
+    pressing: int,
+):
+    """Gauss-Jordan, every contact its own row: normal forces of those that press."""
+    share = PerContact1()
+    part = solver.thread
+    each = solver.own_count
+    span = solver.warp_contacts
+    for k in range(each):
+        mine_in = (pressing >> (part + k)) % 2
+        for e in range(span):
+            keep = real(0.0)
+            if mine_in == 1 and (pressing >> e) % 2 == 1:
+                keep = row(square, k * wp.static(contacts) + e)
+            elif part + k == e:
+                keep = real(1.0)
+            work[k * wp.static(contacts) + e] = keep
+        load[k] = real(0.0)
+        if mine_in == 1:
+            load[k] = row(asked, k)
+    for p in range(span):
+        at = wp.static(tall * contacts) * p
+        pivot = broadcast(row(work, at + p), p)
+        known = broadcast(row(load, wp.static(tall) * p), p)
         for k in range(each):
-            mine_in = (pressing >> (part + k)) % 2
-            for e in range(span):
-                keep = real(0.0)
-                if mine_in == 1 and (pressing >> e) % 2 == 1:
-                    keep = row(square, k * wp.static(held) + e)
-                elif part + k == e:
-                    keep = real(1.0)
-                work[k * wp.static(held) + e] = keep
-            load[k] = real(0.0)
-            if mine_in == 1:
-                load[k] = row(asked, k)
-        for p in range(span):
-            at = wp.static(tall * held) * p
-            pivot = give(row(work, at + p), p)
-            known = give(row(load, wp.static(tall) * p), p)
+            share[k] = real(0.0)
+            if part + k != p:
+                share[k] = row(work, k * wp.static(contacts) + p) / pivot
+            load[k] = row(load, k) - share[k] * known
+        for e in range(p + 1, span):
+            value = broadcast(row(work, at + e), p)
             for k in range(each):
-                share[k] = real(0.0)
-                if part + k != p:
-                    share[k] = row(work, k * wp.static(held) + p) / pivot
-                load[k] = row(load, k) - share[k] * known
-            for e in range(p + 1, span):
-                value = give(row(work, at + e), p)
-                for k in range(each):
-                    c = k * wp.static(held) + e
-                    work[c] = row(work, c) - share[k] * value
-        for k in range(each):
-            if part + k < span:
-                load[k] = row(load, k) / row(work, k * wp.static(held) + part + k)
+                c = k * wp.static(contacts) + e
+                work[c] = row(work, c) - share[k] * value
+    for k in range(each):
+        if part + k < span:
+            load[k] = row(load, k) / row(work, k * wp.static(contacts) + part + k)
 
-    @wp.func(inline=True)
-    def share(
-        grasp: wp.ref[Grasp],
-        own: wp.ref[Own],
-        table: wp.ref[Table],
-        square: wp.ref[Square],
-        work: wp.ref[Square],
-        guessing: int,
-        tries: int,
-    ) -> int:
-        """Neighbouring contacts share a load in ways that Gauss-Seidel finds slowly: solve for all normal forces at
-        once, those of sliding contacts with their friction. Returned is whether the forces were changed."""
-        zero = real(0.0)
-        part = grasp.part
-        each = grasp.each
-        span = grasp.span
-        contacts = grasp.contacts
-        ratio1 = Own1()
-        ratio2 = Own1()
-        asked = Own1()
-        load = Own1()
-        opening = Own1()
-        pressing = int(0)
+
+@wp.func(inline=True)
+def share_normal_forces(
+    solver: wp.ref[SolverState],
+    own: wp.ref[ThreadContacts],
+    table: wp.ref[DelassusRows],
+    square: wp.ref[NormalMatrix],
+    work: wp.ref[NormalMatrix],
+    guessing: int,
+    tries: int,
+) -> int:
+    """Neighbouring contacts share a load in ways that Gauss-Seidel finds slowly: solve for all normal forces at
+    once, those of sliding contacts with their friction. Returned is whether the forces were changed."""
+    zero = real(0.0)
+    part = solver.thread
+    each = solver.own_count
+    span = solver.warp_contacts
+    contacts = solver.contacts
+    ratio1 = PerContact1()
+    ratio2 = PerContact1()
+    asked = PerContact1()
+    load = PerContact1()
+    opening = PerContact1()
+    pressing = int(0)
+    for k in range(each):
+        ratio1[k] = zero
+        ratio2[k] = zero
+        asked[k] = row(own.closing_rate, k) - row(own.free_rate, 3 * k)
+        if part + k < contacts:
+            fn = row(own.force, 3 * k)
+            if fn > zero:
+                pressing = pressing + (1 << (part + k))
+            f1 = row(own.force, 3 * k + 1)
+            f2 = row(own.force, 3 * k + 2)
+            size = wp.sqrt(f1 * f1 + f2 * f2)
+            if size > zero and size >= real(0.999) * row(own.friction, k) * fn:
+                ratio1[k] = row(own.friction, k) * f1 / size
+                ratio2[k] = row(own.friction, k) * f2 / size
+    pressing = group_or(pressing)
+    for e in range(span):
+        slide1 = broadcast(ratio1[wp.static(tall) * e], e)
+        slide2 = broadcast(ratio2[wp.static(tall) * e], e)
+        stick1 = broadcast(row(own.force, wp.static(3 * tall) * e + 1), e)
+        stick2 = broadcast(row(own.force, wp.static(3 * tall) * e + 2), e)
+        if slide1 != zero or slide2 != zero:
+            stick1 = zero
+            stick2 = zero
         for k in range(each):
-            ratio1[k] = zero
-            ratio2[k] = zero
-            asked[k] = row(own.gap, k) - row(own.free, 3 * k)
+            r = 3 * k * wp.static(rows) + 3 * e
+            square[k * wp.static(contacts) + e] = (
+                row(table, r) + row(table, r + 1) * slide1 + row(table, r + 2) * slide2
+            )
+            asked[k] = asked[k] - row(table, r + 1) * stick1 - row(table, r + 2) * stick2
+    agreed = 1 - guessing
+    for _ in range(tries):
+        if warp_max(1 - agreed) == 1:
+            solve_normal_forces(solver, square, work, load, asked, pressing)
+            worst = int(-1)
+            lowest = zero
+            for k in range(each):
+                opening[k] = -asked[k]
+            for e in range(span):
+                value = broadcast(load[wp.static(tall) * e], e)
+                if value < lowest:
+                    lowest = value
+                    worst = e
+                for k in range(each):
+                    opening[k] = opening[k] + row(square, k * wp.static(contacts) + e) * value
+            # A contact that pulls lets go; one that would open into the object presses.
+            flip = worst
+            lowest = real(-1e-6) / solver.step
+            for e in range(span):
+                value = broadcast(opening[wp.static(tall) * e], e)
+                if worst < 0 and e < contacts and (pressing >> e) % 2 == 0 and value < lowest:
+                    lowest = value
+                    flip = e
+            if agreed == 0:
+                if flip < 0:
+                    agreed = 1
+                else:
+                    pressing = pressing ^ (1 << flip)
+    wild = zero
+    for k in range(each):
+        if part + k < contacts and not (wp.abs(load[k]) < real(1e6)):
+            wild = real(1.0)
+    wild = group_max(wild)
+    changed = int(0)
+    if guessing == 1 and agreed == 1 and wild == zero:
+        changed = int(1)
+        for k in range(each):
             if part + k < contacts:
-                fn = row(own.force, 3 * k)
-                if fn > zero:
-                    pressing = pressing + (1 << (part + k))
+                fn = load[k]
                 f1 = row(own.force, 3 * k + 1)
                 f2 = row(own.force, 3 * k + 2)
-                size = wp.sqrt(f1 * f1 + f2 * f2)
-                if size > zero and size >= real(0.999) * row(own.mu, k) * fn:
-                    ratio1[k] = row(own.mu, k) * f1 / size
-                    ratio2[k] = row(own.mu, k) * f2 / size
-        pressing = joined(pressing)
-        for e in range(span):
-            slide1 = give(ratio1[wp.static(tall) * e], e)
-            slide2 = give(ratio2[wp.static(tall) * e], e)
-            stick1 = give(row(own.force, wp.static(3 * tall) * e + 1), e)
-            stick2 = give(row(own.force, wp.static(3 * tall) * e + 2), e)
-            if slide1 != zero or slide2 != zero:
-                stick1 = zero
-                stick2 = zero
-            for k in range(each):
-                r = 3 * k * wp.static(rows) + 3 * e
-                square[k * wp.static(held) + e] = (
-                    row(table, r) + row(table, r + 1) * slide1 + row(table, r + 2) * slide2
-                )
-                asked[k] = asked[k] - row(table, r + 1) * stick1 - row(table, r + 2) * stick2
-        agreed = 1 - guessing
-        for _ in range(tries):
-            if most(1 - agreed) == 1:
-                solve(grasp, square, work, load, asked, pressing)
-                worst = int(-1)
-                lowest = zero
-                for k in range(each):
-                    opening[k] = -asked[k]
-                for e in range(span):
-                    value = give(load[wp.static(tall) * e], e)
-                    if value < lowest:
-                        lowest = value
-                        worst = e
-                    for k in range(each):
-                        opening[k] = opening[k] + row(square, k * wp.static(held) + e) * value
-                # A contact that pulls lets go; one that would open into the object presses.
-                flip = worst
-                lowest = real(-1e-6) / grasp.h
-                for e in range(span):
-                    value = give(opening[wp.static(tall) * e], e)
-                    if worst < 0 and e < contacts and (pressing >> e) % 2 == 0 and value < lowest:
-                        lowest = value
-                        flip = e
-                if agreed == 0:
-                    if flip < 0:
-                        agreed = 1
-                    else:
-                        pressing = pressing ^ (1 << flip)
-        wild = zero
-        for k in range(each):
-            if part + k < contacts and not (wp.abs(load[k]) < real(1e6)):
-                wild = real(1.0)
-        wild = greatest(wild)
-        changed = int(0)
-        if guessing == 1 and agreed == 1 and wild == zero:
-            changed = int(1)
-            for k in range(each):
-                if part + k < contacts:
-                    fn = load[k]
-                    f1 = row(own.force, 3 * k + 1)
-                    f2 = row(own.force, 3 * k + 2)
-                    if ratio1[k] != zero or ratio2[k] != zero:
-                        f1 = ratio1[k] * fn
-                        f2 = ratio2[k] * fn
-                    else:
-                        size = wp.sqrt(f1 * f1 + f2 * f2)
-                        if size > row(own.mu, k) * fn:
-                            f1 = f1 * (row(own.mu, k) * fn / size)
-                            f2 = f2 * (row(own.mu, k) * fn / size)
-                    own.force[3 * k] = fn
-                    own.force[3 * k + 1] = f1
-                    own.force[3 * k + 2] = f2
-        return changed
+                if ratio1[k] != zero or ratio2[k] != zero:
+                    f1 = ratio1[k] * fn
+                    f2 = ratio2[k] * fn
+                else:
+                    size = wp.sqrt(f1 * f1 + f2 * f2)
+                    if size > row(own.friction, k) * fn:
+                        f1 = f1 * (row(own.friction, k) * fn / size)
+                        f2 = f2 * (row(own.friction, k) * fn / size)
+                own.force[3 * k] = fn
+                own.force[3 * k + 1] = f1
+                own.force[3 * k + 2] = f2
+    return changed
 
-    return SimpleNamespace(rates=rates, sweep=sweep, share=share)
+
+@wp.func(inline=True)
+def contact_force(own: wp.ref[ThreadContacts], k: int) -> vec3:
+    """Force of a contact."""
+    pull = row(own.axis, 3 * k) * row(own.force, 3 * k)
+    return (
+        pull
+        + row(own.axis, 3 * k + 1) * row(own.force, 3 * k + 1)
+        + row(own.axis, 3 * k + 2) * row(own.force, 3 * k + 2)
+    )
+
+
+@wp.func(inline=True)
+def iterate_forces(
+    solver: wp.ref[SolverState],
+    own: wp.ref[ThreadContacts],
+    table: wp.ref[DelassusRows],
+    square: wp.ref[NormalMatrix],
+    work: wp.ref[NormalMatrix],
+    doing: int,
+):
+    """Gauss-Seidel sweeps until the forces hold, with all normal forces solved for at once after every other."""
+    slip_tries = int(8) + solver.unknown_zero
+    guess_tries = int(10) + solver.unknown_zero
+    sweeps_most = int(wp.static(SWEEPS)) + solver.unknown_zero
+    solver.converged = 1 - doing
+    refresh = doing
+    solver.gap_error = real(0.0)
+    solver.force_change = real(0.0)
+    solver.force_sum = real(0.0)
+    for turn in range(sweeps_most):
+        if warp_max(1 - solver.converged) == 1:
+            if warp_max(refresh) == 1:
+                contact_rates(solver, own, table, refresh)
+                refresh = 0
+            gauss_seidel_sweep(solver, own, table, slip_tries)
+            guessing = int(0)
+            if solver.converged == 0 and solver.contacts > 1 and turn % 2 == 1:
+                guessing = 1
+            if warp_max(guessing) == 1:
+                refresh = share_normal_forces(solver, own, table, square, work, guessing, guess_tries)
+
+
+@wp.func(inline=True)
+def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts]):
+    """What the contacts do together, and their forces for the next step."""
+    zero = real(0.0)
+    pressed = vec3(zero, zero, zero)
+    twisted = vec3(zero, zero, zero)
+    heavy = zero
+    arm = zero
+    for k in range(solver.own_count):
+        if solver.thread + k < solver.contacts and solver.live == 1:
+            pull = contact_force(own, k)
+            arc = row(own.arc, k)
+            problems.held[solver.job, solver.thread + k] = vec4(arc, pull[0], pull[1], pull[2])
+            pressed = pressed + pull
+            twisted = twisted + wp.cross(row(own.point, k), pull)
+            fn = row(own.force, 3 * k)
+            if fn > zero:
+                heavy += fn
+                arm += fn * arc
+    heavy = group_sum(heavy)
+    arm = group_sum(arm)
+    pressed = vec3(group_sum(pressed[0]), group_sum(pressed[1]), group_sum(pressed[2]))
+    twisted = vec3(group_sum(twisted[0]), group_sum(twisted[1]), group_sum(twisted[2]))
+    if solver.thread == 0 and solver.live == 1:
+        problems.answer[solver.job, 4] = vec3(heavy, arm, zero)
+        problems.answer[solver.job, 5] = pressed
+        problems.answer[solver.job, 6] = twisted
+
+
+@wp.func(inline=True)
+def apply_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], lift: wp.ref[PerLink2], last: int, doing: int) -> int:
+    """Forces up the chain, then the change of acceleration down.
+
+    ``last`` says that there will be no further round. Returned is whether the forces press the whisker onto places
+    that do not take part, with room for them: then another round is needed.
+    """
+    zero = real(0.0)
+    none = vec3(zero, zero, zero)
+    link0 = solver.job * wp.static(capacity)
+    spot0 = solver.job * wp.static(most_candidates)
+    tw = none
+    tv = none
+    for back in range(solver.last_link + 1):
+        i = solver.last_link - back
+        for k in range(solver.own_count):
+            if solver.thread + k < solver.contacts and row(own.link, k) == i:
+                pull = contact_force(own, k)
+                tv = tv + pull
+                tw = tw + wp.cross(row(own.point, k), pull)
+        u1 = zero
+        u2 = zero
+        if i < solver.links:
+            u1 = wp.dot(problems.joint[link0 + i, 0], tw) + wp.dot(problems.joint[link0 + i, 2], tv)
+            u2 = wp.dot(problems.joint[link0 + i, 1], tw) + wp.dot(problems.joint[link0 + i, 3], tv)
+            tw = tw - problems.joint[link0 + i, 4] * u1 - problems.joint[link0 + i, 6] * u2
+            tv = tv - problems.joint[link0 + i, 5] * u1 - problems.joint[link0 + i, 7] * u2
+        u1 = group_sum(u1)
+        u2 = group_sum(u2)
+        if i < solver.links:
+            inv = problems.joint[link0 + i, 8]
+            lift[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
+    tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
+    tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
+    more = int(0)
+    if doing == 1:
+        aw = none
+        av = none
+        for i in range(solver.links):
+            extra = vec2(zero, zero)
+            if i <= solver.last_link:
+                extra = row(lift, i)
+            a1 = extra[0] - wp.dot(problems.joint[link0 + i, 4], aw) - wp.dot(problems.joint[link0 + i, 5], av)
+            a2 = extra[1] - wp.dot(problems.joint[link0 + i, 6], aw) - wp.dot(problems.joint[link0 + i, 7], av)
+            aw = aw + problems.joint[link0 + i, 0] * a1 + problems.joint[link0 + i, 1] * a2
+            av = av + problems.joint[link0 + i, 2] * a1 + problems.joint[link0 + i, 3] * a2
+            if solver.thread == 0:
+                problems.added_acceleration[solver.job, i] = vec2(a1, a2)
+            if solver.contacts < solver.candidates:
+                for j in range(solver.candidates):
+                    if problems.candidate_link[spot0 + j] == i and (solver.selected >> j) % 2 == 0:
+                        moved = problems.spot[spot0 + j, 2] + (av + wp.cross(aw, problems.spot[spot0 + j, 0])) * solver.step
+                        ahead = problems.spot_size[spot0 + j][0] + solver.step * wp.dot(problems.spot[spot0 + j, 1], moved)
+                        problems.predicted_gap[spot0 + j] = ahead
+                        if ahead < real(-wp.static(CLOSED)):
+                            more = int(1)
+        crowded = int(0)
+        if more == 1 and (solver.contacts == wp.static(contacts) or last == 1):
+            more = int(0)
+            crowded = int(1)
+        if more == 0 and solver.thread == 0:
+            unsolved = int(0)
+            miss = zero
+            if solver.converged == 0 and solver.gap_error > real(1e-2) and solver.force_change > real(1e-2) * solver.force_sum:
+                unsolved = int(1)
+                miss = solver.force_change * solver.force_change
+            index = solver.job
+            plan = problems.plan[index]
+            problems.counts[index, 2] = solver.contacts
+            problems.counts[index, 3] = crowded
+            problems.counts[index, 4] = unsolved
+            problems.answer[index, 0] = problems.answer[index, 0] - tw
+            problems.answer[index, 1] = problems.answer[index, 1] - tv
+            problems.answer[index, 2] = problems.answer[index, 2] + av + wp.cross(aw, vec3(plan[1], plan[2], plan[3]))
+            problems.answer[index, 3] = vec3(miss, solver.force_sum * solver.force_sum, zero)
+    return more
+
+
+@wp.func
+def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
+    solver = SolverState()
+    solver.job = index
+    solver.thread = part
+    solver.live = live
+    solver.links = problems.counts[index, 0]
+    solver.candidates = problems.counts[index, 1]
+    solver.previous_contacts = problems.counts[index, 2]
+    solver.step = problems.plan[index][0]
+    solver.unknown_zero = wp.min(0, index)
+    solver.own_count = int(wp.static(own_contacts)) + wp.static(tall) * solver.unknown_zero
+    own = ThreadContacts()
+    table = DelassusRows()
+    square = NormalMatrix()
+    work = NormalMatrix()
+    lift = PerLink2()
+    rounds_most = int(wp.static(ROUNDS)) + solver.unknown_zero
+    more = live
+    for round_ in range(rounds_most):
+        doing = more
+        if warp_max(doing) == 1:
+            select_contacts(problems, solver, own, doing)
+            build_delassus(problems, solver, own, table)
+            iterate_forces(solver, own, table, square, work, doing)
+            last = int(0)
+            if round_ == wp.static(ROUNDS - 1):
+                last = 1
+            more = apply_forces(problems, solver, own, lift, last, doing)
+    store_forces(problems, solver, own)

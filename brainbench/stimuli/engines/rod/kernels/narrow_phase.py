@@ -1,210 +1,199 @@
-"""How near a link comes to a shape: to the triangles of a surface by its search tree, to primitives in closed form."""
+"""How near a link comes to a shape.
+"""
 
-from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
-from brainbench.stimuli.engines.rod.kernels.algebra import algebra
-from brainbench.stimuli.engines.rod.kernels.distances import MESH, distances
-from brainbench.stimuli.engines.rod.kernels.inputs import structs
-from brainbench.stimuli.engines.rod.kernels.mesh_search import searches
-from brainbench.stimuli.engines.rod.kernels.motion import tracks
-from brainbench.stimuli.engines.rod.limits import FAR, MESHES
+import warp as wp
+
+from brainbench.stimuli.engines.rod.limits import FAR, MESH, MESHES
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
+from .algebra import unrotate, vec3, vec4
+from .distances import primitive, segment_primitive
+from .mesh_bvh import NearestTriangles, nearest_triangles
+from .motion import BodyMotion
+from .parameters import against, real
+from .state import ShapeArrays
 
-@cache
-def looks(real: type, against: int, lanes: int = 1) -> SimpleNamespace:
-    """Return ``Touch`` and ``look_at`` of a precision; without meshes to touch their code is left out.
 
-    ``lanes`` threads look at one link; ``part`` is the place of a thread in its group, ``live`` whether the group has
-    anything to look at.
-    """
-    import warp as wp
+@wp.func
+def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
+    """Pseudo-normal of the corner, edge or face on which the point with these barycentric coordinates lies."""
+    u = real(1.0) - v - w
+    low = real(1e-4)
+    on_p = u > low
+    on_q = v > low
+    on_r = w > low
+    slot = 0
+    if on_p and not on_q and not on_r:
+        slot = 1
+    elif on_q and not on_p and not on_r:
+        slot = 2
+    elif on_r and not on_p and not on_q:
+        slot = 3
+    elif not on_p:
+        slot = 4
+    elif not on_q:
+        slot = 5
+    elif not on_r:
+        slot = 6
+    return shapes.outward[face, slot]
 
-    vec3: Any = wp.types.vector(3, real)
-    vec4: Any = wp.types.vector(4, real)
-    shape, maths = distances(real), algebra(real)
-    segment_primitive, primitive = shape.segment_primitive, shape.primitive
-    unrotate, Bodies, Pose = maths.unrotate, structs(real).Bodies, tracks(real).Pose
-    search = searches(real, lanes)
-    nearest, Nearest = search.nearest, search.Nearest
 
-    @wp.func
-    def outward_of(bodies: Bodies, face: int, v: real, w: real) -> vec3:
-        """Pseudo-normal of the corner, edge or face on which the point with these barycentric coordinates lies."""
-        u = real(1.0) - v - w
-        low = real(1e-4)
-        on_p = u > low
-        on_q = v > low
-        on_r = w > low
-        slot = 0
-        if on_p and not on_q and not on_r:
-            slot = 1
-        elif on_q and not on_p and not on_r:
-            slot = 2
-        elif on_r and not on_p and not on_q:
-            slot = 3
-        elif not on_p:
-            slot = 4
-        elif not on_q:
-            slot = 5
-        elif not on_r:
-            slot = 6
-        return bodies.outward[face, slot]
+@wp.struct
+class LinkDistance:
+    """How near a link comes to a shape: between its ends, and at its far end."""
 
-    @wp.struct
-    class Touch:
-        """How near a link comes to a shape: between its ends, and at its far end."""
+    between: wp.int32
+    """Whether something between the ends is near."""
+    share: real
+    gap: real
+    normal: vec3
+    end: wp.int32
+    """Whether the far end is near."""
+    end_gap: real
+    end_normal: vec3
+    clear: real
+    """Lower bound of the distance of the link's axis from the surface."""
+    leaf: wp.int32
+    """Leaf of the search tree (+ 1) where the nearest triangle is; 0 without."""
 
-        between: wp.int32
-        """Whether something between the ends is near."""
-        share: real
-        gap: real
-        normal: vec3
-        end: wp.int32
-        """Whether the far end is near."""
-        end_gap: real
-        end_normal: vec3
-        clear: real
-        """Lower bound of the distance of the link's axis from the surface."""
-        leaf: wp.int32
-        """Leaf of the search tree (+ 1) where the nearest triangle is; 0 without."""
 
-    @wp.func
-    def corner_point(bodies: Bodies, face: int, v: real, w: real) -> vec3:
-        p = bodies.corner[face, 0]
-        return p + (bodies.corner[face, 1] - p) * v + (bodies.corner[face, 2] - p) * w
+@wp.func
+def surface_point(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
+    p = shapes.corner[face, 0]
+    return p + (shapes.corner[face, 1] - p) * v + (shapes.corner[face, 2] - p) * w
 
-    @wp.func
-    def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
-        """Direction out of a mesh and signed distance, given the way from the closest point and the pseudo-normal."""
-        if distance < real(1e-3) * radius:
-            return vec4(outward[0], outward[1], outward[2], distance)
-        side = real(1.0) / distance
-        signed = distance
-        if wp.dot(away, outward) < real(0.0):
-            side = -side
-            signed = -distance
-        return vec4(away[0] * side, away[1] * side, away[2] * side, signed)
 
-    @wp.func
-    def at_mesh(bodies: Bodies, s: int, a: vec3, b: vec3, ra: real, rb: real, within: real, got: Nearest) -> Touch:
-        """What a search found: contacts no further than ``within`` from the axis, or that the link lies far inside."""
-        touch = Touch()
-        touch.between = 0
-        touch.end = 0
-        touch.leaf = 0
-        first = bodies.face[s]
-        square = wp.min(got.side, wp.min(got.end, got.start))
-        touch.clear = wp.sqrt(square)
-        # The nearest of all, with where it is on the axis.
-        face = got.face
-        share = got.share
-        v = got.v
-        w = got.w
-        if got.end < got.side:
-            face = got.end_face
-            share = real(1.0)
-            v = got.end_v
-            w = got.end_w
-        if got.start < wp.min(got.side, got.end):
-            face = got.start_face
-            share = real(0.0)
-            v = got.start_v
-            w = got.start_w
-        if face >= 0:
-            touch.leaf = face // wp.static(WIDE) + 1
-            if touch.clear > within:
-                away = a + (b - a) * share - corner_point(bodies, first + face, v, w)
-                radius = ra + (rb - ra) * share
-                out = direction(away, touch.clear, outward_of(bodies, first + face, v, w), radius)
-                if out[3] < real(0.0):
-                    touch.between = 1
-                    touch.share = share
-                    touch.gap = out[3] - radius
-                    touch.normal = vec3(out[0], out[1], out[2])
-                    touch.clear = real(0.0)
-                return touch
-        # Further away a search need not have found the nearest.
-        if got.face >= 0 and got.side <= within * within:
-            face = first + got.face
-            out_here = outward_of(bodies, face, got.v, got.w)
-            # On a flat or hollow edge the ends of the link are nearer, or as near.
-            flat = wp.dot(out_here, bodies.outward[face, 0]) > real(0.99999)
-            if got.share > real(1e-3) and got.share < real(1.0 - 1e-3) and not (flat and got.side > real(0.0)):
-                radius = ra + (rb - ra) * got.share
-                away = a + (b - a) * got.share - corner_point(bodies, face, got.v, got.w)
-                out = direction(away, wp.sqrt(got.side), out_here, radius)
+@wp.func
+def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
+    """Direction out of a mesh and signed distance, given the way from the closest point and the pseudo-normal."""
+    if distance < real(1e-3) * radius:
+        return vec4(outward[0], outward[1], outward[2], distance)
+    side = real(1.0) / distance
+    signed = distance
+    if wp.dot(away, outward) < real(0.0):
+        side = -side
+        signed = -distance
+    return vec4(away[0] * side, away[1] * side, away[2] * side, signed)
+
+
+@wp.func
+def mesh_distance(shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: real, within: real, got: NearestTriangles) -> LinkDistance:
+    """What a search found: contacts no further than ``within`` from the axis, or that the link lies far inside."""
+    touch = LinkDistance()
+    touch.between = 0
+    touch.end = 0
+    touch.leaf = 0
+    first = shapes.face[s]
+    square = wp.min(got.side, wp.min(got.end, got.start))
+    touch.clear = wp.sqrt(square)
+    # The nearest of all, with where it is on the axis.
+    face = got.face
+    share = got.share
+    v = got.v
+    w = got.w
+    if got.end < got.side:
+        face = got.end_face
+        share = real(1.0)
+        v = got.end_v
+        w = got.end_w
+    if got.start < wp.min(got.side, got.end):
+        face = got.start_face
+        share = real(0.0)
+        v = got.start_v
+        w = got.start_w
+    if face >= 0:
+        touch.leaf = face // wp.static(WIDE) + 1
+        if touch.clear > within:
+            away = a + (b - a) * share - surface_point(shapes, first + face, v, w)
+            radius = ra + (rb - ra) * share
+            out = direction(away, touch.clear, pseudo_normal(shapes, first + face, v, w), radius)
+            if out[3] < real(0.0):
                 touch.between = 1
-                touch.share = got.share
+                touch.share = share
                 touch.gap = out[3] - radius
                 touch.normal = vec3(out[0], out[1], out[2])
-        if got.end_face >= 0 and got.end <= within * within:
-            face = first + got.end_face
-            away = b - corner_point(bodies, face, got.end_v, got.end_w)
-            out = direction(away, wp.sqrt(got.end), outward_of(bodies, face, got.end_v, got.end_w), rb)
-            touch.end = 1
-            touch.end_gap = out[3] - rb
-            touch.end_normal = vec3(out[0], out[1], out[2])
-        return touch
+                touch.clear = real(0.0)
+            return touch
+    # Further away a search need not have found the nearest.
+    if got.face >= 0 and got.side <= within * within:
+        face = first + got.face
+        out_here = pseudo_normal(shapes, face, got.v, got.w)
+        # On a flat or hollow edge the ends of the link are nearer, or as near.
+        flat = wp.dot(out_here, shapes.outward[face, 0]) > real(0.99999)
+        if got.share > real(1e-3) and got.share < real(1.0 - 1e-3) and not (flat and got.side > real(0.0)):
+            radius = ra + (rb - ra) * got.share
+            away = a + (b - a) * got.share - surface_point(shapes, face, got.v, got.w)
+            out = direction(away, wp.sqrt(got.side), out_here, radius)
+            touch.between = 1
+            touch.share = got.share
+            touch.gap = out[3] - radius
+            touch.normal = vec3(out[0], out[1], out[2])
+    if got.end_face >= 0 and got.end <= within * within:
+        face = first + got.end_face
+        away = b - surface_point(shapes, face, got.end_v, got.end_w)
+        out = direction(away, wp.sqrt(got.end), pseudo_normal(shapes, face, got.end_v, got.end_w), rb)
+        touch.end = 1
+        touch.end_gap = out[3] - rb
+        touch.end_normal = vec3(out[0], out[1], out[2])
+    return touch
 
-    @wp.func
-    def look_at(
-        bodies: Bodies,
-        s: int,
-        body: Pose,
-        a_world: vec3,
-        b_world: vec3,
-        taper: vec4,
-        margin: real,
-        leaf: int,
-        part: int,
-        live: int,
-    ) -> Touch:
-        """How near a link comes to a shape, in lengths of the scene but directions of the shape.
 
-        A negative margin asks only for a bound of the distance, up to so far.
-        """
-        turn_s = bodies.turn[s]
-        scale = bodies.scale[s]
-        local = unrotate(body.turn, a_world - body.place) - bodies.place[s]
-        a = unrotate(turn_s, local) / scale
-        local = unrotate(body.turn, b_world - body.place) - bodies.place[s]
-        b = unrotate(turn_s, local) / scale
-        ra = taper[0] / scale
-        rb = taper[1] / scale
-        touch = Touch()
-        meshed = int(0)
-        if wp.static(against == MESHES):
-            asks = int(0)
-            if bodies.kind[s] == wp.static(MESH):
-                meshed = 1
-                asks = live
-            within = (wp.max(taper[0], taper[1]) + margin) / scale
-            radius = wp.max(within, real(wp.static(FAR)) / scale)
-            if margin < real(0.0):
-                within = real(0.0)
-                radius = -margin / scale
-            got = nearest(bodies, s, a, b, radius, within, leaf - 1, part, asks)
-            touch = at_mesh(bodies, s, a, b, ra, rb, within, got)
-        if meshed == 0:
-            found = segment_primitive(bodies.kind[s], bodies.size[s] / scale, a, b, ra, rb)
-            touch.clear = found[1] + wp.min(ra, rb)
-            touch.share = found[0]
-            touch.gap = found[1]
-            touch.normal = vec3(found[2], found[3], found[4])
-            touch.between = 0
-            if found[0] > real(1e-3) and found[0] < real(1.0 - 1e-3):
-                touch.between = 1
-            tip = primitive(bodies.kind[s], bodies.size[s] / scale, b)
-            touch.end = 1
-            touch.end_gap = tip[3] - rb
-            touch.end_normal = vec3(tip[0], tip[1], tip[2])
-            touch.leaf = leaf
-        touch.clear = touch.clear * scale
-        touch.gap = touch.gap * scale
-        touch.end_gap = touch.end_gap * scale
-        return touch
+@wp.func
+def link_shape_distance(
+    shapes: ShapeArrays,
+    s: int,
+    body: BodyMotion,
+    a_world: vec3,
+    b_world: vec3,
+    taper: vec4,
+    margin: real,
+    leaf: int,
+    part: int,
+    live: int,
+) -> LinkDistance:
+    """How near a link comes to a shape, in lengths of the scene but directions of the shape.
 
-    return SimpleNamespace(Touch=Touch, look_at=look_at)
+    A negative margin asks only for a bound of the distance, up to so far.
+    """
+    turn_s = shapes.turn[s]
+    scale = shapes.scale[s]
+    local = unrotate(body.turn, a_world - body.place) - shapes.place[s]
+    a = unrotate(turn_s, local) / scale
+    local = unrotate(body.turn, b_world - body.place) - shapes.place[s]
+    b = unrotate(turn_s, local) / scale
+    ra = taper[0] / scale
+    rb = taper[1] / scale
+    touch = LinkDistance()
+    meshed = int(0)
+    if wp.static(against == MESHES):
+        asks = int(0)
+        if shapes.kind[s] == wp.static(MESH):
+            meshed = 1
+            asks = live
+        within = (wp.max(taper[0], taper[1]) + margin) / scale
+        radius = wp.max(within, real(wp.static(FAR)) / scale)
+        if margin < real(0.0):
+            within = real(0.0)
+            radius = -margin / scale
+        got = nearest_triangles(shapes, s, a, b, radius, within, leaf - 1, part, asks)
+        touch = mesh_distance(shapes, s, a, b, ra, rb, within, got)
+    if meshed == 0:
+        found = segment_primitive(shapes.kind[s], shapes.size[s] / scale, a, b, ra, rb)
+        touch.clear = found[1] + wp.min(ra, rb)
+        touch.share = found[0]
+        touch.gap = found[1]
+        touch.normal = vec3(found[2], found[3], found[4])
+        touch.between = 0
+        if found[0] > real(1e-3) and found[0] < real(1.0 - 1e-3):
+            touch.between = 1
+        tip = primitive(shapes.kind[s], shapes.size[s] / scale, b)
+        touch.end = 1
+        touch.end_gap = tip[3] - rb
+        touch.end_normal = vec3(tip[0], tip[1], tip[2])
+        touch.leaf = leaf
+    touch.clear = touch.clear * scale
+    touch.gap = touch.gap * scale
+    touch.end_gap = touch.end_gap * scale
+    return touch

@@ -1,141 +1,127 @@
-"""Whiskers at rest: straight out of a base that stands still, until an object may come near."""
+"""Whiskers at rest: straight out of a base that stands still, until an object may come near.
+"""
 
-from functools import cache
 from typing import Any
 
-from brainbench.stimuli.engines.rod.kernels.algebra import algebra
-from brainbench.stimuli.engines.rod.kernels.inputs import structs
-from brainbench.stimuli.engines.rod.kernels.motion import tracks
-from brainbench.stimuli.engines.rod.kernels.narrow_phase import looks
-from brainbench.stimuli.engines.rod.kernels.state import memory
+import warp as wp
+
 from brainbench.stimuli.engines.rod.limits import NOTHING
 
+from .algebra import rotate, vec2, vec3
+from .motion import pose_at
+from .narrow_phase import link_shape_distance
+from .parameters import against, real, sliced
+from .state import ChainArrays, ChainState, MotionArrays, PausedWhiskers, ProximityState, ShapeArrays, WhiskerJob, WhiskerState, row
 
-@cache
-def look_ahead_of(real: type, capacity: int, against: int, sliced: bool) -> Any:
-    """Return ``look_ahead(…)``: until when can nothing come near a whisker at rest?
 
-    It is told in ``state.idle``, and link by link in the memory: while at rest, ``clear`` keeps until when nothing can
-    reach a link, later a distance again. Returned is what to wait for: 4 and 2 as in ``State.waiting``, 0 nothing.
-    """
-    import warp as wp
+@wp.func(inline=True)
+def query_rest_distances(
+    paused: PausedWhiskers, job: WhiskerJob, proximity: wp.ref[ProximityState], state: wp.ref[WhiskerState], fresh: int, upto: real, look: real
+) -> int:
+    """Ask for these distances like for all others; returned is what to wait for."""
+    near_count = int(0)
+    for i in range(job.links):
+        if fresh == 1 or row(proximity.clearance, i) < upto:
+            near_count = near_count + 1
+    state.first_query = wp.atomic_add(paused.tally, 6, near_count)
+    if state.first_query + near_count > paused.query_job.shape[0]:
+        return 2
+    paused.times[5, job.index] = state.reading_time
+    paused.times[6, job.index] = -look
+    return 4
 
-    vec2: Any = wp.types.vector(2, real)
-    vec3: Any = wp.types.vector(3, real)
-    kinds, track, near_by, kept = structs(real), tracks(real), looks(real, against), memory(real, capacity)
-    Chains, Bodies, Paused, Tracks, pose_at = kinds.Chains, kinds.Bodies, kinds.Paused, track.Tracks, track.pose_at
-    Links, Watch, Lane, State, row = kept.Links, kept.Watch, kept.Lane, kept.State, kept.row
-    look_at, rotate = near_by.look_at, algebra(real).rotate
 
-    @wp.func(inline=True)
-    def ask(
-        on: Paused, me: Lane, watch: wp.ref[Watch], state: wp.ref[State], fresh: int, upto: real, look: real
-    ) -> int:
-        """Ask for these distances like for all others; returned is what to wait for."""
-        nigh = int(0)
-        for i in range(me.links):
-            if fresh == 1 or row(watch.clear, i) < upto:
-                nigh = nigh + 1
-        state.look_first = wp.atomic_add(on.tally, 6, nigh)
-        if state.look_first + nigh > on.look_lane.shape[0]:
-            return 2
-        on.times[5, me.lane] = state.before
-        on.times[6, me.lane] = -look
-        return 4
-
-    @wp.func(inline=True)
-    def look_ahead(
-        ch: Chains,
-        tr: Tracks,
-        bodies: Bodies,
-        me: Lane,
-        on: Paused,
-        mem: wp.ref[Links],
-        watch: wp.ref[Watch],
-        state: wp.ref[State],
-        start: real,
-        upto: real,
-        end: real,
-    ) -> int:
-        zero = real(0.0)
-        one = real(1.0)
-        before = state.before
-        idle_before = state.idle
-        state.idle = real(1e30)
-        # Without objects nothing of this remains in the kernel, nor what it keeps.
-        if wp.static(against > NOTHING) and (me.speed > zero or before == start):
-            pose = pose_at(tr, me.base, before)
-            x = rotate(pose.turn, vec3(one, zero, zero))
-            y = rotate(pose.turn, vec3(zero, one, zero))
-            at = pose.place
-            # Nothing can come near after the last reading.
-            look = me.speed * (end - before) + real(0.5)
-            fresh = int(0)
-            if idle_before == zero or before == start:
-                fresh = 1
-            wait = int(0)
-            if wp.static(sliced):
-                if state.waiting != 4:
-                    wait = ask(on, me, watch, state, fresh, upto, look)
-            place = state.look_first
-            links = me.links
-            if wait == 2:
-                links = int(0)
-            for i in range(links):
-                b4 = ch.build[i, me.whisker]
-                turned = x * b4[1] + y * b4[2]
-                y = y * b4[1] - x * b4[2]
-                x = turned
-                ahead_at = at + x * b4[0]
-                watch.until[i] = row(watch.clear, i)
-                if fresh == 1 or row(watch.clear, i) < upto:
-                    if wp.static(sliced) and wait == 4:
-                        on.look_lane[place] = me.lane
-                        on.look_link[place] = i
-                        on.look_ends[place, 0] = at
-                        on.look_ends[place, 1] = ahead_at
+@wp.func(inline=True)
+def check_rest(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    job: WhiskerJob,
+    paused: PausedWhiskers,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    state: wp.ref[WhiskerState],
+    start: real,
+    upto: real,
+    end: real,
+) -> int:
+    zero = real(0.0)
+    one = real(1.0)
+    before = state.reading_time
+    idle_before = state.safe_until
+    state.safe_until = real(1e30)
+    # Without objects nothing of this remains in the kernel, nor what it keeps.
+    if wp.static(against > NOTHING) and (job.object_speed > zero or before == start):
+        pose = pose_at(motions, job.base, before)
+        x = rotate(pose.turn, vec3(one, zero, zero))
+        y = rotate(pose.turn, vec3(zero, one, zero))
+        at = pose.place
+        # Nothing can come near after the last reading.
+        look = job.object_speed * (end - before) + real(0.5)
+        fresh = int(0)
+        if idle_before == zero or before == start:
+            fresh = 1
+        wait = int(0)
+        if wp.static(sliced):
+            if state.waiting_for != 4:
+                wait = query_rest_distances(paused, job, proximity, state, fresh, upto, look)
+        place = state.first_query
+        links = job.links
+        if wait == 2:
+            links = int(0)
+        for i in range(links):
+            b4 = chains.build[i, job.whisker]
+            turned = x * b4[1] + y * b4[2]
+            y = y * b4[1] - x * b4[2]
+            x = turned
+            ahead_at = at + x * b4[0]
+            proximity.safe_until[i] = row(proximity.clearance, i)
+            if fresh == 1 or row(proximity.clearance, i) < upto:
+                if wp.static(sliced) and wait == 4:
+                    paused.query_job[place] = job.index
+                    paused.query_link[place] = i
+                    paused.query_ends[place, 0] = at
+                    paused.query_ends[place, 1] = ahead_at
+                else:
+                    slack = real(1e30)
+                    taper = chains.taper[i, job.whisker]
+                    if wp.static(sliced):
+                        answer4 = paused.found[place, 2]
+                        slack = answer4[1]
+                        proximity.leaf[i] = int(answer4[3])
                     else:
-                        slack = real(1e30)
-                        taper = ch.taper[i, me.whisker]
-                        if wp.static(sliced):
-                            answer4 = on.found[place, 2]
-                            slack = answer4[1]
-                            watch.leaf[i] = int(answer4[3])
-                        else:
-                            for s in range(me.shapes_from, me.shapes_to):
-                                body = pose_at(tr, bodies.track[s], before)
-                                touch = look_at(bodies, s, body, at, ahead_at, taper, -look, row(watch.leaf, i), 0, 1)
-                                slack = wp.min(slack, touch.clear)
-                                watch.leaf[i] = touch.leaf
-                        slack = slack - taper[0] - real(0.05)
-                        watch.until[i] = real(1e30)
-                        if slack <= zero:
-                            watch.until[i] = before
-                        elif me.speed > zero:
-                            watch.until[i] = before + slack / (real(1.02) * me.speed)
-                    place = place + 1
-                state.idle = wp.min(state.idle, row(watch.until, i))
-                at = ahead_at
-            if wp.static(sliced):
-                if wait != 0:
-                    state.idle = idle_before
-                    return wait
-                state.waiting = 0
-            for i in range(me.links):
-                if upto > state.idle:
-                    # Not at rest any longer: a distance again.
-                    bound = zero
-                    until = row(watch.until, i)
-                    if until > before:
-                        bound = (until - before) * real(1.02) * me.speed + ch.taper[i, me.whisker][0] + real(0.04)
-                    if fresh == 1:
-                        bound = wp.max(bound, row(watch.clear, i))
-                    watch.until[i] = bound
-                watch.clear[i] = row(watch.until, i)
-        if upto <= state.idle:
-            for i in range(me.links):
-                mem.q[i] = vec2(zero, zero)
-                mem.qd[i] = vec2(zero, zero)
-        return 0
-
-    return look_ahead
+                        for s in range(job.first_shape, job.end_shape):
+                            body = pose_at(motions, shapes.track[s], before)
+                            touch = link_shape_distance(shapes, s, body, at, ahead_at, taper, -look, row(proximity.leaf, i), 0, 1)
+                            slack = wp.min(slack, touch.clear)
+                            proximity.leaf[i] = touch.leaf
+                    slack = slack - taper[0] - real(0.05)
+                    proximity.safe_until[i] = real(1e30)
+                    if slack <= zero:
+                        proximity.safe_until[i] = before
+                    elif job.object_speed > zero:
+                        proximity.safe_until[i] = before + slack / (real(1.02) * job.object_speed)
+                place = place + 1
+            state.safe_until = wp.min(state.safe_until, row(proximity.safe_until, i))
+            at = ahead_at
+        if wp.static(sliced):
+            if wait != 0:
+                state.safe_until = idle_before
+                return wait
+            state.waiting_for = 0
+        for i in range(job.links):
+            if upto > state.safe_until:
+                # Not at rest any longer: a distance again.
+                bound = zero
+                until = row(proximity.safe_until, i)
+                if until > before:
+                    bound = (until - before) * real(1.02) * job.object_speed + chains.taper[i, job.whisker][0] + real(0.04)
+                if fresh == 1:
+                    bound = wp.max(bound, row(proximity.clearance, i))
+                proximity.safe_until[i] = bound
+            proximity.clearance[i] = row(proximity.safe_until, i)
+    if upto <= state.safe_until:
+        for i in range(job.links):
+            chain.angle[i] = vec2(zero, zero)
+            chain.rate[i] = vec2(zero, zero)
+    return 0

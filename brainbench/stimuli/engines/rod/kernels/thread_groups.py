@@ -1,82 +1,75 @@
-"""Groups of threads that work on one thing and tell each other what they found."""
+"""Groups of threads that work on one thing and tell each other what they found.
 
-from functools import cache
-from types import SimpleNamespace
+All threads of a GPU warp must call these functions together. A group of one thread has nobody to ask; on a processor
+groups have one thread.
+"""
 
+import warp as wp
 
-@cache
-def groups(real: type, lanes: int) -> SimpleNamespace:
-    """Return what a group of ``lanes`` threads can tell each other; a group of one thread has nobody to ask.
+from .parameters import group_size, real
 
-    ``give(value, source)`` is the value that the thread ``source`` of the group has; ``total``, ``greatest``,
-    ``least``, ``first`` (the least integer) and ``joined`` (bits) are taken over the group, ``most`` over its warp.
-    All threads of a warp must call them together.
-    """
-    import warp as wp
+if group_size == 1:
 
-    if lanes == 1:
+    @wp.func
+    def broadcast(value: real, source: int) -> real:
+        return value
 
-        @wp.func
-        def give(value: real, source: int) -> real:
-            return value
+    @wp.func
+    def group_sum(value: real) -> real:
+        return value
 
-        @wp.func
-        def total(value: real) -> real:
-            return value
+    @wp.func
+    def group_max(value: real) -> real:
+        return value
 
-        @wp.func
-        def greatest(value: real) -> real:
-            return value
+    @wp.func
+    def group_min(value: real) -> real:
+        return value
 
-        @wp.func
-        def least(value: real) -> real:
-            return value
+    @wp.func
+    def group_min_int(value: int) -> int:
+        return value
 
-        @wp.func
-        def first(value: int) -> int:
-            return value
+    @wp.func
+    def group_or(bits: int) -> int:
+        return bits
 
-        @wp.func
-        def joined(bits: int) -> int:
-            return bits
+    @wp.func
+    def warp_max(value: int) -> int:
+        return value
 
-        @wp.func
-        def most(value: int) -> int:
-            return value
+else:
 
-    else:
+    def native(device_code: str, host_code: str = "return value;") -> str:
+        return f"#if defined(__CUDA_ARCH__)\n{device_code}\n#else\n{host_code}\n#endif\n"
 
-        def native(device_code: str, host_code: str = "return value;") -> str:
-            return f"#if defined(__CUDA_ARCH__)\n{device_code}\n#else\n{host_code}\n#endif\n"
+    def reduce(step: str, name: str = "value", width: int = group_size) -> str:
+        """Return the code of a butterfly reduction over ``width`` threads."""
+        return native(
+            f"for (int o = {width // 2}; o > 0; o /= 2) {{ auto other = __shfl_xor_sync(0xffffffffu, {name}, o);"
+            f" {step} }} return {name};",
+            f"return {name};",
+        )
 
-        def reduce(step: str, name: str = "value", width: int = lanes) -> str:
-            return native(
-                f"for (int o = {width // 2}; o > 0; o /= 2) {{ auto other = __shfl_xor_sync(0xffffffffu, {name}, o);"
-                f" {step} }} return {name};",
-                f"return {name};",
-            )
+    @wp.func_native(native(f"return __shfl_sync(0xffffffffu, value, source, {group_size});"))
+    def broadcast(value: real, source: int) -> real:
+        """Return the value of the thread ``source`` of the group."""
 
-        @wp.func_native(native(f"return __shfl_sync(0xffffffffu, value, source, {lanes});"))
-        def give(value: real, source: int) -> real: ...
+    @wp.func_native(reduce("value += other;"))
+    def group_sum(value: real) -> real: ...
 
-        @wp.func_native(reduce("value += other;"))
-        def total(value: real) -> real: ...
+    @wp.func_native(reduce("value = other > value ? other : value;"))
+    def group_max(value: real) -> real: ...
 
-        @wp.func_native(reduce("value = other > value ? other : value;"))
-        def greatest(value: real) -> real: ...
+    @wp.func_native(reduce("value = other < value ? other : value;"))
+    def group_min(value: real) -> real: ...
 
-        @wp.func_native(reduce("value = other < value ? other : value;"))
-        def least(value: real) -> real: ...
+    @wp.func_native(reduce("value = other < value ? other : value;"))
+    def group_min_int(value: int) -> int: ...
 
-        @wp.func_native(reduce("value = other < value ? other : value;"))
-        def first(value: int) -> int: ...
+    @wp.func_native(reduce("bits |= other;", "bits"))
+    def group_or(bits: int) -> int: ...
 
-        @wp.func_native(reduce("bits |= other;", "bits"))
-        def joined(bits: int) -> int: ...
-
-        @wp.func_native(reduce("value = other > value ? other : value;", width=32))
-        def most(value: int) -> int: ...
-
-    return SimpleNamespace(
-        give=give, total=total, greatest=greatest, least=least, first=first, joined=joined, most=most
-    )
+    @wp.func_native(reduce("value = other > value ? other : value;", width=32))
+    def warp_max(value: int) -> int:
+        """Return the greatest value of all threads of the warp."""

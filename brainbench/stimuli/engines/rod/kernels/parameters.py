@@ -1,0 +1,33 @@
+"""Types and sizes that the other modules are written for; :func:`~brainbench.stimuli.engines.rod.kernels.specialize`
+sets them before it loads a module."""
+
+import warp as wp
+
+from brainbench.stimuli.engines.rod.limits import MESHES, contacts_for
+
+real = wp.float32
+"""Type of all numbers: ``warp.float32`` or ``warp.float64``."""
+capacity = 12
+"""Links that fit."""
+against = MESHES
+"""What there is to touch."""
+sliced = False
+"""Whether whiskers pause for distances and contact forces."""
+cuda = False
+"""Whether the code is for a GPU."""
+bounds: tuple[int, int] | None = None
+"""CUDA launch bounds of the kernel that takes steps."""
+contacts = contacts_for(capacity)
+"""Contacts that are solved together."""
+group_size = 1
+"""Threads that work together on one whisker's contacts, or on one link's distance."""
+queue = 0
+"""Queue of contact problems that a kernel takes."""
+
+
+def module_options() -> dict[str, object]:
+    """Return Warp's options of the modules: on a GPU divisions and roots are approximate in single precision.
+
+    Warp's own flags for a processor inline without bound, which is no faster here and takes longer to compile.
+    """
+    return {"fast_math": cuda and real is wp.float32, "cpu_compiler_flags": "-march=native"}
