@@ -20,8 +20,7 @@ from typing import Any, NoReturn
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import write_text
-from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, migrate_record, record_identity
-from leaderboards.schema import first_fault
+from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
 
 
 @dataclass(frozen=True)
@@ -139,14 +138,9 @@ def _parse(text: str, path: Path) -> tuple[ResultRecord, dict[str, Any]]:
     except ValueError as error:
         raise DataError(f"{path.name!r} is not valid JSON ({error}).") from error
     try:
-        # The version comes first: another layout should be called old or new, not faulty.
-        current = migrate_record(data) if isinstance(data, dict) and isinstance(data.get("schema"), int) else data
-        fault = first_fault(current)
-        if fault:
-            raise DataError(f"it is not a result record: {fault}.")
-        record = ResultRecord.from_json(current)
+        record = ResultRecord.from_json(data)
     except DataError as error:
-        raise DataError(f"{path.name!r}: {error}") from error
+        raise DataError(f"{path.name!r} is not a result record: {error}") from error
     for score in (record.score, record.animal_to_animal, *record.baselines.values()):
         contradiction = _contradiction(score) if score else None
         if score and contradiction:

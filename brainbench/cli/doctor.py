@@ -12,6 +12,7 @@ from brainbench.cli.output import JsonOption, emit, table
 REQUIRED = (
     "torch",
     "warp-lang",
+    "msgspec",
     "mujoco-core",
     "numpy",
     "scipy",

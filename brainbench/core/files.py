@@ -57,14 +57,14 @@ def to_plain(value: Any) -> Any:
     A field that came later than files and hashes which exist (its metadata say ``later=True``) appears only where it
     is used, so that those stay what they are.
     """
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
         return {
             field.name: to_plain(getattr(value, field.name))
             for field in fields(value)
             if not (field.metadata.get("later") and getattr(value, field.name) == field.default)
         }
-    if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [to_plain(item) for item in value]
     if isinstance(value, (set, frozenset)):

@@ -5,83 +5,173 @@ Letters: K stimulus, P = K(K−1)/2 RDM pair.
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from brainbench.core.errors import DataError
+import msgspec
+
+from brainbench.core.errors import DataError, listing
+from brainbench.core.files import content_hash, to_json, to_plain
 
 Status = Literal["ok", "unreliable", "undefined"]
 """``ok``: can be trusted; ``unreliable``: computed, but the data are too noisy or too few to trust
 it; ``undefined``: no number exists. The reason stands in words beside it."""
 
-RECORD_SCHEMA = 2
+RECORD_SCHEMA: Literal[2] = 2
 """Version of the result-record JSON layout; :meth:`ResultRecord.from_json` also reads every earlier one."""
 
 ESTIMATOR_VERSION = 1
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
 
+if TYPE_CHECKING:
+    Number = Share = float
+    Count = int
+else:
+    # JSON has no NaN: a number without value is written as null, and read back as NaN (_NullIsNaN).
+    Number = float | None
+    Share = Annotated[float, msgspec.Meta(ge=0, le=1)] | None
+    Count = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class _NullIsNaN:
+    """Base of the dataclasses here that hold numbers."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):  # pyright: ignore[reportArgumentType]  # every subclass is a dataclass
+            value = getattr(self, item.name)
+            if item.type in ("Number", "Share") and value is None:
+                object.__setattr__(self, item.name, math.nan)
+            elif item.type == "tuple[Number, ...]" and isinstance(value, tuple) and None in value:
+                object.__setattr__(self, item.name, tuple(math.nan if one is None else one for one in value))
+
 
 @dataclass(frozen=True)
-class Interval:
+class Interval(_NullIsNaN):
     """A confidence interval with the method that made it."""
 
-    low: float
-    high: float
-    level: float = 0.95
+    low: Number
+    high: Number
+    level: Share = 0.95
     """Share of repetitions whose intervals hold the truth."""
     method: str = ""
     """How it was made, over what, and why it may be unreliable."""
 
 
 @dataclass(frozen=True)
-class Ceiling:
+class Ceiling(_NullIsNaN):
     """Noise ceiling of the raw (uncorrected) comparison: what a perfect model could reach."""
 
-    lower: float
+    lower: Number
     """Each animal against the mean of the others."""
-    upper: float
+    upper: Number
     """Each animal against the mean of all."""
     method: str = "leave-one-animal-out (lower), mean of all (upper)"
 
 
 @dataclass(frozen=True)
-class SubjectScore:
+class SubjectScore(_NullIsNaN):
     """One animal's part of a score."""
 
     subject: str
-    value: float
+    value: Number
     """Noise-corrected score; NaN when undefined."""
-    r: float
+    r: Number
     """Raw comparison of the model's RDM with this animal's."""
-    reliability: float
+    reliability: Number
     """Spearman-Brown-corrected split-half reliability of this animal's RDM."""
     status: Status = "ok"
-    units: int = 0
+    units: Count = 0
     """Neurons that entered."""
-    trials: int = 0
+    trials: Count = 0
     """Trials that entered."""
     layer: str | None = None
     """Layer evaluated on this animal; it was chosen without this animal's data."""
 
 
 @dataclass(frozen=True)
-class LayerScore:
+class LayerScore(_NullIsNaN):
     """One layer compared with every animal; shown for reading, never picked from."""
 
     layer: str
-    value: float
+    value: Number
     """Mean noise-corrected score over the animals whose RDM is reliable."""
-    r: float
+    r: Number
     """Mean raw comparison over the same animals."""
     status: Status = "ok"
     interval: Interval | None = None
     """Of ``value``, over animals."""
 
 
+@dataclass(frozen=True, eq=False)
+class Provenance(Mapping[str, Any]):
+    """Where a score comes from. Read as a mapping it has the entries that are stated, as the JSON has."""
+
+    version: str = ""
+    """Version of this package that made the score."""
+    time: str = ""
+    """When, in ISO format."""
+    machine: str = ""
+    """Operating system and processor."""
+    python: str = ""
+    packages: Mapping[str, str] = field(default_factory=dict)
+    """Versions of the packages that numbers may depend on."""
+    seconds: float = 0.0
+    """Time that the computation took [s]."""
+    command: str = ""
+    """Command line that makes the score again."""
+    recordings: Mapping[str, Any] = field(default_factory=dict)
+    """``source``, ``content_hash``, ``window``, ``selection``, ``removed`` and ``synthetic`` of the recordings."""
+    stimuli: Mapping[str, Any] = field(default_factory=dict)
+    """``description``, ``content_hash``, ``config_hash`` and ``backend``; empty for features computed elsewhere."""
+    pairs: Mapping[str, str] = field(default_factory=dict)
+    """Recording label → stimulus label."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the run, from which the same score can be computed again."""
+    statistics: Mapping[str, Any] = field(default_factory=dict)
+    """What single metrics and tests add: layer tests, bootstrap, accuracies, shares of variance."""
+    more: Mapping[str, Any] = field(default_factory=dict)
+    """All else that was stated, and entries of another kind than above: a record is data that anyone may write."""
+
+    @classmethod
+    def of(cls, stated: Mapping[str, Any]) -> Provenance:
+        """Return the provenance that a mapping states; as a mapping it is equal to that."""
+        kinds: dict[str, Any] = dict.fromkeys(("version", "time", "machine", "python", "command"), str)
+        kinds |= dict.fromkeys(("packages", "recordings", "stimuli", "pairs", "settings", "statistics"), Mapping)
+        kinds["seconds"] = (int, float)
+        typed: dict[str, Any] = {
+            name: value for name, value in stated.items() if value and isinstance(value, kinds.get(name, ()))
+        }
+        return cls(**typed, more={name: value for name, value in stated.items() if name not in typed})
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a stated entry."""
+        return self._stated()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the stated entries."""
+        return iter(self._stated())
+
+    def __len__(self) -> int:
+        """Return the number of stated entries."""
+        return len(self._stated())
+
+    def _stated(self) -> dict[str, Any]:
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {**values.pop("more"), **{name: value for name, value in values.items() if value}}
+
+
+if TYPE_CHECKING:
+    _StatedProvenance = Provenance
+else:
+    _StatedProvenance = Mapping[str, Any]  # in a file any object; Score makes it typed
+
+
 @dataclass(frozen=True)
-class Score:
+class Score(_NullIsNaN):
     """What is known about one model's match to one set of recordings.
 
     Everything printed or published comes from this object. ``value`` is NaN exactly when
@@ -90,25 +180,25 @@ class Score:
 
     name: str
     """Of the model."""
-    value: float
+    value: Number
     """Mean over animals, corrected for their noise where the metric can be."""
     status: Status
     """``ok``, ``unreliable`` or ``undefined``."""
     reasons: tuple[str, ...] = ()
     """Why it is not ``ok``, and what else a reader must know, in words."""
-    r: float = math.nan
+    r: Number = math.nan
     """Mean raw comparison over animals."""
-    reliability: float = math.nan
+    reliability: Number = math.nan
     """Mean Spearman-Brown-corrected split-half reliability over animals."""
     reliability_interval: Interval | None = None
     """Of ``reliability``, over animals."""
     interval: Interval | None = None
     """Of ``value``."""
-    p: float = math.nan
+    p: Share = math.nan
     """Of a value as high without a match, by ``p_method``."""
     p_method: str = ""
     """The test, what was exchanged and how often."""
-    p_smallest: float = math.nan
+    p_smallest: Share = math.nan
     """Smallest p that this number of stimuli can give."""
     ceiling: Ceiling | None = None
     """Of ``r``; None where the metric has none."""
@@ -118,7 +208,7 @@ class Score:
     """How layers were chosen."""
     best_layer: str | None = None
     """Layer of ``best_layer_value``."""
-    best_layer_value: float = math.nan
+    best_layer_value: Number = math.nan
     """The optimistic maximum over layers, chosen and evaluated on the same data. Not a result."""
     layers: tuple[LayerScore, ...] = ()
     subjects: tuple[SubjectScore, ...] = ()
@@ -127,17 +217,21 @@ class Score:
     """What was compared and how, in words."""
     stimuli: tuple[str, ...] = ()
     """Names, in the order of the RDMs."""
-    model_rdm: tuple[float, ...] = ()
+    model_rdm: tuple[Number, ...] = ()
     """[P], of ``layer``."""
-    brain_rdm: tuple[float, ...] = ()
+    brain_rdm: tuple[Number, ...] = ()
     """[P], mean over the animals that were scored."""
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Versions, machine, data with hashes, settings and the command that makes it again."""
+    provenance: _StatedProvenance = field(default_factory=Provenance)
+    """Versions, machine, data with hashes, settings and the command that makes it again; a mapping becomes typed."""
+
+    def __post_init__(self) -> None:
+        """Read null as NaN, and any mapping as provenance."""
+        super().__post_init__()
+        if not isinstance(self.provenance, Provenance):
+            object.__setattr__(self, "provenance", Provenance.of(self.provenance))
 
     def to_json(self) -> str:
         """Serialise deterministically; NaN becomes null."""
-        from brainbench.core.files import to_json
-
         return to_json(self)
 
     @classmethod
@@ -147,19 +241,7 @@ class Score:
         Raises:
             DataError: a field is missing, unknown or of the wrong kind.
         """
-        data = _mapping(source, "score")
-        return _build(
-            cls,
-            data,
-            reliability_interval=_optional(Interval, data.get("reliability_interval")),
-            interval=_optional(Interval, data.get("interval")),
-            ceiling=_optional(Ceiling, data.get("ceiling")),
-            layers=tuple(
-                _build(LayerScore, item, interval=_optional(Interval, item.get("interval")))
-                for item in data.get("layers", ())
-            ),
-            subjects=tuple(_build(SubjectScore, item) for item in data.get("subjects", ())),
-        )
+        return _convert(cls, _parsed(source))
 
     def summary(self) -> str:
         """One line a person reads: value, interval, p and status."""
@@ -203,9 +285,9 @@ class GraphNode:
     """What it computes, such as ``convolution 2×2``."""
     memory: str = ""
     """Its recurrent cell; empty for none."""
-    shape: tuple[int, ...] = ()
+    shape: tuple[Count, ...] = ()
     """Shape of its output at one time step."""
-    parameters: int | None = None
+    parameters: Count | None = None
 
 
 @dataclass(frozen=True)
@@ -234,12 +316,12 @@ class ModelCard:
     family: str = ""
     objective: str | None = None
     augmentation: str | None = None
-    parameters: int | None = None
-    multiply_adds: int | None = None
+    parameters: Count | None = None
+    multiply_adds: Count | None = None
     """Multiply-adds per time step of one stimulus."""
-    top1: float | None = None
+    top1: Share | None = None
     """Share of test sweeps whose class is the network's first answer."""
-    top5: float | None = None
+    top5: Share | None = None
     """Share whose class is among its first five."""
     accuracy_interval: Interval | None = None
     """Of ``top1``."""
@@ -264,7 +346,7 @@ class ModelCard:
     graph: ModelGraph | None = None
     citation: str | None = None
     """Papers that the architecture comes from."""
-    twin_top1: float | None = field(default=None, metadata={"later": True})
+    twin_top1: Share | None = field(default=None, metadata={"later": True})
     """Top-1 accuracy of the untrained twin, its decoder trained on the same data."""
     twin_interval: Interval | None = field(default=None, metadata={"later": True})
     """Of ``twin_top1``."""
@@ -280,12 +362,10 @@ class ResultRecord:
     card: ModelCard | None = None
     synthetic: bool = False
     """True when the recordings are synthetic: ranks then say nothing about brains."""
-    schema: int = RECORD_SCHEMA
+    schema: Literal[2] = RECORD_SCHEMA
 
     def to_json(self) -> str:
         """Serialise deterministically; NaN becomes null."""
-        from brainbench.core.files import to_json
-
         return to_json(self)
 
     @classmethod
@@ -295,24 +375,11 @@ class ResultRecord:
         Raises:
             DataError: it is not a record of a schema version this package reads.
         """
-        data = migrate_record(_mapping(source, "result record"))
-        if "score" not in data:
-            raise DataError("This result record is incomplete (it has no 'score').")
-        card = data.get("card")
-        return _build(
-            cls,
-            data,
-            score=Score.from_json(data["score"]),
-            animal_to_animal=_optional_score(data.get("animal_to_animal")),
-            baselines={key: Score.from_json(item) for key, item in data.get("baselines", {}).items()},
-            card=card and _card(card),
-        )
+        return _convert(cls, migrate_record(_parsed(source)))
 
     @property
     def identity(self) -> str:
         """Content hash of the result without time and machine: equal inputs give equal names."""
-        from brainbench.core.files import to_plain
-
         return record_identity(to_plain(self))
 
     def _repr_html_(self) -> str:
@@ -326,8 +393,6 @@ def record_identity(data: Mapping[str, Any]) -> str:
 
     What differs between two runs of one computation does not count: time, machine, packages, command.
     """
-    from brainbench.core.files import content_hash
-
     return content_hash(
         {
             **data,
@@ -346,7 +411,7 @@ def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
     return {**score, "provenance": kept}
 
 
-def migrate_record(data: Mapping[str, Any]) -> Mapping[str, Any]:
+def migrate_record(data: Any) -> Any:
     """Bring the mapping inside a record's JSON to :data:`RECORD_SCHEMA`.
 
     Version 2 added to version 1 the model card's encoder, attender, training, graph and citation and the
@@ -355,6 +420,8 @@ def migrate_record(data: Mapping[str, Any]) -> Mapping[str, Any]:
     Raises:
         DataError: the version is unknown here.
     """
+    if not isinstance(data, Mapping):
+        return data  # refused in words by whoever reads it
     version = data.get("schema")
     if version == 1 and not isinstance(version, bool):
         return {**data, "schema": 2}
@@ -377,50 +444,69 @@ def _span(interval: Interval | Ceiling) -> str:
     return f"[{_number(low)}, {_number(high)}]"
 
 
-def _mapping(source: str | Mapping[str, Any], what: str) -> Mapping[str, Any]:
-    import json
-
-    if isinstance(source, str):
-        try:
-            source = json.loads(source)
-        except json.JSONDecodeError as error:
-            raise DataError(f"This {what} is not valid JSON ({error}).") from error
-    if not isinstance(source, Mapping):
-        raise DataError(f"A {what} is a JSON object; received {type(source).__name__}.")
-    return source
-
-
-def _card(data: Mapping[str, Any]) -> ModelCard:
-    graph = data.get("graph")
-    if graph is not None:
-        nodes = tuple(_build(GraphNode, item) for item in graph.get("nodes", ()))
-        graph = ModelGraph(nodes, tuple(_build(GraphEdge, item) for item in graph.get("edges", ())))
-    spans = {name: _optional(Interval, data.get(name)) for name in ("accuracy_interval", "twin_interval")}
-    return _build(ModelCard, data, **spans, graph=graph)
-
-
-def _optional(kind: type, data: Mapping[str, Any] | None) -> Any:
-    return None if data is None else _build(kind, data)
-
-
-def _optional_score(data: Mapping[str, Any] | None) -> Score | None:
-    return None if data is None else Score.from_json(data)
-
-
-def _build(kind: type, data: Mapping[str, Any], **ready: Any) -> Any:
-    """Make a dataclass from JSON: null becomes NaN for floats, lists become tuples."""
-    annotations = {item.name: str(item.type) for item in fields(kind)}
-    unknown = sorted(set(data) - set(annotations))
-    if unknown:
-        raise DataError(f"A {kind.__name__} has no field {unknown[0]!r}; it has {sorted(annotations)}.")
-    values: dict[str, Any] = {}
-    for name, value in data.items():
-        if value is None and annotations[name] == "float":
-            value = math.nan
-        elif isinstance(value, list):
-            value = tuple(math.nan if item is None else item for item in value)
-        values[name] = value
+def _parsed(source: str | Mapping[str, Any]) -> Any:
+    if not isinstance(source, str):
+        return source
     try:
-        return kind(**{**values, **ready})
-    except TypeError as error:
-        raise DataError(f"This {kind.__name__} is incomplete ({error}).") from error
+        return json.loads(source)
+    except json.JSONDecodeError as error:
+        raise DataError(f"This is not valid JSON ({error}).") from error
+
+
+def _convert(kind: type, data: Any) -> Any:
+    """Make a dataclass from parsed JSON.
+
+    Raises:
+        DataError: a field is missing, unknown, of the wrong kind or outside its range; the text names its place.
+    """
+    try:
+        built = msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        raise DataError(f"{_in_words(str(error), data)}.") from error
+    _check_rest(data, built, "")
+    return built
+
+
+def _check_rest(data: Any, built: Any, place: str) -> None:
+    """Refuse fields that a dataclass does not have, which msgspec leaves out without a word, and infinity."""
+    if is_dataclass(built) and not isinstance(built, Provenance):
+        known = [item.name for item in fields(built)]
+        for name, value in data.items():
+            if name not in known:
+                raise DataError(f"{place or 'the record'} has no field {name!r}; it has {listing(known, limit=40)}.")
+            _check_rest(value, getattr(built, name), f"{place}.{name}".lstrip("."))
+    elif isinstance(built, tuple):
+        for index, (value, made) in enumerate(zip(data, built, strict=True)):
+            _check_rest(value, made, f"{place}[{index}]")
+    elif isinstance(built, float) and math.isinf(built):
+        raise DataError(f"{place} is {built}; expected a number or null.")
+    elif isinstance(built, Mapping):
+        for name, made in built.items():
+            _check_rest(data[name], made, f"{place}.{name}")
+
+
+_WORDS = {"float": "a number", "int": "an integer", "str": "text", "bool": "true or false", "null": "null"} | {
+    "object": "an object",
+    "array": "a list",
+}
+
+
+def _in_words(fault: str, data: Any) -> str:
+    """Say what msgspec found wrong with parsed JSON: the place, what stands there and what is allowed there.
+
+    >>> _in_words("Expected `float | null`, got `str` - at `$.score.p`", {"score": {"p": "high"}})
+    "score.p is 'high'; expected a number or null"
+    """
+    message, _, path = fault.partition(" - at `$")
+    place = path.strip("`.")
+    if missing := re.search(r"missing required field `(\w+)`", message):
+        return f"{place or 'the record'} lacks {missing[1]!r}"
+    allowed = message.partition(", got")[0].replace("Expected", "expected")
+    if message.startswith("Invalid enum value"):
+        allowed = f"expected one of {listing(get_args(Status)) if place.endswith('status') else RECORD_SCHEMA}"
+    allowed = re.sub(r"`([a-z |]+)`", lambda kinds: " or ".join(_WORDS[one] for one in kinds[1].split(" | ")), allowed)
+    if "[...]" in place:  # an entry of a mapping, whose name is not told
+        return f"an entry of {place.replace('[...]', '')} is wrong: {allowed}"
+    for step in re.findall(r"[^.\[\]]+", place):
+        data = data[int(step)] if isinstance(data, list) else data[step]
+    return f"{place or 'the record'} is {repr(data)[:60]}; {allowed}"

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.records import Interval, Score, Status, SubjectScore
+from brainbench.core.records import Interval, Provenance, Score, Status, SubjectScore
 from brainbench.metrics.animals import (
     Animals,
     ceiling_of,
@@ -106,7 +106,7 @@ def score_animals(
         metric=f"{metric_name(animals, compare)}; each animal against the mean of the others, both corrected",
         stimuli=labels,
         brain_rdm=mean_rdm(animals),
-        provenance={"seed": seed, "reliability_gate": RELIABILITY_GATE},
+        provenance=Provenance.of({"seed": seed, "reliability_gate": RELIABILITY_GATE}),
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
-from brainbench.core.records import LayerScore, Score, Status, SubjectScore
+from brainbench.core.records import LayerScore, Provenance, Score, Status, SubjectScore
 from brainbench.metrics.animals import (
     Animals,
     ceiling_of,
@@ -150,16 +150,18 @@ def score_with_test(
         stimuli=tuple(map(str, stimuli)),
         model_rdm=() if chosen is None else tuple(rdms[chosen].tolist()),
         brain_rdm=mean_rdm(animals),
-        provenance={
-            "statistics": {}
-            if choice is None
-            else _statistics(
-                [names[index] for index in defined], rdms[defined], animals, choice, estimator, compare, seed
-            ),
-            "seed": seed,
-            "splits": max(len(subject.split_half_r) for subject in animals.subjects),
-            "reliability_gate": RELIABILITY_GATE,
-        },
+        provenance=Provenance.of(
+            {
+                "statistics": {}
+                if choice is None
+                else _statistics(
+                    [names[index] for index in defined], rdms[defined], animals, choice, estimator, compare, seed
+                ),
+                "seed": seed,
+                "splits": max(len(subject.split_half_r) for subject in animals.subjects),
+                "reliability_gate": RELIABILITY_GATE,
+            }
+        ),
     )
     return score, None if choice is None else choice.test
 

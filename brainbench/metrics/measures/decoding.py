@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.records import LayerScore, Score
+from brainbench.core.records import LayerScore, Provenance, Score
 from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.intervals import t_interval
 from brainbench.metrics.measures.animal_patterns import AnimalPatterns, OfMeanResponses
@@ -109,10 +109,12 @@ class LabelDecoding(OfMeanResponses):
                 else LayerScore(layer, math.nan, math.nan, "undefined")
                 for layer in layers
             ),
-            provenance={
-                "statistics": {"layer_tests": table, "decoding": _by_property(properties, values[:, best])},
-                "seed": seed,
-            },
+            provenance=Provenance.of(
+                {
+                    "statistics": {"layer_tests": table, "decoding": _by_property(properties, values[:, best])},
+                    "seed": seed,
+                }
+            ),
             **common,
         )
 
@@ -149,7 +151,9 @@ class LabelDecoding(OfMeanResponses):
             p_smallest=_smallest_p(properties, orders),
             layer_rule="no layers: each animal by itself",
             subjects=subject_scores(found, by_subject),
-            provenance={"statistics": {"decoding": _by_property(properties, values.mean(axis=1))}, "seed": seed},
+            provenance=Provenance.of(
+                {"statistics": {"decoding": _by_property(properties, values.mean(axis=1))}, "seed": seed}
+            ),
             **common,
         )
 

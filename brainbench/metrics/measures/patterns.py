@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
-from brainbench.core.records import LayerScore, Score
+from brainbench.core.records import LayerScore, Provenance, Score
 from brainbench.metrics.inference.intervals import t_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI
 from brainbench.metrics.layers import most_chosen
@@ -138,11 +138,13 @@ class PatternMetric(OfMeanResponses):
                 for layer in layers
             ),
             subjects=subject_scores(found, by_subject),
-            provenance={
-                "statistics": {"layer_tests": layer_table(usable, values.mean(axis=-1))}
-                | self.statistics(layers[usable[most_chosen(chosen)]], scored, seed),
-                "seed": seed,
-            },
+            provenance=Provenance.of(
+                {
+                    "statistics": {"layer_tests": layer_table(usable, values.mean(axis=-1))}
+                    | self.statistics(layers[usable[most_chosen(chosen)]], scored, seed),
+                    "seed": seed,
+                }
+            ),
             **common,
         )
 
@@ -193,6 +195,6 @@ class PatternMetric(OfMeanResponses):
             p_method=permutation_method(len(stimuli), len(orders), 1, statistic),
             p_smallest=1 / len(orders),
             subjects=subject_scores(found, by_subject),
-            provenance={"statistics": {}, "seed": seed},
+            provenance=Provenance.of({"statistics": {}, "seed": seed}),
             **common,
         )
