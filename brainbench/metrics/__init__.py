@@ -1,10 +1,9 @@
-"""Compare the geometry of a model's responses with that of animals, and know what can be concluded.
+"""Metrics: how alike a model's responses and animals' are, and what can be concluded from it.
 
-The pieces, from trials to a score: :func:`rdm` and :func:`compare`; :func:`split_half` reliability and
-:func:`noise_corrected`; :func:`noise_ceiling`; :func:`permutation_test`; :func:`subject_rdm`,
-:func:`score_rdms` and :func:`score_animals`, which join them. Beyond one score: :func:`bootstrap_score`,
-:func:`compare_models`, :func:`layer_tests`, :func:`turing_test`. Beyond RSA: :func:`get_metric`.
-:class:`RDM` names and draws one.
+``rdms`` makes and compares representational dissimilarity matrices (RDMs), ``reliability`` splits trials into halves
+and corrects for noise, ``score`` and ``animal_to_animal`` join both, ``inference`` tests and gives intervals,
+``measures`` holds the registered metrics. Data pass in this order: :class:`Trials` → :func:`subject_rdm` →
+:func:`score_rdms` and :func:`score_animals` → a score.
 """
 
 from __future__ import annotations
@@ -43,8 +42,7 @@ from brainbench.metrics.reliability.noise_correction import (
     noise_corrected,
     spearman_brown,
 )
-from brainbench.metrics.reliability.split_half import SUBJECT_METHODS, SplitHalf, split_half
-from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
+from brainbench.metrics.reliability.subject_rdm import SUBJECT_METHODS, SubjectRDM, subject_rdm
 from brainbench.metrics.reliability.units import reliable_units, unit_reliability
 from brainbench.metrics.score import score_rdms
 
@@ -65,7 +63,6 @@ __all__ = [
     "NoiseCeiling",
     "PatternMetric",
     "PermutationTest",
-    "SplitHalf",
     "SubjectRDM",
     "Trials",
     "bootstrap_ceiling",
@@ -92,7 +89,6 @@ __all__ = [
     "score_animals",
     "score_rdms",
     "spearman_brown",
-    "split_half",
     "subject_rdm",
     "turing_test",
     "unit_reliability",

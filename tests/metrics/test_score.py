@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 
 import numpy as np
 import pytest
@@ -337,13 +336,3 @@ def test_the_interval_covers_the_mean_of_all_animals(animals):
         interval = t_interval(rng.choice(values, animals, replace=False))
         covered += interval.low <= values.mean() <= interval.high
     assert 0.93 <= covered / 2000 <= 0.97
-
-
-@pytest.mark.slow
-def test_a_whole_score_takes_less_than_three_seconds():
-    latent = make_latent(19)
-    blocks = [[make_block(latent, seed=i, units=91, repeats=60)] for i in range(11)]
-    start = time.perf_counter()
-    animals = [subject_rdm(f"m{i}", block, 6) for i, block in enumerate(blocks)]
-    _score(_make_layers(latent, 12), animals)
-    assert time.perf_counter() - start < 3

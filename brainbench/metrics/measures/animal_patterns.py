@@ -10,7 +10,7 @@ import numpy as np
 
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.split_half import usable_sessions
+from brainbench.metrics.reliability.sessions import usable_sessions
 from brainbench.metrics.stimulus_labels import stimulus_means
 
 
@@ -40,7 +40,7 @@ class AnimalPatterns:
 def animal_patterns(
     subject: str, blocks: Sequence[Trials], n_stimuli: int, *, stimuli: Sequence[str] | None = None
 ) -> AnimalPatterns:
-    """Average an animal's trials, leaving out by the rules of :mod:`brainbench.metrics.reliability.split_half`.
+    """Average an animal's trials, leaving out by the rules of :mod:`brainbench.metrics.reliability.sessions`.
 
     Raises:
         UsageError: bad shapes or labels.
@@ -48,16 +48,16 @@ def animal_patterns(
     """
     names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
     sessions, problem, notes = usable_sessions(blocks, n_stimuli, names, least=2)
-    trials = sum(len(session.codes) for session in sessions)
+    trials = sum(len(session.labels) for session in sessions)
     if problem is not None:
         empty = np.empty((n_stimuli, 0))
         return AnimalPatterns(subject, empty, empty, 0, trials, problem, notes)
     means, noise = [], []
     for session in sessions:
-        mean = stimulus_means(session.responses, session.codes, n_stimuli)
-        square = stimulus_means((session.responses - mean[session.codes]) ** 2, session.codes, n_stimuli)
-        member = np.zeros((n_stimuli, len(session.codes)))
-        member[session.codes, np.arange(len(session.codes))] = 1.0
+        mean = stimulus_means(session.responses, session.labels, n_stimuli)
+        square = stimulus_means((session.responses - mean[session.labels]) ** 2, session.labels, n_stimuli)
+        member = np.zeros((n_stimuli, len(session.labels)))
+        member[session.labels, np.arange(len(session.labels))] = 1.0
         number = member @ np.isfinite(session.responses)
         means.append(mean)
         noise.append(square / (number - 1))

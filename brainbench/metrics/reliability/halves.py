@@ -1,9 +1,11 @@
-"""RDMs of random halves of an animal's trials, many splits at once."""
+"""RDMs of weighted trials of an animal, and of the halves of random splits of them, many at once.
+
+Weights [N, R] say how often each trial counts: once in the data themselves, as often as it was drawn in a bootstrap.
+Where nothing is missing, inner products of summed trials give the distances: the sums of one half, and those of all
+trials less them, are all that a split needs. Else mean patterns are formed. Both give the same distances.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,51 +17,140 @@ from brainbench.metrics.rdms.distances import (
     products_from_gram,
 )
 from brainbench.metrics.rdms.pairs import Floats, Ints, upper
+from brainbench.metrics.reliability.sessions import SortedTrials
 from brainbench.metrics.reliability.trial_hashes import Hashes, draws
 
-_CHUNK_BYTES = 1 << 24
+_CHUNK_BYTES = 1 << 20
+"""Sums of one chunk of weightings stay in the processor's cache."""
 
 _COMMON = 1e-3
 """Products of trials lose digits when less than this share of a pattern's square is left after taking
-away its mean over units; then half means are formed instead."""
+away its mean over units; then mean patterns are formed instead."""
+
+BY_PRODUCTS = ("correlation", "sqeuclidean", "crossnobis")
+"""Methods whose distances follow from inner products of summed trials."""
 
 
-@dataclass(frozen=True)
-class Session:
-    """Trials of one session that can be split, sorted by stimulus."""
+class WeightedRDMs:
+    """RDMs [N, P] of an animal's trials under N weightings, and of their halves.
 
-    responses: Floats
-    """[R, F]; NaN is missing."""
-    codes: Ints
-    """[R], ascending."""
-    hashes: Hashes
-    """[R]"""
-    inflation: float = 1.0
-    """How much larger the noise of means is, in units of the noise that the trials were divided by."""
-    complete: bool = field(init=False)
+    Args:
+        sessions: Those of the animal.
+        weights: [N, R] of each session; N may be 1 where only the halves differ.
+        count: K.
+        method: RDM method.
+        copies: [N, J] how often the units of each session count; once by default.
+    """
 
-    identity: int = field(init=False)
-    """A number that depends on the trials, not on their order."""
+    def __init__(
+        self, sessions: list[SortedTrials], weights: list[Floats], count: int, method: str, copies: Ints | None = None
+    ) -> None:
+        self._sessions, self._weights, self._count, self._method = sessions, weights, count, method
+        self._copies = np.ones((len(weights[0]), len(sessions)), dtype=np.int64) if copies is None else copies
+        by_products = method in BY_PRODUCTS and all(session.complete for session in sessions)
+        self._sums = [_Sums(*each, count) for each in zip(sessions, weights, strict=True)] if by_products else None
 
-    def __post_init__(self) -> None:
-        order = np.lexsort((self.hashes, self.codes))
-        for name in ("responses", "codes", "hashes"):
-            object.__setattr__(self, name, getattr(self, name)[order])
-        object.__setattr__(self, "complete", bool(np.isfinite(self.responses).all()))
-        object.__setattr__(self, "identity", int(self.hashes.sum(dtype=np.uint64)))
+    def whole(self) -> Floats:
+        """Return the RDMs [N, P] of all weighted trials."""
+        found = None if self._sums is None else self._from_products(self._sums)
+        return self._from_patterns(self._weights) if found is None else found
 
-    def group(self, stimulus: int) -> slice:
-        """Return the rows of a stimulus."""
-        first, last = np.searchsorted(self.codes, [stimulus, stimulus + 1])
-        return slice(int(first), int(last))
+    def halves(self, members: list[Floats]) -> tuple[Floats, Floats]:
+        """Return the RDMs [N, P] of both halves, from 1 for the trials [N or 1, R] of each session's first half."""
+        first = [weight * member for weight, member in zip(self._weights, members, strict=True)]
+        if self._sums is not None:
+            sums = [_Sums(*each, self._count) for each in zip(self._sessions, first, strict=True)]
+            rest = [whole.without(half) for whole, half in zip(self._sums, sums, strict=True)]
+            one, two = self._from_products(sums), self._from_products(rest)
+            if one is not None and two is not None:
+                return one, two
+        second = [weight - half for weight, half in zip(self._weights, first, strict=True)]
+        return self._from_patterns(first), self._from_patterns(second)
+
+    def _from_products(self, sums: list[_Sums]) -> Floats | None:
+        """Return RDMs from summed trials, NaN where a stimulus has none left; None where that would lose digits."""
+        gram, total = np.zeros_like(sums[0].gram), np.zeros_like(sums[0].units)
+        units = (self._copies @ np.array([s.responses.shape[1] for s in self._sessions])).astype(np.float64)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for index, part in enumerate(sums):
+                number = np.where(part.number > 0, part.number, np.nan)
+                own = part.gram / (number[:, :, None] * number[:, None, :])
+                if self._method == "crossnobis":
+                    # The product of a trial with itself holds its noise; those of different trials do not.
+                    pairs = part.number**2 - part.number_squared
+                    free = (np.einsum("nii->ni", part.gram) - part.squares) / np.where(pairs > 0, pairs, np.nan)
+                    diagonal = np.einsum("nii->ni", own)
+                    diagonal[...] = diagonal - self._sessions[index].inflation * (diagonal - free)
+                copies = self._copies[:, index].astype(np.float64)[:, None]
+                gram += np.where(copies[..., None] > 0, copies[..., None] * own, 0.0)
+                total += np.where(copies > 0, copies * part.units / number, 0.0)
+        if self._method != "correlation":
+            return products_from_gram(gram, 1) / units[:, None]
+        # Correlation takes each pattern's mean over all units, which spans the sessions.
+        centred = gram - total[:, :, None] * total[:, None, :] / units[:, None, None]
+        if (np.einsum("nii->ni", centred) <= _COMMON * np.einsum("nii->ni", gram)).any():
+            return None
+        return correlation_from_gram(centred, np.zeros(gram.shape[:2]))
+
+    def _from_patterns(self, weights: list[Floats]) -> Floats:
+        """Return RDMs from mean patterns: any method, missing entries, large common offsets."""
+        number = max(map(len, weights))
+        rdms = np.empty((number, self._count * (self._count - 1) // 2))
+        copies = np.broadcast_to(self._copies, (number, len(self._sessions)))
+        for repeats in np.unique(copies, axis=0):
+            rows = (copies == repeats).all(axis=1)
+            some = [np.broadcast_to(weight, (number, weight.shape[1]))[rows] for weight in weights]
+            rdms[rows] = self._pattern_rdms(some, repeats)
+        return rdms
+
+    def _pattern_rdms(self, weights: list[Floats], repeats: Ints) -> Floats:
+        unbiased = self._method == "crossnobis"
+        found = [
+            weighted_patterns(session, weight, self._count, variances=unbiased)
+            for session, weight in zip(self._sessions, weights, strict=True)
+        ]
+        patterns, variances = (
+            np.concatenate([found[index][part] for index in np.repeat(np.arange(len(found)), repeats)], axis=-1)
+            for part in (0, 1)
+        )
+        if unbiased:
+            return _unbiased_distances(patterns, variances)
+        if self._method == "correlation":
+            return correlation_distances(patterns, missing=True)
+        if self._method == "poisson":
+            rates = poisson_rates(patterns)
+            return product_distances(rates, np.log(rates), missing=True)
+        return product_distances(patterns, patterns, missing=True)
 
 
-def distances(patterns: Floats, method: str) -> Floats:
-    """Return RDMs [..., P] of patterns [..., K, F] that may lack entries (NaN)."""
-    return _DISTANCES[method](patterns)
+class _Sums:
+    """Sums over weighted trials of one session: of patterns [N, K, F], and of what distances take from them."""
+
+    def __init__(self, session: SortedTrials, weights: Floats, count: int) -> None:
+        groups = [session.group(stimulus) for stimulus in range(count)]
+        factor = session.factor
+        self.patterns = np.empty((len(weights), count, factor.shape[1]))
+        for stimulus, rows in enumerate(groups):
+            np.matmul(weights[:, rows], factor[rows], out=self.patterns[:, stimulus])
+        starts = [rows.start for rows in groups]
+        own = np.einsum("ru,ru->r", factor, factor)
+        self.number = np.add.reduceat(weights, starts, axis=1)
+        self.number_squared = np.add.reduceat(weights**2, starts, axis=1)
+        self.units = np.add.reduceat(weights * session.responses.sum(axis=1), starts, axis=1)
+        self.squares = np.add.reduceat(weights**2 * own, starts, axis=1)
+        self.gram = self.patterns @ self.patterns.swapaxes(-1, -2)
+
+    def without(self, half: _Sums) -> _Sums:
+        """Return the sums of the other half, whose inner products need no second pass over its patterns."""
+        other = object.__new__(_Sums)
+        cross = self.patterns @ half.patterns.swapaxes(-1, -2)
+        other.gram = self.gram - cross - cross.swapaxes(-1, -2) + half.gram
+        for name in ("number", "number_squared", "units", "squares"):
+            setattr(other, name, getattr(self, name) - getattr(half, name))
+        return other
 
 
-def unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
+def _unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
     """Return squared distances per unit [..., P] less what the noise of the patterns [..., K, F] adds to them.
 
     With ``variances`` [..., K, F] of the patterns (sample variance over trials / trials) this is the
@@ -74,50 +165,7 @@ def unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
         return product_distances(seen, seen, missing=True) - upper((own + np.swapaxes(own, -1, -2)) / both)
 
 
-def half_rdms(sessions: list[Session], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
-    """Return the RDMs [S, P] of both halves of the splits ``index`` [S].
-
-    Where trials are few against units, products of trials serve all splits (the RDM of any half is
-    a sum of them); else half means are formed. Both give the same distances.
-    """
-    units = sum(session.responses.shape[1] for session in sessions)
-    trials = max(len(session.codes) for session in sessions)
-    by_products = method != "poisson" and trials <= 4 * units and all(session.complete for session in sessions)
-    widest = trials if by_products else count * units
-    step = max(1, _CHUNK_BYTES // (8 * max(widest, count * count)))
-    products = [session.responses @ session.responses.T for session in sessions] if by_products else []
-    parts = []
-    for start in range(0, len(index), step):
-        chosen = index[start : start + step]
-        members = [split_members(session, count, chosen, seed) for session in sessions]
-        pair = _from_products(sessions, products, members, count, method) if by_products else None
-        if pair is None:
-            pair = (
-                pattern_rdms(sessions, members, count, method),
-                pattern_rdms(sessions, [1.0 - member for member in members], count, method),
-            )
-        parts.append(pair)
-    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-
-
-def pattern_rdms(
-    sessions: list[Session], weights: list[Floats], count: int, method: str, copies: Ints | None = None
-) -> Floats:
-    """Return the RDMs [N, P] of patterns averaged with one weight per trial [N, R] of each session.
-
-    ``copies`` [J] counts the units of each session so many times; once by default.
-    """
-    unbiased = method == "crossnobis"
-    found = [weighted_patterns(s, w, count, variances=unbiased) for s, w in zip(sessions, weights, strict=True)]
-    if copies is not None:
-        found = [found[index] for index in np.repeat(np.arange(len(found)), copies)]
-    patterns = np.concatenate([item[0] for item in found], axis=-1)
-    if not unbiased:
-        return distances(patterns, method)
-    return unbiased_distances(patterns, np.concatenate([item[1] for item in found], axis=-1))
-
-
-def weighted_patterns(session: Session, weights: Floats, count: int, *, variances: bool) -> tuple[Floats, Floats]:
+def weighted_patterns(session: SortedTrials, weights: Floats, count: int, *, variances: bool) -> tuple[Floats, Floats]:
     """Return mean patterns [N, K, F] over trials weighted by [N, R], and their variances (empty unless asked for).
 
     A unit without a weighted trial of a stimulus is NaN there; a variance needs two.
@@ -142,6 +190,12 @@ def weighted_patterns(session: Session, weights: Floats, count: int, *, variance
     return means, spread
 
 
+def chunk_size(sessions: list[SortedTrials], count: int) -> int:
+    """Return how many weightings are computed at once."""
+    width = sum(min(session.responses.shape) for session in sessions)
+    return max(1, _CHUNK_BYTES // (8 * count * max(width, count)))
+
+
 def members(random: Hashes) -> Floats:
     """Return 1 for the trials [S, n] of the first half: the lower half of the random numbers."""
     count = random.shape[1]
@@ -154,63 +208,18 @@ def members(random: Hashes) -> Floats:
     return member
 
 
-def split_members(session: Session, count: int, index: Ints, seed: int) -> Floats:
+def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> Floats:
     """Return 1 for the trials [S, R] in the first half of their stimulus, in the splits ``index`` [S]."""
     random = draws(session.hashes, index, seed)
     return np.concatenate([members(random[:, session.group(stimulus)]) for stimulus in range(count)], axis=1)
 
 
-def _from_products(
-    sessions: list[Session], products: list[Floats], chosen: list[Floats], count: int, method: str
-) -> tuple[Floats, Floats] | None:
-    """Return both halves' RDMs from products of trials, or None where that would lose digits."""
-    splits = len(chosen[0])
-    units = sum(session.responses.shape[1] for session in sessions)
-    grams, sums = np.zeros((2, splits, count, count)), np.zeros((2, splits, count))
-    for session, product, member in zip(sessions, products, chosen, strict=True):
-        group = np.zeros((len(session.codes), count))
-        group[np.arange(len(session.codes)), session.codes] = 1.0
-        for half, weight in enumerate((member, 1.0 - member)):
-            number = weight @ group
-            # A half's mean pattern is its trials weighted by these shares.
-            share = weight / number[:, session.codes]
-            sums[half] += (share * session.responses.sum(axis=1)) @ group
-            gram = np.empty((splits, count, count))
-            for stimulus in range(count):
-                rows = session.group(stimulus)
-                gram[:, stimulus] = ((share[:, rows] @ product[rows]) * share) @ group
-            if method == "crossnobis":
-                # The product of a trial with itself holds its noise; those of different trials do not.
-                diagonal = np.einsum("sii->si", gram)
-                free = (number**2 * diagonal - (weight * np.diag(product)) @ group) / (number * (number - 1))
-                diagonal[...] = diagonal - session.inflation * (diagonal - free)
-            grams[half] += gram
-    if method in ("sqeuclidean", "crossnobis"):
-        return products_from_gram(grams[0], units), products_from_gram(grams[1], units)
-    # Correlation takes each pattern's mean over all units, which spans the sessions.
-    common = sums[..., :, None] * sums[..., None, :] / units
-    centred = grams - common
-    if (np.einsum("...ii->...i", centred) <= _COMMON * np.einsum("...ii->...i", grams)).any():
-        return None
-    floor = np.zeros((splits, count))
-    return correlation_from_gram(centred[0], floor), correlation_from_gram(centred[1], floor)
-
-
-def _correlation(patterns: Floats) -> Floats:
-    return correlation_distances(patterns, missing=True)
-
-
-def _sqeuclidean(patterns: Floats) -> Floats:
-    return product_distances(patterns, patterns, missing=True)
-
-
-def _poisson(patterns: Floats) -> Floats:
-    rates = poisson_rates(patterns)
-    return product_distances(rates, np.log(rates), missing=True)
-
-
-_DISTANCES: dict[str, Callable[[Floats], Floats]] = {
-    "correlation": _correlation,
-    "sqeuclidean": _sqeuclidean,
-    "poisson": _poisson,
-}
+def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
+    """Return the RDMs [S, P] of both halves of the splits ``index`` [S]."""
+    all_trials = WeightedRDMs(sessions, [np.ones((1, len(session.labels))) for session in sessions], count, method)
+    step = chunk_size(sessions, count)
+    parts = [
+        all_trials.halves([split_members(session, count, index[start : start + step], seed) for session in sessions])
+        for start in range(0, len(index), step)
+    ]
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])

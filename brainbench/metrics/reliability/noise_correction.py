@@ -108,8 +108,8 @@ def noise_corrected(
             f"r_xy and the split-half correlations are single numbers or one per split; received {len(comparison)}, "
             f"{len(halves)}{'' if others is None else f', {len(others)}'}."
         )
-    r = _mean(comparison)
-    sides = [float(spearman_brown(_mean(side))) for side in (halves, others) if side is not None]
+    r = float(finite_mean(comparison))
+    sides = [float(spearman_brown(finite_mean(side))) for side in (halves, others) if side is not None]
     reliability = sides[0] if len(sides) == 1 else math.sqrt(math.prod(sides)) if min(sides) > 0 else min(sides)
     value, splits, reason = _ESTIMATORS[estimator](comparison, halves, others)
     if math.isnan(r):
@@ -125,13 +125,13 @@ def noise_corrected(
 
 
 def _default(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
-    sides = [float(spearman_brown(_mean(side))) for side in (halves, others) if side is not None]
+    sides = [float(spearman_brown(finite_mean(side))) for side in (halves, others) if side is not None]
     lowest = min(sides) if not any(map(math.isnan, sides)) else math.nan
     if math.isnan(lowest):
         return math.nan, 0, "the split-half reliability is undefined"
     if lowest <= 0:
         return math.nan, 0, f"the reliability is {lowest:.2f}, not positive: the split halves share no geometry"
-    return _mean(r_xy) / math.sqrt(math.prod(sides)), int(np.isfinite(halves).sum()), ""
+    return float(finite_mean(r_xy)) / math.sqrt(math.prod(sides)), int(np.isfinite(halves).sum()), ""
 
 
 def _thesis(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
@@ -150,9 +150,11 @@ def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[
     return float(np.median(kept)), kept.size, ""
 
 
-def _mean(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else math.nan
+def finite_mean(values: Floats) -> Floats:
+    """Return the mean over the finite values of the last axis; NaN where there is none."""
+    present = np.isfinite(values)
+    number = present.sum(axis=-1)
+    return np.where(number > 0, np.where(present, values, 0.0).sum(axis=-1) / np.maximum(number, 1), np.nan)
 
 
 _ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None], tuple[float, int, str]]] = {

@@ -1,19 +1,46 @@
-"""One animal's RDM with what is needed to correct scores for its noise."""
+"""One animal's RDM with what is needed to correct scores for its noise: split-half reliability and draws.
+
+An animal is a sequence of sessions (:class:`Trials`) with different units. Units of all sessions are joined after
+averaging trials, so an RDM spans them all. What cannot be split is left out by the rules of
+:mod:`brainbench.metrics.reliability.sessions`.
+
+``mahalanobis`` and ``crossnobis`` divide by the noise of each session, see
+:mod:`brainbench.metrics.reliability.whitening`; ``crossnobis`` takes every trial as its own fold, so unequal
+numbers of trials leave it unbiased.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.records import Interval
 from brainbench.core.trials import Trials
-from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.rdms.comparison import check_comparison, compare
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.split_half import DRAW_SPLITS, SPLITS, split_half
+from brainbench.metrics.reliability.halves import WeightedRDMs, half_rdms
+from brainbench.metrics.reliability.noise_correction import finite_mean, spearman_brown
+from brainbench.metrics.reliability.resampling import resample
+from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions
+from brainbench.metrics.reliability.whitening import whitened_sessions
+
+SPLITS = 1000
+"""Random split halves per animal."""
+
+SUBJECT_METHODS = ("correlation", "sqeuclidean", "mahalanobis", "crossnobis", "poisson")
+"""RDM methods of an animal."""
+
+DRAW_SPLITS = 20
+"""Split halves in each bootstrap draw; more change its interval by less than the draws themselves do."""
+
+_CHUNK_BYTES = 1 << 24
+_HALVES_BYTES = 1 << 26
+_DRAWS_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -26,7 +53,7 @@ class SubjectRDM:
     split_half_r: Floats = field(repr=False)
     """[S] raw comparisons (by ``comparison``) of the RDMs of random split halves."""
     halves: Floats = field(repr=False)
-    """[S′, 2, P] RDMs of the halves."""
+    """[S′, 2, P] RDMs of the halves of the first S′ ≤ S splits (as many as fit in 64 MiB)."""
     units: int = 0
     """Neurons that entered."""
     trials: int = 0
@@ -36,9 +63,10 @@ class SubjectRDM:
     comparison: str = "pearson"
     """Comparison of two RDMs."""
     reliability: float = math.nan
-    """Spearman-Brown reliability of the mean of ``split_half_r``."""
+    """Spearman-Brown reliability of the mean of ``split_half_r`` (averaged before, not after, the formula)."""
     spread: Interval | None = None
-    """Percentiles over random splits; not a confidence interval."""
+    """Percentiles of single splits' Spearman-Brown values: how much one split would have misled, not a
+    confidence interval of the reliability."""
     seed: int = 0
     """Of splits and draws."""
     problem: str | None = None
@@ -71,59 +99,105 @@ def subject_rdm(
     draws: int = 0,
     draw_splits: int = DRAW_SPLITS,
 ) -> SubjectRDM:
-    """Build an animal's RDM and its split halves from the trials of its sessions.
+    """Return an animal's RDM and its split halves from the trials of its sessions.
+
+    Every stimulus' trials of each session are split into random halves, whose RDMs are compared. With an odd number
+    of trials the larger half is drawn too. Random numbers are hashes of (seed, split, trial key).
 
     An animal whose data cannot be used comes back with ``problem`` (for example ``no trials of
     'convex-far'``) instead of an error, so the others can still be scored.
 
     Args:
         subject: Name of the animal.
-        blocks: Its sessions; see :class:`Trials` and the rules of :mod:`brainbench.metrics.reliability.split_half`.
+        blocks: Its sessions.
         n_stimuli: K.
         stimuli: Names of the stimuli, for messages.
         method: RDM method: ``correlation``, ``sqeuclidean``, ``mahalanobis``, ``crossnobis`` or ``poisson``.
         comparison: Comparison of RDMs, see :func:`brainbench.metrics.rdms.comparison`.
         splits: Number of random split halves.
         seed: Seed of the splits and draws.
-        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``.
-        draws: Bootstrap draws of sessions and trials, for intervals; see :mod:`brainbench.metrics.inference.bootstrap`.
+        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``: ``diag``, ``none`` or another of
+            :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave crossnobis
+            unbiased; shrinkage leaves a bias of up to .01 per unit (docs/statistics.md).
+        draws: Bootstrap draws of sessions and trials, for intervals; fewer where their RDMs would not fit in 256 MiB.
+            See :mod:`brainbench.metrics.inference.bootstrap`.
         draw_splits: Split halves within each draw.
 
     Raises:
-        UsageError: unknown method, bad shapes or labels, repeated trial keys.
+        UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
         DataError: infinite responses, or negative ones for ``poisson``.
     """
-    found = split_half(
-        blocks,
-        n_stimuli,
-        stimuli=stimuli,
-        method=method,
-        comparison=comparison,
-        splits=splits,
-        seed=seed,
-        noise=noise,
-        draws=draws,
-        draw_splits=draw_splits,
-    )
-    return SubjectRDM(
+    if method not in SUBJECT_METHODS:
+        raise unknown_name("RDM method of an animal", method, SUBJECT_METHODS)
+    check_comparison(comparison)
+    if min(splits, draw_splits) < 1 or draws < 0 or n_stimuli < 2:
+        raise UsageError(
+            "Split halves need splits ≥ 1, draw_splits ≥ 1, draws ≥ 0 and 2 or more stimuli; received "
+            f"{splits}, {draw_splits}, {draws} and {n_stimuli}."
+        )
+    names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
+    if len(names) != n_stimuli:
+        raise UsageError(f"There are {n_stimuli} stimuli but {len(names)} names.")
+    sessions, problem, notes = usable_sessions(blocks, n_stimuli, names, least=4 if method == "crossnobis" else 2)
+    if method in ("mahalanobis", "crossnobis") and problem is None:
+        sessions, problem, notes = whitened_sessions(sessions, n_stimuli, noise, notes)
+    pairs = n_stimuli * (n_stimuli - 1) // 2
+    empty = SubjectRDM(
         subject=subject,
-        rdm=found.rdm,
-        split_half_r=found.r,
-        halves=found.halves,
-        units=found.units,
-        trials=found.trials,
+        rdm=np.full(pairs, np.nan),
+        split_half_r=np.empty(0),
+        halves=np.empty((0, 2, pairs)),
+        units=sum(session.responses.shape[1] for session in sessions),
+        trials=sum(len(session.labels) for session in sessions),
         method=method,
         comparison=comparison,
-        reliability=found.reliability,
-        spread=found.spread,
         seed=seed,
-        problem=found.problem,
-        notes=found.notes,
-        draws=found.draws,
-        draws_r=found.draws_r,
+        problem=problem,
+        notes=notes,
     )
+    if problem is not None:
+        return empty
+    if method == "poisson" and any((session.responses < 0).any() for session in sessions):
+        raise DataError("method='poisson' needs rates or counts, which are never negative; some responses are.")
+    # Trials without noise covariance left make squared distances Mahalanobis distances.
+    distance = "sqeuclidean" if method == "mahalanobis" else method
+    if distance != "poisson":
+        sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
+    every = WeightedRDMs(sessions, [np.ones((1, len(session.labels))) for session in sessions], n_stimuli, distance)
+    rdm, halves, r = every.whole()[0], *_split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
+    found = replace(empty, rdm=rdm, split_half_r=r, halves=halves)
+    finite = r[np.isfinite(r)]
+    if not np.isfinite(rdm).all() or not finite.size:
+        flat = np.isnan(rdm).any()
+        reason = "the mean responses to a stimulus are constant across units" if flat else "all pairs are equal"
+        return replace(found, problem=f"its RDM is undefined: {reason}")
+    low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
+    spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
+    found = replace(found, reliability=float(spearman_brown(finite.mean())), spread=spread)
+    number = min(draws, _DRAWS_BYTES // (8 * pairs))
+    if not number:
+        return replace(found, draws=np.empty((0, pairs)))
+    drawn, agreement = resample(sessions, n_stimuli, distance, comparison, draws=number, splits=draw_splits, seed=seed)
+    return replace(found, draws=drawn, draws_r=finite_mean(agreement))
+
+
+def _split_halves(
+    sessions: list[SortedTrials], count: int, method: str, comparison: str, splits: int, seed: int
+) -> tuple[Floats, Floats]:
+    """Return the RDMs [S′, 2, P] of the halves that are kept, and the comparison [S] of every split's."""
+    pairs = count * (count - 1) // 2
+    kept = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
+    halves, r = np.empty((kept, 2, pairs)), np.empty(splits)
+    step = max(1, _CHUNK_BYTES // (8 * pairs))
+    for start in range(0, splits, step):
+        index = np.arange(start, min(start + step, splits))
+        first, second = half_rdms(sessions, count, method, index, seed)
+        r[index] = compare(first, second, method=comparison)
+        stored = index[index < kept]
+        halves[stored, 0], halves[stored, 1] = first[: len(stored)], second[: len(stored)]
+    return halves, r
 
 
 def is_flat(rdms: Floats) -> NDArray[np.bool_]:
-    """Whether RDMs [..., P] have missing pairs or no differences between pairs: nothing compares with them."""
+    """Return where RDMs [..., P] have missing pairs or no differences between pairs: nothing compares with them."""
     return np.isnan(compare(rdms, rdms, method="pearson")) | ~np.isfinite(rdms).all(axis=-1)

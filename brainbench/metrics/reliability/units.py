@@ -9,6 +9,7 @@ raises reliability also where there is nothing to find, so report it with the sc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,9 +17,9 @@ from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.halves import Session, split_members, weighted_patterns
+from brainbench.metrics.reliability.halves import split_members, weighted_patterns
 from brainbench.metrics.reliability.noise_correction import spearman_brown
-from brainbench.metrics.reliability.split_half import trial_hashes
+from brainbench.metrics.reliability.sessions import SortedTrials, trial_hashes
 from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes
 
 UNIT_GATE = 0.5
@@ -45,7 +46,7 @@ def unit_reliability(
     for block in blocks:
         responses = response_matrix(block.responses, "trials").astype(np.float64)
         codes, _ = stimulus_codes(block.labels, n_stimuli)
-        session = Session(responses, codes, trial_hashes(block, responses, codes))
+        session = SortedTrials.sort(responses, codes, trial_hashes(block, responses, codes))
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
         for start in range(0, splits, _CHUNK):
             member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
@@ -75,7 +76,7 @@ def reliable_units(
     for block, value in zip(blocks, values, strict=True):
         good = value >= least
         if good.any():
-            kept.append(Trials(np.asarray(block.responses)[:, good], block.labels, block.keys, block.covariates))
+            kept.append(replace(block, responses=np.asarray(block.responses)[:, good]))
     every = sum(len(value) for value in values)
     left = sum(int((~(value >= least)).sum()) for value in values)
     return tuple(kept), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import RELIABILITY_GATE, compare, noise_corrected, rdm, spearman_brown, split_half
+from brainbench.metrics import RELIABILITY_GATE, compare, noise_corrected, rdm, spearman_brown, subject_rdm
 from brainbench.metrics.reliability.noise_correction import corrected_splits
 from tests.factories.animals import make_block, make_latent
 
@@ -130,9 +130,9 @@ def _simulated_errors(count, noise, seed, true_r=None):
         latent = make_latent(rng.integers(1 << 31))
         model_rdm = rdm(latent + 0.15 * rng.normal(size=latent.shape))
         clean = make_block(latent, seed=animal, units=60, repeats=2, noise=0.0)
-        found = split_half([make_block(latent, seed=animal, units=60, repeats=20, noise=noise)], 6, splits=100)
+        found = subject_rdm("a", [make_block(latent, seed=animal, units=60, repeats=20, noise=noise)], 6, splits=100)
         truth = float(compare(model_rdm, rdm(clean.responses, clean.labels)))
-        errors.append(noise_corrected(float(compare(model_rdm, found.rdm)), found.r).value - truth)
+        errors.append(noise_corrected(float(compare(model_rdm, found.rdm)), found.split_half_r).value - truth)
         reliabilities.append(found.reliability)
     return np.array(errors), np.array(reliabilities)
 

@@ -7,8 +7,9 @@ import warnings
 import numpy as np
 import pytest
 
-from brainbench.metrics import Trials, noise_precision, rdm, split_half, subject_rdm
-from brainbench.metrics.reliability.halves import Session, half_rdms, pattern_rdms, split_members
+from brainbench.metrics import Trials, noise_precision, rdm, subject_rdm
+from brainbench.metrics.reliability.halves import WeightedRDMs, half_rdms, split_members
+from brainbench.metrics.reliability.sessions import SortedTrials
 from brainbench.metrics.reliability.trial_hashes import key_hashes
 from tests.factories.animals import make_block, make_latent
 
@@ -46,14 +47,16 @@ def test_crossnobis_with_unequal_trials_equals_rsatoolbox():
 
 
 @pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "crossnobis"])
-def test_halves_by_products_and_by_patterns_are_the_same(method):
+def test_halves_by_products_and_by_patterns_are_the_same(method, monkeypatch):
     block = make_block(make_latent(), units=60, repeats=8)
-    session = Session(block.responses, block.labels, key_hashes(block.keys))
+    session = SortedTrials.sort(block.responses, block.labels, key_hashes(block.keys))
     index = np.arange(7)
     first, second = half_rdms([session], 6, method, index, seed=3)
     member = split_members(session, 6, index, 3)
-    np.testing.assert_allclose(first, pattern_rdms([session], [member], 6, method), atol=1e-11)
-    np.testing.assert_allclose(second, pattern_rdms([session], [1 - member], 6, method), atol=1e-11)
+    monkeypatch.setattr("brainbench.metrics.reliability.halves.BY_PRODUCTS", ())
+    for half, weights in ((first, member), (second, 1 - member)):
+        by_patterns = WeightedRDMs([session], [weights], 6, method).whole()
+        np.testing.assert_allclose(half, by_patterns, atol=1e-11)
 
 
 @pytest.mark.parametrize("noise", ["none", "diag", "shrinkage_diag", "full"])
@@ -95,13 +98,13 @@ def test_units_that_were_not_recorded_in_every_trial_leave_the_full_covariance_b
     responses[0, 2] = np.nan
     responses[:, 5] = 3.0
     gap = Trials(responses, block.labels, block.keys)
-    diagonal = split_half([gap], 6, method="mahalanobis", noise="diag", splits=5)
-    full = split_half([gap], 6, method="mahalanobis", noise="full", splits=5)
+    diagonal = subject_rdm("a", [gap], 6, method="mahalanobis", noise="diag", splits=5)
+    full = subject_rdm("a", [gap], 6, method="mahalanobis", noise="full", splits=5)
     assert diagonal.units == 7
     assert full.units == 6
     assert "1 units or bins left out: without noise or not in every trial" in diagonal.notes
     assert "2 units or bins left out: without noise or not in every trial" in full.notes
-    crossed = split_half([gap], 6, method="crossnobis", noise="diag", splits=5)
+    crossed = subject_rdm("a", [gap], 6, method="crossnobis", noise="diag", splits=5)
     assert np.isfinite(crossed.rdm).all()
 
 

@@ -10,19 +10,36 @@ a tenth of the residuals in turn.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from brainbench.core.errors import DataError, unknown_name
 from brainbench.metrics.rdms.noise_model import NOISE_METHODS, NoiseModel
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.rdms.precision import estimate_noise
-from brainbench.metrics.reliability.halves import Session
+from brainbench.metrics.reliability.sessions import SortedTrials
 from brainbench.metrics.stimulus_labels import stimulus_means
 
 _FOLDS = 10
 
 
-def whitened(session: Session, count: int, noise: str) -> tuple[Session | None, str]:
+def whitened_sessions(
+    sessions: list[SortedTrials], count: int, noise: str, notes: tuple[str, ...]
+) -> tuple[list[SortedTrials], str | None, tuple[str, ...]]:
+    """Whiten every session; return those with a noise covariance, why there is none (or None), and notes for people."""
+    found = [whitened(session, count, noise) for session in sessions]
+    kept = [session for session, _ in found if session is not None]
+    notes += tuple(dict.fromkeys(told for session, told in found if told and session is not None))
+    lost = sorted({told for session, told in found if session is None})
+    if not kept:
+        return sessions, f"no session has a noise covariance: {'; '.join(lost)}", notes
+    if lost:
+        notes += (f"{len(found) - len(kept)} sessions left out: {'; '.join(lost)}",)
+    return kept, None, notes
+
+
+def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrials | None, str]:
     """Return the session with noise of unit covariance, and what was left out in words.
 
     The covariance comes from all trials of the session, about their stimulus' mean. Units that never
@@ -39,7 +56,7 @@ def whitened(session: Session, count: int, noise: str) -> tuple[Session | None, 
         return session, ""
     if noise not in NOISE_METHODS:
         raise unknown_name("noise covariance method", noise, ("none", *NOISE_METHODS))
-    residuals = session.responses - stimulus_means(session.responses, session.codes, count)[session.codes]
+    residuals = session.responses - stimulus_means(session.responses, session.labels, count)[session.labels]
     largest = np.nanmax(np.abs(session.responses), axis=0)
     varies = np.nanmax(np.abs(residuals), axis=0) > 8 * np.finfo(np.float64).eps * largest
     usable = varies if noise == "diag" else varies & np.isfinite(session.responses).all(axis=0)
@@ -57,13 +74,13 @@ def whitened(session: Session, count: int, noise: str) -> tuple[Session | None, 
         scaled = responses / np.sqrt(np.nansum(rest**2, axis=0) / freedom)
         # Units with two degrees of freedom or fewer have no expected factor; four is the least anyone has.
         inflation = float(np.mean(freedom / np.maximum(freedom - 2, 1)))
-        return Session(scaled, session.codes, session.hashes, inflation), told
+        return replace(session, responses=scaled, inflation=inflation), told
     try:
-        precision = estimate_noise(responses, session.codes, count, noise).precision()
+        precision = estimate_noise(responses, session.labels, count, noise).precision()
     except DataError as error:
         return None, str(error).rstrip(".")
-    inflation = _inflation(responses, session.codes, noise, count)
-    return Session(responses @ np.linalg.cholesky(precision), session.codes, session.hashes, inflation), told
+    inflation = _inflation(responses, session.labels, noise, count)
+    return replace(session, responses=responses @ np.linalg.cholesky(precision), inflation=inflation), told
 
 
 def _inflation(responses: Floats, codes: Ints, noise: str, count: int) -> float:

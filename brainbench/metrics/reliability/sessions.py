@@ -1,0 +1,140 @@
+"""Sessions of an animal that can be split into halves: their trials sorted, what cannot be split left out.
+
+Rules for what cannot be split:
+a session that lacks two trials of some stimulus (four for ``crossnobis``, whose halves need two) is
+left out, of the RDM too, so that the RDM and its reliability describe the same data; a unit with fewer
+recorded trials of some stimulus is left out of its session. What was left out is told in words.
+Without any session left the animal is undefined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.core.trials import Trials
+from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.reliability.trial_hashes import Hashes, content_hashes, key_hashes
+from brainbench.metrics.stimulus_labels import check_finite, listed, response_matrix, stimulus_codes, stimulus_means
+
+
+@dataclass(frozen=True)
+class SortedTrials(Trials):
+    """Trials [R, U] of one session sorted by stimulus, each with the hash from which its random numbers come."""
+
+    hashes: Hashes = field(default_factory=lambda: np.empty(0, dtype=np.uint64), repr=False)
+    """[R]"""
+    inflation: float = 1.0
+    """Noise variance of means, in units of the noise that the trials were divided by."""
+
+    @classmethod
+    def sort(cls, responses: Floats, labels: Ints, hashes: Hashes) -> SortedTrials:
+        """Sort trials by stimulus and hash, so that the order in which they came is forgotten."""
+        order = np.lexsort((hashes, labels))
+        return cls(responses[order], labels[order], hashes=hashes[order])
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether no response is missing."""
+        return bool(np.isfinite(self.responses).all())
+
+    @cached_property
+    def identity(self) -> int:
+        """A number that depends on the trials, not on their order."""
+        return int(self.hashes.sum(dtype=np.uint64))
+
+    @cached_property
+    def factor(self) -> Floats:
+        """[R, ≤ R] patterns with the same inner products as the trials' responses, and no more columns than trials."""
+        if self.responses.shape[1] <= len(self.labels):
+            return self.responses
+        return np.asarray(np.linalg.qr(self.responses.T, mode="r")).T
+
+    def group(self, stimulus: int) -> slice:
+        """Return the rows of a stimulus."""
+        first, last = np.searchsorted(self.labels, [stimulus, stimulus + 1])
+        return slice(int(first), int(last))
+
+
+def usable_sessions(
+    blocks: Sequence[Trials], count: int, names: list[str], *, least: int
+) -> tuple[list[SortedTrials], str | None, tuple[str, ...]]:
+    """Check the sessions, leave out what cannot be split and say what.
+
+    Returns:
+        Sessions that can be split; why none can, or None; notes for people.
+
+    Raises:
+        UsageError: trials and labels differ in number, or a label is none of the stimuli.
+    """
+    sessions: list[SortedTrials] = []
+    lacking: list[str] = []
+    total = np.zeros(count, dtype=np.int64)
+    dropped = 0
+    for block in blocks:
+        responses = response_matrix(block.responses, "trials").astype(np.float64)
+        codes, _ = stimulus_codes(block.labels, count)
+        if len(codes) != len(responses):
+            raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+        check_finite(responses)
+        recorded = np.isfinite(responses).any(axis=1)
+        hashes = trial_hashes(block, responses, codes)[recorded]
+        responses, codes = responses[recorded], codes[recorded]
+        # A trial without any recorded unit is no trial, whatever its label.
+        trials = np.bincount(codes, minlength=count)
+        total += trials
+        if trials.min() < least:
+            few = [f"{names[k]} ({trials[k]})" for k in np.flatnonzero(trials < least)]
+            lacking.append(
+                f"fewer than {least} trials of {', '.join(few[:4])}" + (" and others" if len(few) > 4 else "")
+            )
+            continue
+        member = np.zeros((count, len(codes)))
+        member[codes, np.arange(len(codes))] = 1.0
+        splittable = (member @ np.isfinite(responses) >= least).all(axis=0)
+        dropped += int((~splittable).sum())
+        if splittable.any():
+            sessions.append(SortedTrials.sort(responses[:, splittable], codes, hashes))
+        else:
+            lacking.append(f"no unit recorded in {least} trials of every stimulus")
+    notes = [f"{len(lacking)} of {len(blocks)} sessions left out: {'; '.join(sorted(set(lacking)))}"] if lacking else []
+    if dropped:
+        notes.append(f"{dropped} units or bins left out: recorded in fewer than {least} trials of some stimulus")
+    problem = None
+    if (total == 0).any():
+        problem = f"no trials of {listed(names, total == 0)}"
+    elif not sessions:
+        problem = f"no session can be split into halves: {'; '.join(sorted(set(lacking)))}"
+    return sessions, problem, tuple(notes)
+
+
+def trial_hashes(block: Trials, responses: Floats, codes: Ints) -> Hashes:
+    """Return one hash per trial, of its key or of its content.
+
+    Raises:
+        UsageError: keys are not one per trial, or repeat.
+    """
+    if block.keys is None:
+        return content_hashes(responses, codes)
+    if len(block.keys) != len(codes):
+        raise UsageError(f"There are {len(codes)} trials but {len(block.keys)} keys; give one key per trial or none.")
+    if len(set(map(str, block.keys))) < len(codes):
+        raise UsageError("Trial keys repeat within a session; each trial needs its own key.")
+    return key_hashes(block.keys)
+
+
+def shifted_sessions(sessions: list[SortedTrials], count: int, *, by_unit: bool) -> list[SortedTrials]:
+    """Return the sessions less an offset that distances do not feel, but that half means would lose digits to.
+
+    Correlation distance does not feel one number taken from all units, squared distance not even one per unit.
+    """
+    means = [stimulus_means(session.responses, session.labels, count) for session in sessions]
+    if by_unit:
+        shifts = [np.nanmean(mean, axis=0) for mean in means]
+    else:
+        shifts = [np.nanmean(np.concatenate([mean.ravel() for mean in means]))] * len(sessions)
+    return [replace(s, responses=s.responses - shift) for s, shift in zip(sessions, shifts, strict=True)]
