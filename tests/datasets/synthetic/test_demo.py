@@ -102,9 +102,9 @@ def test_firing_peaks_about_15_ms_after_the_first_contact(folder):
 def test_counts_are_over_dispersed(dataset):
     factors = []
     for sessions in trials_by_subject(dataset).values():
-        for responses, labels, _ in sessions:
+        for trials in sessions:
             for index in range(6):
-                counts = responses[labels == index, 0] * 0.8
+                counts = trials.responses[trials.labels == index, 0] * 0.8
                 mean, spread = np.nanmean(counts, axis=0), np.nanvar(counts, axis=0, ddof=1)
                 factors.append(np.sum(spread) / np.sum(mean))
     assert 1.25 < np.mean(factors) < 2.0
