@@ -416,7 +416,7 @@ def faults(simulations: int) -> Result:
             for study in range(simulations):
                 geometry = ResponseGeometry.from_features(np.random.default_rng(study).normal(size=(6, 4)))
                 animals = simulate(geometry, design, seed=study, faults=given)
-                blocks = [[Trials(b.responses[:, 0], b.labels, b.keys) for b in a.blocks] for a in animals]
+                blocks = [[Trials(b.responses[:, 0], b.labels, b.keys) for b in a.sessions] for a in animals]
                 score = score_animals([subject_rdm(str(i), block, 6, splits=50) for i, block in enumerate(blocks)])
                 values.append(score.value)
                 reliable.append(score.reliability)

@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets import blocks, open_recordings
+from brainbench.datasets import open_recordings, trials_by_subject
 from brainbench.datasets.synthetic.demo import ensure_demo, read_truth
 from brainbench.metrics import Trials, rdm, score_animals, subject_rdm
 from brainbench.stimuli import load_stimuli
@@ -67,7 +67,7 @@ def main() -> None:
     }
     labels = truth["labels"]
     animals = []
-    for name, sessions in blocks(open_recordings(folder)).items():
+    for name, sessions in trials_by_subject(open_recordings(folder)).items():
         trials = [Trials(item.responses[:, 0], item.labels, item.keys) for item in sessions]
         animals.append(subject_rdm(name, trials, len(labels)))
     print(f"{'animal':8} {'reliability':>11} {'own truth':>9} {'shared':>6}", *(f"{name:>16}" for name in raw))

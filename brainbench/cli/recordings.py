@@ -88,9 +88,9 @@ def rdm(
 
 @app.command("check")
 def check(
-    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
+    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or LAYOUT:PATH.")],
     conditions: Annotated[
-        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] whose labels are checked; the recipe's by default.")
+        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] whose labels are checked; the layout's by default.")
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on warnings too.")] = False,
     as_json: JsonOption = False,
@@ -116,7 +116,7 @@ def check(
 
 @app.command("export")
 def export(
-    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or RECIPE:PATH.")],
+    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or LAYOUT:PATH.")],
     target: Annotated[Path, typer.Argument(help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")],
     select: SelectOption = None,
     as_json: JsonOption = False,
@@ -131,7 +131,7 @@ def export(
 
 @app.command("fetch")
 def fetch(
-    name: Annotated[str, typer.Argument(help="A recipe ('rodgers') or the six digits of a dandiset.")],
+    name: Annotated[str, typer.Argument(help="A layout ('rodgers') or the six digits of a dandiset.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to put it in.")] = Path(),
     assets: Annotated[str | None, typer.Option(help="Glob of the files wanted, e.g. 'sub-231CR/*'.")] = None,
     as_json: JsonOption = False,
@@ -173,15 +173,15 @@ def _matrix(title: str, labels: tuple[str, ...], rdm: NDArray[np.float64]) -> st
 
 @app.command("recipe")
 def recipe(
-    name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without one.")] = None,
+    name: Annotated[str | None, typer.Argument(help="A recording layout; all are listed without one.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print every rule by which a named recipe selects trials and units and cuts windows."""
-    from brainbench.datasets import get_recipe, list_recipes
+    """Print every rule by which a recording layout selects trials and units and cuts windows."""
+    from brainbench.datasets import get_layout, list_layouts
 
     if name is None:
-        known = {item: get_recipe(item).title for item in list_recipes()}
-        emit(known, table("", ["recipe", ""], [[key, text] for key, text in known.items()]), as_json=as_json)
+        known = {item: get_layout(item).title for item in list_layouts()}
+        emit(known, table("", ["layout", ""], [[key, text] for key, text in known.items()]), as_json=as_json)
         return
-    found = get_recipe(name)
+    found = get_layout(name)
     emit({"name": found.name, "rules": found.describe().splitlines()}, found.describe(), as_json=as_json)

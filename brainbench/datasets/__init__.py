@@ -9,13 +9,12 @@ from brainbench.datasets.exports import export
 from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import Inspection, inspect
-from brainbench.datasets.layouts.registry import RecordingLayout, get_recipe, list_recipes, register_recipe
+from brainbench.datasets.layouts.registry import RecordingLayout, get_layout, list_layouts, register_layout
 from brainbench.datasets.recordings import open_recordings
 from brainbench.datasets.sessions import Session, make_session
-from brainbench.datasets.trials.blocks import blocks
 from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.pooling import pooled
 from brainbench.datasets.trials.selection import Rule, Selection
+from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
 from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 
@@ -29,16 +28,16 @@ __all__ = [
     "Session",
     "WhiskingDataset",
     "Window",
-    "blocks",
     "check",
     "export",
     "fetch",
-    "get_recipe",
+    "get_layout",
     "inspect",
-    "list_recipes",
+    "list_layouts",
     "make_session",
     "open_recordings",
     "pooled",
-    "register_recipe",
+    "register_layout",
+    "trials_by_subject",
     "write_recordings",
 ]

@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import atomic_path
 from brainbench.datasets.hdf5 import write_recordings
-from brainbench.datasets.layouts.registry import resolve_selection
-from brainbench.datasets.reading import Source, each_session, find_recordings
+from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, decode, ragged
-from brainbench.datasets.sources import open_file
 from brainbench.datasets.synthetic.nwb_writer import NwbWriter
 from brainbench.datasets.trials.counting import has_units, read_spikes, recorded_span
 from brainbench.datasets.trials.covariates import LICKS, lick_times
@@ -39,7 +37,7 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
         target: ``*.h5`` (our layout; any number of sessions), ``*.nwb`` (one session), or a folder, which
             gets one NWB file per session.
         select: subjects, trials and units to copy; all by default. Rules are applied to the table that
-            the recipe names, else to ``trials``.
+            the layout names, else to ``trials``.
 
     Returns:
         The files that were written.
@@ -48,12 +46,12 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
         DataError: nothing is left, or a session cannot be stored as NWB.
         UsageError: several sessions for one NWB file, another suffix, an unknown subject or rule.
     """
-    recipe, paths = find_recordings(source)
+    layout, paths = find_recordings(source)
     chosen = EVERYTHING if select is None else resolve_selection(select)
     sessions, skipped = [], []
     for path in paths:
         with open_file(path) as file:
-            for session, found in each_session(file, path, recipe):
+            for session, found in each_session(file, path, layout):
                 if chosen.subjects and session.subject not in chosen.subjects:
                     skipped.append(session.subject)
                 elif has_units(session):

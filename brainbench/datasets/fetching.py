@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError, unknown_name
-from brainbench.datasets.layouts.registry import get_recipe, list_recipes
+from brainbench.datasets.layouts.registry import get_layout, list_layouts
 
 
 def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None = None) -> Path:
@@ -18,9 +18,9 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
     What is there already is kept if unchanged, so an interrupted download goes on.
 
     Args:
-        name: a recipe's name, or the six digits of a dandiset.
+        name: a layout's name, or the six digits of a dandiset.
         folder: where to put it.
-        assets: glob of the files wanted, such as ``"sub-231CR/*"``; by default those that the recipe
+        assets: glob of the files wanted, such as ``"sub-231CR/*"``; by default those that the layout
             can use, else all.
 
     Returns:
@@ -54,12 +54,12 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
 
 def _dandiset(name: str) -> tuple[str, str]:
     if match := re.fullmatch(r"(?:DANDI:)?(\d{6})", name, re.IGNORECASE):
-        known = [get_recipe(item) for item in list_recipes()]
+        known = [get_layout(item) for item in list_layouts()]
         return match[1], next((item.assets for item in known if item.dandiset == match[1]), "")
-    public = [item for item in list_recipes() if get_recipe(item).dandiset]
-    if name not in list_recipes():
+    public = [item for item in list_layouts() if get_layout(item).dandiset]
+    if name not in list_layouts():
         raise unknown_name("data set", name, public, hint="Or give the six digits of a dandiset, such as 000231.")
-    recipe = get_recipe(name)
-    if not recipe.dandiset:
-        raise UsageError(f"The recipe {name!r} names no data set of the DANDI archive; public are {', '.join(public)}.")
-    return recipe.dandiset, recipe.assets
+    layout = get_layout(name)
+    if not layout.dandiset:
+        raise UsageError(f"The layout {name!r} names no data set of the DANDI archive; public are {', '.join(public)}.")
+    return layout.dandiset, layout.assets

@@ -74,16 +74,18 @@ def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Sess
 
 
 def is_ours(file: h5py.File) -> bool:
-    """Tell whether an open HDF5 file has this layout, of any version."""
+    """Return whether an open HDF5 file has this layout, of any version."""
     return text(file.attrs.get("format", "")) == FORMAT
 
 
-def read_kind(file: h5py.File, path: Path) -> str:
-    """Return the kind of an open file of this layout, "spikes" or "counts".
+def holds_counts(file: h5py.File, path: Path) -> bool:
+    """Return whether an open file has this layout and kind "counts".
 
     Raises:
-        DataError: its version or kind is not one this package reads.
+        DataError: it has this layout, in a version or kind that this package does not read.
     """
+    if not is_ours(file):
+        return False
     version, kind = file.attrs.get("version"), text(file.attrs.get("kind", ""))
     if version != VERSION or kind not in ("spikes", "counts"):
         newer = isinstance(version, (int, np.integer)) and version > VERSION
@@ -91,7 +93,7 @@ def read_kind(file: h5py.File, path: Path) -> str:
             f"{path} is {FORMAT} version {version}, kind {kind!r}; this brainbench reads version {VERSION}, kinds "
             f"'spikes' and 'counts'.{' A newer brainbench wrote it: update this one.' if newer else ''}"
         )
-    return kind
+    return kind == "counts"
 
 
 def read_sessions(file: h5py.File, path: Path) -> list[Session]:

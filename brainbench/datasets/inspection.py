@@ -1,23 +1,59 @@
-"""Say what a recordings file holds, what is missing for scoring, and which conditions to try."""
+"""Contents of recordings files: tables and units, what scoring lacks, and the columns that could label trials."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
 from brainbench.datasets import hdf5
-from brainbench.datasets.reading import each_session
-from brainbench.datasets.sessions import SPIKES, Session, SessionTable, natural_order
-from brainbench.datasets.sources import find_files, open_file
+from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.reading import each_session, find_files, open_file
+from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
+from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
-from brainbench.datasets.trials.proposals import EXAMPLES, ColumnSummary, Proposal, propose, summarise_columns
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+EXAMPLES = 6
+"""Number of values shown of a column."""
+_MOST_VALUES = 60
+_STIMULUS = re.compile(r"stim|cond|object|image|texture|shape|categ|orient|freq|odou?r|position", re.IGNORECASE)
+_BEHAVIOUR = re.compile(r"resp|choice|accuracy|correct|outcome|confid|reward|react|lick|key|tags", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class ColumnSummary:
+    """One column of an interval table."""
+
+    name: str
+    kind: str
+    """``text``, ``integer``, ``number``, ``boolean``, ``list`` (ragged) or ``other``."""
+    distinct: int
+    """Number of distinct values; 0 where they are not single values."""
+    examples: tuple[str, ...] = ()
+    fewest: int = 0
+    """Trials of the rarest value."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A ``--conditions`` value worth trying."""
+
+    conditions: str
+    labels: tuple[str, ...]
+    fewest: int
+    """Trials of the rarest label."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +118,8 @@ class Inspection:
 
     path: str
     format: str
-    recipe: str | None
-    """Recipe that will be used, because the layout is known."""
+    layout: str | None
+    """Layout that will be used, because the layout is known."""
     sessions: tuple[SessionSummary, ...]
     proposals: tuple[Proposal, ...]
     """Best first."""
@@ -97,8 +133,8 @@ class Inspection:
 
     def _lines(self) -> Iterator[str]:
         yield f"{self.path} ({self.format})"
-        if self.recipe:
-            yield f"recipe: {self.recipe} (detected from the layout)"
+        if self.layout:
+            yield f"layout: {self.layout} (detected from its columns)"
         for session in self.sessions:
             yield from _session_lines(session)
         if self.proposals:
@@ -121,21 +157,21 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
     summaries: list[SessionSummary] = []
     proposals: list[Proposal] = []
     formats: dict[str, None] = {}
-    recipes: dict[str | None, None] = {}
+    layouts: set[str | None] = set()
     for file_path in find_files(path):
         with open_file(file_path) as file:
-            if hdf5.is_ours(file) and hdf5.read_kind(file, file_path) == "counts":
+            if hdf5.holds_counts(file, file_path):
                 return _counted(hdf5.read_counts(file, file_path), file_path)
             for session, found in each_session(file, file_path):
-                recipes[found.name if found else None] = None
+                layouts.add(found.name if found else None)
                 formats[session.format] = None
-                own = propose([session])
+                own = propose(session, found)
                 summaries.append(_summary(session, bool(own)))
                 proposals += own
     return Inspection(
         path=os.fspath(path),
         format=", ".join(formats),
-        recipe=next(iter(recipes)) if len(recipes) == 1 else None,
+        layout=layouts.pop() if len(layouts) == 1 else None,
         sessions=tuple(summaries),
         proposals=_merged(proposals),
     )
@@ -149,10 +185,10 @@ def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
         if known is None:
             merged[item.conditions] = item
         else:
-            labels = list(dict.fromkeys((*known.labels, *item.labels)))
-            if len(labels) > len(known.labels):
-                labels = [labels[index] for index in natural_order(labels)]
-            merged[item.conditions] = Proposal(item.conditions, tuple(labels), min(known.fewest, item.fewest))
+            labels = known.labels
+            if more := set(item.labels).difference(labels):
+                labels = tuple(sorted({*labels, *more}, key=natural_key))
+            merged[item.conditions] = Proposal(item.conditions, labels, min(known.fewest, item.fewest))
     return tuple(merged.values())
 
 
@@ -212,11 +248,7 @@ def _table(table: SessionTable) -> TableSummary:
         return TableSummary(table.name, len(table), (), str(error))
 
 
-def _counted(dataset: object, path: Path) -> Inspection:
-    import xarray as xr
-
-    if not isinstance(dataset, xr.Dataset):
-        raise DataError(f"{path} does not hold a recordings data set.")
+def _counted(dataset: xr.Dataset, path: Path) -> Inspection:
     labels = Counter(dataset["stimulus"].values.astype(str).tolist())
     pairs = dict.fromkeys(zip(dataset["subject"].values.tolist(), dataset["session"].values.tolist(), strict=True))
     sessions = tuple(
@@ -249,3 +281,68 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
         yield f"  {item.name} ({item.kind}): {shape} samples, {size}, not read"
     for item in (*session.missing, *session.notes):
         yield f"  ! {item}"
+
+
+def propose(session: Session, layout: RecordingLayout | None = None) -> list[Proposal]:
+    """Rank the columns that could label trials: 2–60 values (more if named like a stimulus), twice each or more.
+
+    The conditions of the session's layout come first. Stimulus-like names come before others and before
+    behavioural ones; then text before integers before the rest, the table ``trials`` before others, and
+    balanced columns before unbalanced.
+    """
+    ranked: list[tuple[tuple[float, ...], Proposal]] = []
+    for name, table in session.tables.items():
+        for column in summarise_columns(table):
+            # A column named like a stimulus may have thousands of values; others would be mere numbers.
+            most = np.inf if _STIMULUS.search(column.name) else _MOST_VALUES
+            if 2 <= column.distinct <= most and column.fewest >= 2 and not column.name.endswith(("_time", "_times")):
+                labels = as_labels(table.column(column.name)).tolist()
+                ranked.append((_rank(name, column, len(table)), _proposal(f"{name}:{column.name}", labels)))
+    if layout is not None:
+        table = session.table(layout.conditions.table)
+        if all(name in table for name in layout.conditions.columns):
+            values = [tuple(row) for row in layout.conditions.values(table).tolist() if all(row)]
+            declared = layout.vocabulary(layout.conditions) or natural_vocabulary(values)
+            labels = ["-".join(row) for row in values]
+            ranked.append(((-1.0,), _proposal(str(layout.conditions), labels, declared)))
+    return [proposal for _, proposal in sorted(ranked, key=lambda item: item[0])]
+
+
+def _proposal(conditions: str, labels: list[str], vocabulary: tuple[str, ...] | None = None) -> Proposal:
+    """Return a proposal from the label of every trial, in the order of a vocabulary, else natural."""
+    counts = Counter(label for label in labels if label)
+    ordered = vocabulary or tuple(sorted(counts, key=natural_key))
+    return Proposal(conditions, ordered, min((counts[label] for label in ordered), default=0))
+
+
+def _rank(table: str, column: ColumnSummary, rows: int) -> tuple[float, ...]:
+    topic = 0 if _STIMULUS.search(column.name) else 2 if _BEHAVIOUR.search(column.name) else 1
+    kind = {"text": 0, "integer": 1}.get(column.kind, 2)
+    imbalance = 1 - column.fewest * column.distinct / max(rows, 1)
+    return (topic, kind, table != "trials", imbalance)
+
+
+def summarise_columns(table: SessionTable) -> Iterator[ColumnSummary]:
+    """Describe every column of an interval table."""
+    for name in table.columns:
+        if f"{name}_index" in table:
+            yield ColumnSummary(name, "list", 0)
+            continue
+        try:
+            values = table.column(name)
+        except DataError:
+            yield ColumnSummary(name, "other", 0)
+            continue
+        unique, number = np.unique(values, return_counts=True)
+        present = np.char.strip(unique) != "" if values.dtype.kind == "U" else np.isfinite(unique)
+        unique, number, kind = unique[present], number[present], _kind(values)
+        labels = as_labels(unique).tolist()
+        labels = (sorted(labels, key=natural_key) if kind == "text" else labels)[:EXAMPLES]
+        examples = tuple(f"{float(item):.6g}" for item in labels) if kind == "number" else tuple(labels)
+        yield ColumnSummary(name, kind, len(unique), examples, int(min(number, default=0)))
+
+
+def _kind(values: NDArray[Any]) -> str:
+    if values.dtype.kind == "f" and len(values) and np.all(np.isfinite(values) & (values == np.round(values))):
+        return "integer"
+    return {"U": "text", "b": "boolean", "i": "integer", "u": "integer"}.get(values.dtype.kind, "number")

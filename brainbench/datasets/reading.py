@@ -1,47 +1,189 @@
-"""From what a user names to sessions: files, the recipe of each, and what that recipe makes of it."""
+"""Find recording files and read their sessions: from what a user names to what is counted.
+
+A source names files, and perhaps the layout to read them by. Each file is opened, described as sessions, and every
+session is adapted by its layout.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brainbench.datasets.layouts.registry import RecordingLayout, detect_recipe, get_recipe, split_source
-from brainbench.datasets.sessions import Session
-from brainbench.datasets.sources import find_files, read_file
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, nearest, unknown_name
+from brainbench.datasets import hdf5, nwb
+from brainbench.datasets.layouts.registry import detect_layout, get_layout, is_name, list_layouts, load_layout
+from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
 
 if TYPE_CHECKING:
     import h5py
 
+    from brainbench.datasets.layouts.layout import RecordingLayout
+    from brainbench.datasets.sessions import Session
+
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-"""A file, a folder, a glob, a list of these, or ``RECIPE:PATH``."""
+"""A file, a folder, a glob, a list of these, or ``LAYOUT:PATH``."""
+
+SUFFIXES = ((".nwb",), (".h5", ".hdf5"))
+"""Endings searched for in a folder, in this order; other tools also leave ``.h5`` files beside NWB."""
+
+_SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
 
 
 def find_recordings(source: Source) -> tuple[RecordingLayout | None, list[Path]]:
-    """Return the recipe that a source names, if any, and its files.
+    """Return the layout that a source names, if any, and its files.
+
+    ``LAYOUT:PATH`` names one, or ``FILE.py:PATH`` for a Python file that defines one. A prefix counts as a layout
+    when it is a bare word of at least two letters (so drive letters stay paths) and no file of the whole name exists.
 
     Raises:
         DataFileNotFoundError: the source names nothing.
-        UsageError: it names an unknown recipe.
+        UsageError: it names an unknown layout, or a layout and no file.
     """
-    if not isinstance(source, str):
+    prefix, colon, rest = source.partition(":") if isinstance(source, str) else ("", "", "")
+    in_file = prefix.endswith(".py")
+    if not colon or not (in_file or is_name(prefix)) or Path(str(source)).exists():
         return None, find_files(source)
-    name, rest = split_source(source)
-    return (get_recipe(name) if name else None), find_files(rest)
+    layout = load_layout(prefix) if in_file else None
+    if not rest:
+        raise UsageError(f"The source {source!r} names a layout but no file; write {prefix}:PATH.")
+    return layout or get_layout(prefix), find_files(rest)
+
+
+def find_files(source: Source) -> list[Path]:
+    """Return the recording files a source names, sorted and without repetition.
+
+    A folder is searched at every depth for ``.nwb`` and, if it has none, for ``.h5`` and ``.hdf5``;
+    hidden files are skipped.
+
+    Raises:
+        DataFileNotFoundError: a path does not exist, or a folder or glob holds no recording file.
+    """
+    items = [source] if isinstance(source, (str, os.PathLike)) else source
+    return sorted({path for item in items for path in _expand(os.fspath(item))}, key=str)
+
+
+def resolve_selection(select: Selection | str) -> Selection:
+    """Return a selection from itself, a name ("none", "default" or a layout's) or rules in text.
+
+    Raises:
+        UsageError: the text is neither a name nor a rule.
+    """
+    if isinstance(select, Selection):
+        return select
+    if select in _SELECTIONS:
+        return _SELECTIONS[select]
+    if select in list_layouts():
+        return get_layout(select).selection
+    if "=" not in select:
+        names = [*_SELECTIONS, *list_layouts()]
+        raise unknown_name("selection", select, names, hint="Or write rules: 'outcome=correct; units.layer=4'.")
+    return Selection.parse(select)
+
+
+@contextlib.contextmanager
+def open_file(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading; failures inside the block name the file too.
+
+    Raises:
+        DataError: the file is not HDF5, is truncated or is damaged.
+    """
+    import h5py
+
+    if not os.access(path, os.R_OK):
+        raise DataError(f"{path} may not be read by this user; change its permissions.")
+    if not h5py.is_hdf5(path):
+        raise DataError(
+            f"{path} is not an HDF5 file{_why_not(path)}; brainbench reads NWB 2.x and its own HDF5 layout."
+        )
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, DataError):
+            raise
+        reason = str(error).strip().splitlines()[0]
+        if "unable to lock" in reason:
+            raise DataError(f"{path} is open for writing in another program ({reason}); close it there.") from error
+        if "truncated" in reason:
+            raise DataError(
+                f"{path} is truncated: the file is shorter than its HDF5 header says; copy it again."
+            ) from error
+        raise DataError(f"{path} cannot be read, it seems damaged ({reason}); copy it again.") from error
 
 
 def each_session(
-    file: h5py.File, path: Path, recipe: RecordingLayout | None = None
+    file: h5py.File, path: Path, layout: RecordingLayout | None = None
 ) -> Iterator[tuple[Session, RecordingLayout | None]]:
-    """Yield the sessions of an open file with the recipe that fits each: the given one, else by its layout.
+    """Yield the sessions of an open file with the layout of each: the given one, else the one it is recognised by.
 
-    A session comes as its recipe adapts it. Read it while the file is open, inside the block of
-    :func:`~brainbench.datasets.sources.open_file`, which names the file if reading fails.
+    A session comes as its layout adapts it. Read it while the file is open, inside the block of
+    :func:`open_file`, which names the file if reading fails.
 
     Raises:
-        DataError: the file cannot be read; see :func:`~brainbench.datasets.sources.read_file`.
+        DataError: the file is neither NWB 2.x nor our layout, or holds responses that are already counted.
     """
-    for session in read_file(file, path):
-        found = recipe or detect_recipe(session)
+    for session in _sessions(file, path):
+        found = layout or detect_layout(session)
         yield (session if found is None else found.adapted(session)), found
+
+
+def _sessions(file: h5py.File, path: Path) -> list[Session]:
+    if hdf5.holds_counts(file, path):
+        raise DataError(f"{path} holds counted responses, not sessions of spike times; open it alone.")
+    if hdf5.is_ours(file):
+        return hdf5.read_sessions(file, path)
+    if nwb.is_nwb(file):
+        return [nwb.read_nwb(file, path)]
+    inside = ", ".join(list(file)[:8]) or "nothing"
+    raise DataError(
+        f"{path} is HDF5 but neither NWB nor the {hdf5.FORMAT} layout: it holds {inside}. "
+        f"`brainbench.datasets.write_recordings` writes the layout."
+    )
+
+
+def _expand(source: str) -> list[Path]:
+    path = Path(source).expanduser()
+    if path.is_file():
+        return [path]
+    if path.is_dir():
+        visible = [item for item in path.rglob("*") if _visible(item, path)]
+        for endings in SUFFIXES:
+            if found := [item for item in visible if item.suffix.lower() in endings]:
+                return found
+        raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).")
+    if glob.has_magic(source):
+        found = [
+            Path(item)
+            for item in glob.glob(str(path), recursive=True)  # noqa: PTH207 (absolute patterns)
+            if Path(item).is_file()
+        ]
+        if not found:
+            raise DataFileNotFoundError(f"The pattern {source!r} matches no file.")
+        return found
+    if source == "demo":
+        raise UsageError(
+            "The demo recordings are made from simulated stimuli on first use: ask for recordings='demo' in "
+            "brainbench.score, or pass the folder that brainbench.datasets.synthetic.ensure_demo returns."
+        )
+    siblings = [item.name for item in path.parent.iterdir()] if path.parent.is_dir() else []
+    guess = nearest(path.name, siblings)
+    raise DataFileNotFoundError(f"There is no file {source!r}{f'; did you mean {guess!r}?' if guess else '.'}")
+
+
+def _visible(path: Path, root: Path) -> bool:
+    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(root).parts)
+
+
+def _why_not(path: Path) -> str:
+    size = path.stat().st_size
+    if size == 0:
+        return " (it is empty)"
+    with path.open("rb") as stream:
+        head = stream.read(64)
+    if head.startswith((b"version https://git-lfs", b"/annex/", b"../../.git/annex")):
+        return " but a pointer that git-lfs or git-annex left in its place; fetch the content first"
+    return ""

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -101,6 +101,10 @@ class SessionTable:
                 f"rows, the last at {last} of {total} values{order}; the file is damaged or was written wrongly."
             )
         return ends
+
+    def with_columns(self, **columns: NDArray[Any]) -> SessionTable:
+        """Return the table with further columns [rows]."""
+        return replace(self, data={**self.data, **columns})
 
     def require(self, column: str) -> None:
         """Raise the error for an unknown column, naming the nearest one.
@@ -195,6 +199,10 @@ class Session:
         if name not in self.tables:
             raise unknown_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
         return self.tables[name]
+
+    def with_table(self, table: SessionTable, *notes: str) -> Session:
+        """Return the session with one more table, or another of this name, and further notes."""
+        return replace(self, tables={**self.tables, table.name: table}, notes=(*self.notes, *notes))
 
 
 def make_session(
@@ -302,9 +310,3 @@ def natural_key(label: str) -> tuple[Any, ...]:
     # The odd parts are the digits; the label itself keeps "01" and "1" apart.
     parts = re.split(r"(\d+)", label)
     return (1, 0.0, tuple((int(part), "") if index % 2 else (-1, part) for index, part in enumerate(parts)), label)
-
-
-def natural_order(labels: Iterable[Any]) -> NDArray[np.int64]:
-    """Return the order [n] that sorts labels naturally."""
-    keys = [natural_key(str(label)) for label in labels]
-    return np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.int64)

@@ -49,14 +49,14 @@ class NeuralResponses:
         self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
     ) -> tuple[Any, ...]:
         """Every animal prepared by a metric (RSA by default) over the labels ``kept``, in that order."""
-        from brainbench.datasets import blocks
+        from brainbench.datasets import trials_by_subject
         from brainbench.metrics import get_metric
 
         metric = metric or get_metric("rsa")
         index = np.full(len(self.vocabulary), -1)
         index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
         animals = []
-        for subject, sessions in blocks(self.dataset).items():
+        for subject, sessions in trials_by_subject(self.dataset).items():
             kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
             trials = [
                 replace(item, responses=without_time(item.responses, time), labels=index[item.labels])

@@ -20,7 +20,7 @@ def test_a_copy_is_counted_to_the_same_numbers(tmp_path, suffix):
     path = write_rodgers(tmp_path / "a.h5", units={"layer": ["4", "5b"], "depth": [400.0, 900.0]})
     (copy,) = export(path, tmp_path / f"copy{suffix}")
     same(open_recordings(path, bin=0.1), open_recordings(copy, bin=0.1))
-    assert open_recordings(copy).attrs["recipe"] == "rodgers (detected from the layout)"
+    assert open_recordings(copy).attrs["layout"] == "rodgers (detected from its columns)"
     (again,) = export(copy, tmp_path / f"again{suffix}")
     same(open_recordings(copy), open_recordings(again))
 

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from brainbench.datasets import blocks, check, inspect, make_session, open_recordings, pooled, write_recordings
+from brainbench.datasets import (
+    check,
+    inspect,
+    make_session,
+    open_recordings,
+    pooled,
+    trials_by_subject,
+    write_recordings,
+)
 from brainbench.datasets.sessions import SessionTable
 from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, as_recordings, simulate
 from brainbench.metrics import Trials, subject_rdm
@@ -21,7 +29,7 @@ def make_geometry(stimuli):
 
 def result(dataset, subject):
     """What the metrics say about an animal of a data set."""
-    trials = [Trials(item.responses[:, 0], item.labels, item.keys) for item in blocks(dataset)[subject]]
+    trials = [Trials(item.responses[:, 0], item.labels, item.keys) for item in trials_by_subject(dataset)[subject]]
     labels = dataset.attrs["vocabulary"]
     return subject_rdm(subject, trials, len(labels), stimuli=labels, splits=20)
 

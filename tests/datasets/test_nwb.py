@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import blocks, inspect, make_session, open_recordings
+from brainbench.datasets import inspect, make_session, open_recordings, trials_by_subject
 from brainbench.datasets.nwb import read_nwb
 from brainbench.datasets.synthetic.nwb_writer import NwbWriter
 
@@ -54,7 +54,7 @@ def test_interval_tables_in_processing_modules_are_found(tmp_path):
     assert np.all(dataset["counts"].values == 10)
 
 
-def test_natural_order_is_used_for_conditions_without_a_recipe(tmp_path):
+def test_natural_order_is_used_for_conditions_without_a_layout(tmp_path):
     dataset = open_recordings(write_nwb(tmp_path / "a.nwb"), conditions="trials:texture")
     assert dataset.attrs["vocabulary"] == ["P20", "P100"]
 
@@ -171,7 +171,7 @@ def test_human_units_go_through_to_an_rdm(reference):
     dataset = open_recordings(reference / "nwb" / HUMAN, conditions="encoding_table:stimCategory")
     assert dataset.attrs["vocabulary"] == ["0", "1", "2"]
     assert (dataset.sizes["trial"], dataset.sizes["unit"]) == (90, 35)
-    ((block,),) = blocks(dataset).values()
+    ((block,),) = trials_by_subject(dataset).values()
     means = np.stack([block.responses[block.labels == index, 0].mean(axis=0) for index in range(3)])
     distances = 1 - np.corrcoef(means)[np.triu_indices(3, 1)]
     assert np.all((distances > 0) & (distances < 1))

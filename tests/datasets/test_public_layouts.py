@@ -14,11 +14,11 @@ from brainbench.datasets import (
     check,
     export,
     fetch,
-    get_recipe,
+    get_layout,
     inspect,
-    list_recipes,
+    list_layouts,
     open_recordings,
-    register_recipe,
+    register_layout,
     write_recordings,
 )
 from brainbench.datasets.layouts.hires import recorded_runs
@@ -38,13 +38,13 @@ def layout(request, tmp_path):
 def test_each_layout_is_detected_read_and_declared_healthy(layout):
     name, path, _ = layout
     dataset = open_recordings(path)
-    assert dataset.attrs["recipe"] == f"{name} (detected from the layout)"
+    assert dataset.attrs["layout"] == f"{name} (detected from its columns)"
     checkup = check(path)
     assert checkup.count("error") == 0, str(checkup)
     assert "spikes answer touch" in str(checkup)
-    assert inspect(path).recipe == name
+    assert inspect(path).layout == name
     assert inspect(path).sessions[0].units.spikes > 0
-    assert get_recipe(name).dandiset in get_recipe(name).title
+    assert get_layout(name).dandiset in get_layout(name).title
 
 
 def test_copies_of_each_layout_are_small_and_equal(layout, tmp_path):
@@ -53,7 +53,7 @@ def test_copies_of_each_layout_are_small_and_equal(layout, tmp_path):
         (copy,) = export(path, tmp_path / f"copy{suffix}")
         one, two = open_recordings(path, bin=0.1), open_recordings(copy, bin=0.1)
         xr.testing.assert_identical(one.drop_attrs(), two.drop_attrs())
-        assert two.attrs["recipe"] == f"{name} (detected from the layout)"
+        assert two.attrs["layout"] == f"{name} (detected from its columns)"
         assert one.attrs["content_hash"] == two.attrs["content_hash"]
 
 
@@ -140,10 +140,10 @@ def test_the_test_trials_of_the_benchmark_are_refused_in_words(tmp_path):
         open_recordings(f"area2-bump:{tmp_path / 'a.nwb'}")
 
 
-# A recipe of one's own
+# A layout of one's own
 
 
-def my_recipe(name="my-lab", **changes):
+def my_layout(name="my-lab", **changes):
     return RecordingLayout(
         name=name,
         title="my experiment",
@@ -152,34 +152,34 @@ def my_recipe(name="my-lab", **changes):
         orders={"stimulus": ("c", "b", "a")},
         selection=Selection(),
         window=Window("start", length=0.5),
-        layout=("stimulus", "mine"),
+        columns=("stimulus", "mine"),
         **changes,
     )
 
 
 @pytest.fixture
 def registry(monkeypatch):
-    from brainbench.datasets.layouts import registry as recipes
+    from brainbench.datasets.layouts import registry as layouts
 
-    monkeypatch.setattr(recipes, "_RECIPES", dict(recipes._RECIPES))
+    monkeypatch.setattr(layouts, "_LAYOUTS", dict(layouts._LAYOUTS))
 
 
-def test_a_registered_recipe_is_found_by_name_and_by_layout(registry, tmp_path):
-    assert register_recipe(my_recipe()) == my_recipe()
-    assert "my-lab" in list_recipes()
+def test_a_registered_layout_is_found_by_name_and_by_layout(registry, tmp_path):
+    assert register_layout(my_layout()) == my_layout()
+    assert "my-lab" in list_layouts()
     path = write_recordings(tmp_path / "a.h5", make_simple_session(columns={"mine": np.ones(12)}))
     dataset = open_recordings(path)
-    assert dataset.attrs["recipe"] == "my-lab (detected from the layout)"
+    assert dataset.attrs["layout"] == "my-lab (detected from its columns)"
     assert dataset.attrs["vocabulary"] == ["c", "b", "a"]
     other = write_recordings(tmp_path / "b.h5", make_simple_session())
     assert open_recordings(f"my-lab:{other}").attrs["window"] == "start..+0.5"
-    with pytest.raises(UsageError, match="already a recordings recipe 'my-lab'"):
-        register_recipe(my_recipe(remarks=("other",)))
-    with pytest.raises(UsageError, match="A recipe's name is a word"):
-        register_recipe(my_recipe("c"))
+    with pytest.raises(UsageError, match="already a recording layout 'my-lab'"):
+        register_layout(my_layout(remarks=("other",)))
+    with pytest.raises(UsageError, match="A layout's name is a word"):
+        register_layout(my_layout("c"))
 
 
-def test_a_recipe_in_a_file_of_its_own_works_on_the_command_line(registry, tmp_path):
+def test_a_layout_in_a_file_of_its_own_works_on_the_command_line(registry, tmp_path):
     """The example of docs/recordings.md."""
     import re
     from pathlib import Path
@@ -190,29 +190,29 @@ def test_a_recipe_in_a_file_of_its_own_works_on_the_command_line(registry, tmp_p
     columns = {"texture": np.resize(np.array(["rough", "smooth", "none"]), 12)}
     path = write_recordings(tmp_path / "a.h5", make_simple_session(columns=columns))
     dataset = open_recordings(f"{tmp_path / 'my_lab.py'}:{path}")
-    assert dataset.attrs["recipe"] == "my-lab"
+    assert dataset.attrs["layout"] == "my-lab"
     assert dataset.attrs["vocabulary"] == ["smooth", "rough"]
     assert dataset.attrs["removed"]["trials: label outside the vocabulary"] == 4
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("x = 1", r"defines no RECIPE"), ("raise KeyError('k')", r"fails: KeyError: 'k'"), (None, "no recipe file")],
+    [("x = 1", r"defines no LAYOUT"), ("raise KeyError('k')", r"KeyError: 'k'"), (None, "There is no Python file")],
 )
-def test_an_unusable_recipe_file_is_refused_in_words(registry, tmp_path, content, message):
+def test_an_unusable_layout_file_is_refused_in_words(registry, tmp_path, content, message):
     if content:
         (tmp_path / "my.py").write_text(content)
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises((UsageError, DataError), match=message):
         open_recordings(f"{tmp_path / 'my.py'}:a.h5")
 
 
-def test_installed_packages_add_recipes_and_one_that_fails_takes_nothing_away(registry, monkeypatch, tmp_path, caplog):
+def test_installed_packages_add_layouts_and_one_that_fails_takes_nothing_away(registry, monkeypatch, tmp_path, caplog):
     (tmp_path / "their_recordings.py").write_text(
         "from dataclasses import replace\n"
-        "from brainbench.datasets import Conditions, Recipe, Selection, Window, register_recipe\n"
-        "ONE = Recipe('their-one', 'theirs', 'Them (2026)', Conditions('trials', ('texture',)), {}, Selection(), "
-        "Window('start', length=0.5), ('texture', 'their_mark'))\n"
-        "register_recipe(replace(ONE, name='their-two', layout=()))\n"
+        "from brainbench.datasets import Conditions, RecordingLayout, Selection, Window, register_layout\n"
+        "ONE = RecordingLayout('their-one', 'theirs', 'Them (2026)', Conditions('trials', ('texture',)), {}, "
+        "Selection(), Window('start', length=0.5), ('texture', 'their_mark'))\n"
+        "register_layout(replace(ONE, name='their-two', columns=()))\n"
     )
     (tmp_path / "broken_recordings.py").write_text("raise RuntimeError('out of order')\n")
     info = tmp_path / "theirs-1.0.dist-info"
@@ -224,10 +224,10 @@ def test_installed_packages_add_recipes_and_one_that_fails_takes_nothing_away(re
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("brainbench.datasets.layouts.registry._loaded", [])
     with caplog.at_level(logging.WARNING):
-        names = list_recipes()
+        names = list_layouts()
     assert {"their-one", "their-two", "rodgers"} <= set(names)
-    assert get_recipe("their-one").citation == "Them (2026)"
-    assert "entry point 'broken' (broken_recordings) could not be loaded: out of order" in caplog.text
+    assert get_layout("their-one").citation == "Them (2026)"
+    assert "'broken' (broken_recordings)" in caplog.text
 
 
 # Fetching

@@ -266,12 +266,12 @@ def test_a_folder_with_nwb_files_leaves_other_hdf5_files_alone(tmp_path):
     assert open_recordings(tmp_path, conditions="trials:texture").attrs["source"].endswith("a.nwb")
 
 
-def test_globs_lists_and_recipes_name_sources(tmp_path):
+def test_globs_lists_and_layouts_name_sources(tmp_path):
     paths = [write(tmp_path / f"m{index}.h5", subject=f"m{index}", seed=index) for index in range(3)]
     by_glob = open_recordings(str(tmp_path / "m[01].h5"), conditions="trials:stimulus")
     by_list = open_recordings(paths[:2], conditions="trials:stimulus")
     xr.testing.assert_identical(by_glob.drop_attrs(), by_list.drop_attrs())
-    with pytest.raises(UsageError, match="Unknown recordings recipe 'rodgrs'; did you mean 'rodgers'"):
+    with pytest.raises(UsageError, match="Unknown recording layout 'rodgrs'; did you mean 'rodgers'"):
         open_recordings(f"rodgrs:{tmp_path}")
     with pytest.raises(UsageError, match="no file; write rodgers:PATH"):
         open_recordings("rodgers:")

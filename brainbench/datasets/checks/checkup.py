@@ -21,9 +21,8 @@ from brainbench.datasets.checks.labels import check_labels
 from brainbench.datasets.checks.spikes import check_spikes
 from brainbench.datasets.checks.tables import check_coverage, check_tables
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.reading import Source, each_session, find_recordings
+from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.sources import open_file
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes
 
@@ -70,19 +69,19 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
 
     Args:
         source: as in :func:`~brainbench.datasets.open_recordings`.
-        conditions: table and columns that label the trials, to check the labels; the recipe's by default.
+        conditions: table and columns that label the trials, to check the labels; the layout's by default.
 
     Raises:
         DataFileNotFoundError: the source names nothing.
-        UsageError: it names an unknown recipe, or the conditions cannot be read.
+        UsageError: it names an unknown layout, or the conditions cannot be read.
     """
-    recipe, paths = find_recordings(source)
+    layout, paths = find_recordings(source)
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
     findings: list[Finding] = []
     names: list[str] = []
     for path in paths:
         try:
-            findings += _check_file(path, recipe, wanted, names)
+            findings += _check_file(path, layout, wanted, names)
         except DataError as error:
             findings.append(Finding("error", "file", path.name, str(error)))
     findings += _check_together(names)
@@ -92,28 +91,28 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
 
 
 def _check_file(
-    path: Path, recipe: RecordingLayout | None, conditions: Conditions | None, names: list[str]
+    path: Path, layout: RecordingLayout | None, conditions: Conditions | None, names: list[str]
 ) -> Iterator[Finding]:
     with open_file(path) as file:
-        if hdf5.is_ours(file) and hdf5.read_kind(file, path) == "counts":
+        if hdf5.holds_counts(file, path):
             hdf5.read_counts(file, path)
             message = "holds responses that are already counted; spikes, clock and tables cannot be checked"
             yield Finding("note", "file", path.name, message)
             return
-        for session, found in each_session(file, path, recipe):
+        for session, found in each_session(file, path, layout):
             name = f"{session.subject} / {session.session}"
             names.append(name)
             yield from check_session(session, found, conditions, name)
 
 
 def check_session(
-    session: Session, recipe: RecordingLayout | None = None, conditions: Conditions | None = None, where: str = ""
+    session: Session, layout: RecordingLayout | None = None, conditions: Conditions | None = None, where: str = ""
 ) -> Iterator[Finding]:
     """Yield the findings about one session, which must still be open."""
     where = where or f"{session.subject} / {session.session}"
-    conditions = conditions or (recipe.conditions if recipe else None)
+    conditions = conditions or (layout.conditions if layout else None)
     yield from check_tables(session, where)
-    yield from check_labels(session, recipe, conditions, where)
+    yield from check_labels(session, layout, conditions, where)
     if not has_units(session) or session.units is None:
         yield Finding("error", "units", where, no_units(session))
         return
@@ -126,8 +125,8 @@ def check_session(
     for note in notes:
         yield Finding("warning", "spikes", where, note, "Whoever wrote the file may have joined trials or probes.")
     yield from check_spikes(session, spikes, where)
-    yield from check_coverage(session, spikes, recipe, conditions, where)
-    yield from check_clock(session, spikes, recipe, where)
+    yield from check_coverage(session, spikes, layout, conditions, where)
+    yield from check_clock(session, spikes, layout, where)
 
 
 def _check_together(names: list[str]) -> Iterator[Finding]:

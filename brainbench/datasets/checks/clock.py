@@ -42,12 +42,12 @@ _LONGEST = 12 * 3600.0
 
 
 def check_clock(
-    session: Session, spikes: list[NDArray[np.float64]], recipe: RecordingLayout | None, where: str
+    session: Session, spikes: list[NDArray[np.float64]], layout: RecordingLayout | None, where: str
 ) -> Iterator[Finding]:
     """Yield what can be said about the clock of one session."""
-    found = touches(session, recipe)
+    found = touches(session, layout)
     if found is None:
-        message = "no touch times (tables contacts_by_whisker_*, or a recipe's event), so the clock cannot be checked"
+        message = "no touch times (tables contacts_by_whisker_*, or a layout's event), so the clock cannot be checked"
         yield Finding("note", "clock", where, message, "Look at spike rates around a known event before scoring.")
         return
     times, event = found
@@ -108,14 +108,14 @@ def _other_lag(lags: NDArray[np.float64], size: NDArray[np.float64], at_touch: f
     return float(lags[np.flatnonzero(before)[0]]), float(size[best])
 
 
-def touches(session: Session, recipe: RecordingLayout | None) -> tuple[NDArray[np.float64], str] | None:
+def touches(session: Session, layout: RecordingLayout | None) -> tuple[NDArray[np.float64], str] | None:
     """Return touch times (s) of a session and what they are, or None where it has none.
 
-    First contacts of the trials if there are contact tables, else the event that the recipe names.
+    First contacts of the trials if there are contact tables, else the event that the layout names.
     """
-    trials = session.tables.get(recipe.conditions.table if recipe else "trials")
+    trials = session.tables.get(layout.conditions.table if layout else "trials")
     contacts = any(CONTACTS.match(name) for name in session.tables)
-    event = FIRST_CONTACT if contacts else recipe.touch if recipe else ""
+    event = FIRST_CONTACT if contacts else layout.touch if layout else ""
     if trials is None or not event or (event == FIRST_CONTACT and not contacts):
         return None
     try:

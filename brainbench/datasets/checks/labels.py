@@ -9,23 +9,23 @@ import numpy as np
 
 from brainbench.core.errors import BrainbenchError, nearest
 from brainbench.datasets.checks.findings import Finding, share, some
+from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import Session, SessionTable, as_labels
-from brainbench.datasets.trials.conditions import Conditions, join
-from brainbench.datasets.trials.proposals import propose
+from brainbench.datasets.trials.conditions import Conditions, joined_labels
 
 _FEW = 2
 """Split halves need this many trials of every stimulus."""
 
 
 def check_labels(
-    session: Session, recipe: RecordingLayout | None, conditions: Conditions | None, where: str
+    session: Session, layout: RecordingLayout | None, conditions: Conditions | None, where: str
 ) -> Iterator[Finding]:
     """Yield the findings about the condition labels of one session."""
     if conditions is None:
-        proposals = [item.conditions for item in propose([session])]
+        proposals = [item.conditions for item in propose(session)]
         if session.tables:
-            message = f"no recipe fits, so labels were not checked; columns to try: {some(proposals, 3) or 'none'}"
+            message = f"no layout fits, so labels were not checked; columns to try: {some(proposals, 3) or 'none'}"
             yield Finding("note", "labels", where, message, "Pass --conditions TABLE:COLUMN to check them.")
         return
     try:
@@ -34,16 +34,16 @@ def check_labels(
     except BrainbenchError as error:
         yield Finding("error", "labels", where, str(error))
         return
-    counts = Counter(join(values))
+    counts = Counter(joined_labels(values))
     missing = counts.pop("", 0)
     if missing:
         message = f"{share(missing, len(table))} trials have no value of {', '.join(conditions.columns)}"
         yield Finding("warning" if missing < len(table) else "error", "labels", where, message, "They are left out.")
-    vocabulary = recipe.vocabulary(conditions) if recipe else None
+    vocabulary = layout.vocabulary(conditions) if layout else None
     if vocabulary is None:
         yield from _spelling(counts, where)
     else:
-        yield from _strangers(counts, vocabulary, recipe, where)
+        yield from _strangers(counts, vocabulary, layout, where)
         counts = Counter({label: counts[label] for label in vocabulary})
     yield from _balance(counts, vocabulary, where)
     if {"outcome", "choice", "rewarded_side"} <= set(table.columns):
@@ -61,10 +61,10 @@ def _spelling(counts: Counter[str], where: str) -> Iterator[Finding]:
 
 
 def _strangers(
-    counts: Counter[str], vocabulary: tuple[str, ...], recipe: RecordingLayout | None, where: str
+    counts: Counter[str], vocabulary: tuple[str, ...], layout: RecordingLayout | None, where: str
 ) -> Iterator[Finding]:
-    # What the recipe refuses by rule (such as "nothing") is known and no misspelling.
-    refused = {value for rule in recipe.selection.trials for value in rule.refuse} if recipe else set()
+    # What the layout refuses by rule (such as "nothing") is known and no misspelling.
+    refused = {value for rule in layout.selection.trials for value in rule.refuse} if layout else set()
     for label, number in sorted(counts.items()):
         if label in vocabulary or refused & set(label.split("-")):
             continue

@@ -155,19 +155,19 @@ def _contacts(session: Session, trials: SessionTable, where: str) -> Iterator[Fi
 def check_coverage(
     session: Session,
     spikes: list[NDArray[np.float64]],
-    recipe: RecordingLayout | None,
+    layout: RecordingLayout | None,
     conditions: Conditions | None,
     where: str,
 ) -> Iterator[Finding]:
     """Yield the findings about trials without recording, and breaks inside it.
 
-    Of a trial the recipe's window counts, without a recipe all of it.
+    Of a trial the layout's window counts, without a layout all of it.
     """
     table = session.tables.get(conditions.table if conditions else "trials")
     span = recorded_span(spikes)
     if table is None or span is None or "start_time" not in table or not len(table):
         return
-    window = recipe.window if recipe else WHOLE if "stop_time" in table else Window("start", length=1e-3)
+    window = layout.window if layout else WHOLE if "stop_time" in table else Window("start", length=1e-3)
     try:
         edges = window.edges(session, table, [])
     except BrainbenchError:

@@ -1,1 +1,17 @@
-"""Named ways to read published data sets: one module per data set, and their registry."""
+"""Layouts of published data sets: how the files of each are recognised, adapted, selected and labelled.
+
+A session is matched by the columns of its trials (``registry``) and then adapted by its layout, before it is counted.
+"""
+
+from brainbench.datasets.layouts import area2_bump, hires, rodgers, yu
+from brainbench.datasets.layouts.registry import register_layout
+
+for _layout in (
+    rodgers.LAYOUT,
+    rodgers.DISCRIMINATION,
+    rodgers.DETECTION,
+    yu.LAYOUT,
+    hires.LAYOUT,
+    area2_bump.LAYOUT,
+):
+    register_layout(_layout)

@@ -1,13 +1,11 @@
-"""Recipe for Area2_Bump (DANDI 000127): macaque somatosensory area 2 during reaches and bumps of the arm.
+"""Layout of Area2_Bump (DANDI 000127): macaque somatosensory area 2 during reaches and bumps of the arm.
 
 The manipulandum pushes the hand in one of the directions of the reaches (passive trials), or the
 monkey reaches there (active ones). ``trials`` names both by ``cond_dir`` (degrees) and tells them
-apart by ``ctr_hold_bump``; the recipe joins the two to one label, such as ``passive-90``.
+apart by ``ctr_hold_bump``; the layout joins the two to one label, such as ``passive-90``.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -29,11 +27,12 @@ def adapt(session: Session) -> Session:
         return session
     bump = np.isin(np.char.lower(as_labels(table.column("ctr_hold_bump"))), ("true", "1"))
     angle = table.times("cond_dir") % 360
-    made = {"movement": np.where(bump, PASSIVE, "active"), "direction": as_labels(angle)}
-    return replace(session, tables={**session.tables, "trials": replace(table, data={**table.data, **made})})
+    return session.with_table(
+        table.with_columns(movement=np.where(bump, PASSIVE, "active"), direction=as_labels(angle))
+    )
 
 
-RECIPE = RecordingLayout(
+LAYOUT = RecordingLayout(
     name="area2-bump",
     title="reaches and bumps of the arm, units of macaque area 2 (DANDI 000127)",
     citation="Chowdhury R. H., Glaser J. I., Miller L. E., eLife 9:e48198 (2020), doi:10.7554/eLife.48198",
@@ -41,7 +40,7 @@ RECIPE = RecordingLayout(
     orders={"movement": ("active", PASSIVE), "direction": DIRECTIONS},
     selection=Selection(name="area2-bump", trials=(Rule("result", allow=("R",), required=False),)),
     window=Window("move_onset_time", offset=-0.1, length=0.6),
-    layout=("cond_dir", "ctr_hold_bump", "bump_time", "move_onset_time", "split"),
+    columns=("cond_dir", "ctr_hold_bump", "bump_time", "move_onset_time", "split"),
     adapt=adapt,
     touch="bump_time",
     dandiset="000127",

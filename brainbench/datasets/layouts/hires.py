@@ -1,4 +1,4 @@
-"""Recipe for Hires 2015 (DANDI 000013): single layer 4 neurons while a mouse finds a pole with a whisker.
+"""Layout of Hires 2015 (DANDI 000013): single layer 4 neurons while a mouse finds a pole with a whisker.
 
 One cell per file, and no units table: spikes are a 0/1 signal ``acquisition/SpikeTrain`` with time
 stamps, touches likewise under ``acquisition/behavior``. They become a unit and a contact table here.
@@ -51,10 +51,8 @@ def with_contacts(session: Session, prefix: str, whisker: str) -> Session:
     # A touch ends at the next offset; one that is cut off by the end of the recording ends at once.
     after = np.searchsorted(end, begin, side="left")
     stop = np.append(end, np.nan)[after]
-    table = SessionTable(
-        name, {"start_time": begin, "stop_time": np.where(np.isnan(stop), begin, stop)}, session.source
-    )
-    return replace(session, tables={**session.tables, name: table})
+    data = {"start_time": begin, "stop_time": np.where(np.isnan(stop), begin, stop)}
+    return session.with_table(SessionTable(name, data, session.source))
 
 
 def _unit(train: Series, source: str) -> SessionTable:
@@ -77,7 +75,7 @@ def recorded_runs(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([stamps[np.append(0, breaks + 1)], stamps[np.append(breaks, len(stamps) - 1)] + step], axis=1)
 
 
-RECIPE = RecordingLayout(
+LAYOUT = RecordingLayout(
     name="hires",
     title="pole localisation with one whisker, single neurons of layer 4 (DANDI 000013)",
     citation="Hires S. A., Gutnisky D. A. et al., eLife 4:e06619 (2015), doi:10.7554/eLife.06619",
@@ -85,7 +83,7 @@ RECIPE = RecordingLayout(
     orders={},
     selection=Selection(name="hires", trials=SELECTION),
     window=Window("pole_in_time", stop="pole_out_time"),
-    layout=("type", "response", "stim_present", "pole_position", "pole_in_time", "pole_out_time"),
+    columns=("type", "response", "stim_present", "pole_position", "pole_in_time", "pole_out_time"),
     adapt=adapt,
     dandiset="000013",
     remarks=(

@@ -1,9 +1,9 @@
-"""What a recipe is: how one published data set is read, in one record."""
+"""The record that says how one published data set is read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 from brainbench.datasets.sessions import Session
@@ -14,7 +14,7 @@ from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 
 @dataclass(frozen=True)
 class RecordingLayout:
-    """How one published data set is read. Every part can be overridden by an argument."""
+    """The way one published data set is read; an argument of ``open_recordings`` overrides any part."""
 
     name: str
     title: str
@@ -24,9 +24,9 @@ class RecordingLayout:
     """Column → its values in fixed order; other values are not part of the experiment."""
     selection: Selection
     window: Window
-    layout: tuple[str, ...]
+    columns: tuple[str, ...]
     """Columns of the condition table by which a file of this data set is recognised; empty: never, the
-    recipe has to be named."""
+    layout has to be named."""
     remarks: tuple[str, ...] = ()
     adapt: Callable[[Session], Session] | None = None
     """Turns the file's own layout into units and interval tables; must leave alone what is already
@@ -40,9 +40,9 @@ class RecordingLayout:
     """Glob of the archive's files that hold units; all of them if empty."""
 
     def matches(self, session: Session) -> bool:
-        """Tell whether a session has the layout of this data set."""
+        """Return whether a session's condition table has the columns of this data set."""
         table = session.tables.get(self.conditions.table)
-        return bool(self.layout) and table is not None and all(column in table for column in self.layout)
+        return bool(self.columns) and table is not None and all(column in table for column in self.columns)
 
     def adapted(self, session: Session) -> Session:
         """Return the session with the units and tables that this data set stores in its own way."""
@@ -55,7 +55,7 @@ class RecordingLayout:
         return tuple("-".join(values) for values in product(*(self.orders[name] for name in conditions.columns)))
 
     def describe(self) -> str:
-        """Print every rule of the recipe, one per line."""
+        """Return every rule of the layout, one per line."""
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:
@@ -69,8 +69,3 @@ class RecordingLayout:
             yield f"window of sessions without contact tables: {self.window.fallback}"
         yield from self.selection.lines()
         yield from self.remarks
-
-
-def variant(recipe: RecordingLayout, **changes: object) -> RecordingLayout:
-    """Return a recipe that differs in some parts and is used only when named."""
-    return replace(recipe, layout=(), **changes)  # pyright: ignore[reportArgumentType]

@@ -1,161 +1,97 @@
-"""The registry of recipes: named ways to read a data set.
+"""The registry of recording layouts: named ways to read a data set.
 
 Other packages add theirs through the entry point group ``brainbench.recordings``: an entry point names a
-:class:`~brainbench.datasets.RecordingLayout`, or a module whose import runs :func:`register_recipe`.
+:class:`~brainbench.datasets.RecordingLayout`, or a module whose import runs :func:`register_layout`.
 """
 
 from __future__ import annotations
 
-import logging
-from pathlib import Path
+from typing import Any
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.datasets.layouts import area2_bump, hires, rodgers, yu
+from brainbench.core.plugins import load_entry_points, load_module
 from brainbench.datasets.layouts.layout import RecordingLayout
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
-
-_log = logging.getLogger(__name__)
 
 ENTRY_POINTS = "brainbench.recordings"
 
-_RECIPES: dict[str, RecordingLayout] = {
-    recipe.name: recipe
-    for recipe in (
-        rodgers.RECIPE,
-        rodgers.DISCRIMINATION,
-        rodgers.DETECTION,
-        yu.RECIPE,
-        hires.RECIPE,
-        area2_bump.RECIPE,
-    )
-}
-_SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
+_LAYOUTS: dict[str, RecordingLayout] = {}
 _loaded: list[str] = []
 """Groups of entry points that were loaded: once, on first use."""
 
 
-def register_recipe(recipe: RecordingLayout) -> RecordingLayout:
-    """Make a recipe known by its name and its layout for the rest of this process; returns it.
+def register_layout(layout: RecordingLayout) -> RecordingLayout:
+    """Make a layout known by its name and its columns for the rest of this process; returns it.
 
-    On the command line ``FILE.py:PATH`` registers the ``RECIPE`` that a file defines.
+    On the command line ``FILE.py:PATH`` registers the ``LAYOUT`` that a file defines.
 
     Raises:
-        UsageError: another recipe has this name, or it could not be told from a path.
+        UsageError: another layout has this name, or it could not be told from a path.
     """
-    if not _is_name(recipe.name):
+    if not is_name(layout.name):
         raise UsageError(
-            f"A recipe's name is a word of at least two letters, digits, '-' or '_', beginning with a letter; "
-            f"received {recipe.name!r}."
+            f"A layout's name is a word of at least two letters, digits, '-' or '_', beginning with a letter; "
+            f"received {layout.name!r}."
         )
-    known = _RECIPES.get(recipe.name)
-    if known is not None and known != recipe:
-        raise UsageError(f"There is already a recordings recipe {recipe.name!r} ({known.title}); choose another name.")
-    _RECIPES[recipe.name] = recipe
-    return recipe
+    known = _LAYOUTS.setdefault(layout.name, layout)
+    if known != layout:
+        raise UsageError(f"There is already a recording layout {layout.name!r} ({known.title}); choose another name.")
+    return layout
 
 
-def get_recipe(name: str) -> RecordingLayout:
-    """Return a recipe by name.
+def get_layout(name: str) -> RecordingLayout:
+    """Return a layout by name.
 
     Raises:
-        UsageError: there is no such recipe (the nearest is named).
+        UsageError: there is no such layout (the nearest is named).
     """
     if name not in _known():
-        raise unknown_name("recordings recipe", name, _RECIPES)
-    return _RECIPES[name]
+        raise unknown_name("recording layout", name, _LAYOUTS)
+    return _LAYOUTS[name]
 
 
-def list_recipes() -> list[str]:
-    """Names of the recipes."""
+def list_layouts() -> list[str]:
+    """Return the names of the layouts."""
     return sorted(_known())
 
 
-def detect_recipe(session: Session) -> RecordingLayout | None:
-    """Return the recipe whose layout a session has, if any; of several the most specific one."""
-    found = [recipe for recipe in _known().values() if recipe.matches(session)]
-    return max(found, key=lambda recipe: len(recipe.layout), default=None)
+def detect_layout(session: Session) -> RecordingLayout | None:
+    """Return the layout that a session has, if any; of several the most specific one."""
+    found = [layout for layout in _known().values() if layout.matches(session)]
+    return max(found, key=lambda layout: len(layout.columns), default=None)
 
 
-def resolve_selection(select: Selection | str) -> Selection:
-    """Return a selection from itself, a name ("none", "default" or a recipe's) or rules in text.
-
-    Raises:
-        UsageError: the text is neither a name nor a rule.
-    """
-    if isinstance(select, Selection):
-        return select
-    if select in _SELECTIONS:
-        return _SELECTIONS[select]
-    if select in _known():
-        return _RECIPES[select].selection
-    if "=" not in select:
-        names = [*_SELECTIONS, *list_recipes()]
-        raise unknown_name("selection", select, names, hint="Or write rules: 'outcome=correct; units.layer=4'.")
-    return Selection.parse(select)
-
-
-def split_source(source: str) -> tuple[str | None, str]:
-    """Split ``RECIPE:PATH`` or ``FILE.py:PATH``; a source without a recipe gives (None, source).
-
-    A prefix counts as a recipe when it is a bare word of at least two letters (so drive letters stay
-    paths) and no file of the whole name exists. A Python file is run and its ``RECIPE`` registered.
+def load_layout(path: str) -> RecordingLayout:
+    """Run a Python file and register the layout that it calls ``LAYOUT`` (or ``RECIPE``).
 
     Raises:
-        UsageError: the prefix is not a recipe, or the file defines none.
+        DataFileNotFoundError: there is no such file.
+        DataError: it fails.
+        UsageError: it defines no layout.
     """
-    prefix, colon, rest = source.partition(":")
-    if colon and prefix.endswith(".py") and not Path(source).exists():
-        recipe = load_recipe(prefix)
-    elif not colon or not _is_name(prefix) or Path(source).exists():
-        return None, source
-    else:
-        recipe = None
-    if not rest:
-        raise UsageError(f"The source {source!r} names a recipe but no file; write {prefix}:PATH.")
-    return (recipe or get_recipe(prefix)).name, rest
-
-
-def load_recipe(path: str) -> RecordingLayout:
-    """Run a Python file and register the recipe that it calls ``RECIPE``.
-
-    Raises:
-        UsageError: there is no such file, it fails, or it defines no recipe.
-    """
-    import runpy
-
-    if not Path(path).is_file():
-        raise UsageError(f"There is no recipe file {path!r}.")
-    try:
-        found = runpy.run_path(path).get("RECIPE")
-    except Exception as error:
-        raise UsageError(f"The recipe file {path!r} fails: {type(error).__name__}: {error}.") from error
+    module = load_module(path)
+    found = getattr(module, "LAYOUT", getattr(module, "RECIPE", None))
     if not isinstance(found, RecordingLayout):
         raise UsageError(
-            f"The recipe file {path!r} defines no RECIPE = brainbench.datasets.Recipe(…); docs/recordings.md shows one."
+            f"The file {path!r} defines no LAYOUT = brainbench.datasets.RecordingLayout(…); "
+            f"docs/recordings.md shows one."
         )
-    return register_recipe(found)
+    return register_layout(found)
+
+
+def is_name(word: str) -> bool:
+    """Return whether a word could be a layout's name; a drive letter could not."""
+    return len(word) >= 2 and word.replace("-", "_").isidentifier()
 
 
 def _known() -> dict[str, RecordingLayout]:
-    """Return the registry with the recipes of other packages."""
+    """Return the registry with the layouts of other packages."""
     if ENTRY_POINTS not in _loaded:
         _loaded.append(ENTRY_POINTS)
-        _load_entry_points()
-    return _RECIPES
+        load_entry_points(ENTRY_POINTS, _take)
+    return _LAYOUTS
 
 
-def _load_entry_points() -> None:
-    from importlib.metadata import entry_points
-
-    for entry in entry_points(group=ENTRY_POINTS):
-        try:
-            found = entry.load()
-            if isinstance(found, RecordingLayout):
-                register_recipe(found)
-        except Exception as error:  # noqa: BLE001 - another package's fault must not take our recipes away
-            _log.warning("The recipe of entry point %r (%s) could not be loaded: %s", entry.name, entry.value, error)
-
-
-def _is_name(word: str) -> bool:
-    return len(word) >= 2 and word.replace("-", "_").isidentifier()
+def _take(_: str, found: Any) -> None:
+    if isinstance(found, RecordingLayout):
+        register_layout(found)

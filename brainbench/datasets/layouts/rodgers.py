@@ -1,9 +1,9 @@
-"""Recipes for Rodgers 2022 (DANDI 000231): mice that recognise shapes with their whiskers.
+"""Layouts of Rodgers 2022 (DANDI 000231): mice that recognise shapes with their whiskers.
 
 Two tasks share one layout. *Discrimination*: convex or concave, one side each. *Detection*: a shape of
 either kind on one side, ``nothing`` on the other. ``rodgers`` reads both as the published analysis
 pooled them, ``rodgers-discrimination`` and ``rodgers-detection`` read one; the last keeps ``nothing``
-as a seventh stimulus. ``get_recipe("rodgers").describe()`` prints every rule.
+as a seventh stimulus. ``get_layout("rodgers").describe()`` prints every rule.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from brainbench.core.errors import listing
-from brainbench.datasets.layouts.layout import RecordingLayout, variant
+from brainbench.datasets.layouts.layout import RecordingLayout
 from brainbench.datasets.sessions import Session, as_labels
-from brainbench.datasets.trials.conditions import Conditions, join
+from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Rule, Selection
 from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, Window
 
@@ -48,7 +48,7 @@ WINDOW = Window(
 """First contact to choice, as in the published analysis; the last second before the choice where a
 session has no contact tables."""
 
-LAYOUT = ("stimulus", "servo_position", "outcome", "choice_time")
+COLUMNS = ("stimulus", "servo_position", "outcome", "choice_time")
 
 REMARKS = (
     "trials: a contact must last longer than zero to be the first; no contact before the choice removes the trial",
@@ -78,16 +78,17 @@ def adapt(session: Session) -> Session:
     if table is None or any(name not in table for name in CONDITIONS.columns) or "task" in table:
         return session
     values = CONDITIONS.values(table)
-    objects = np.where(values[:, 0] == NOTHING, NOTHING, join(values)) if len(table) else np.zeros(0, dtype="U1")
-    made = {"task": np.full(len(table), task(session)), "object": objects}
-    tables = {**session.tables, CONDITIONS.table: replace(table, data={**table.data, **made})}
+    objects = (
+        np.where(values[:, 0] == NOTHING, NOTHING, joined_labels(values)) if len(table) else np.zeros(0, dtype="U1")
+    )
+    made = table.with_columns(task=np.full(len(table), task(session)), object=objects)
     have = {match["whisker"] for match in map(CONTACTS.match, session.tables) if match}
     lost = [name for name in TRACKED if name not in have]
     note = f"{session.source}: no contact table of {listing(lost)}; the first contact is that of the other whiskers"
-    return replace(session, tables=tables, notes=(*session.notes, note) if have and lost else session.notes)
+    return session.with_table(made, *([note] if have and lost else []))
 
 
-RECIPE = RecordingLayout(
+LAYOUT = RecordingLayout(
     name="rodgers",
     title=TITLE,
     citation=CITATION,
@@ -95,14 +96,15 @@ RECIPE = RecordingLayout(
     orders=ORDERS,
     selection=SELECTION,
     window=WINDOW,
-    layout=LAYOUT,
+    columns=COLUMNS,
     remarks=REMARKS,
     adapt=adapt,
     dandiset="000231",
     assets="*ecephys*",
 )
-DISCRIMINATION = variant(
-    RECIPE,
+DISCRIMINATION = replace(
+    LAYOUT,
+    columns=(),
     name="rodgers-discrimination",
     title=f"{TITLE}, sessions of the discrimination task",
     selection=replace(
@@ -111,8 +113,9 @@ DISCRIMINATION = variant(
         trials=(Rule("task", allow=("discrimination",)), *SELECTION.trials),
     ),
 )
-DETECTION = variant(
-    RECIPE,
+DETECTION = replace(
+    LAYOUT,
+    columns=(),
     name="rodgers-detection",
     title=f"{TITLE}, sessions of the detection task, with 'nothing' as a stimulus",
     conditions=Conditions("trials", ("object",)),

@@ -1,4 +1,4 @@
-"""Recipe for Yu 2016 (DANDI 000005): thalamus and layer 4 while a mouse finds a pole with its whiskers.
+"""Layout of Yu 2016 (DANDI 000005): thalamus and layer 4 while a mouse finds a pole with its whiskers.
 
 Extracellular files have a units table. Touches are 0/1 signals, one container per whisker under
 ``acquisition``: ``principal_whisker_c2``, ``whisker_c1``. They become contact tables here.
@@ -26,7 +26,7 @@ def adapt(session: Session) -> Session:
     return session
 
 
-RECIPE = RecordingLayout(
+LAYOUT = RecordingLayout(
     name="yu",
     title="pole localisation with a few whiskers, units of thalamus (VPM) and layer 4 (DANDI 000005)",
     citation="Yu J., Gutnisky D. A. et al., Nature Neuroscience 19:1647 (2016), doi:10.1038/nn.4412",
@@ -34,7 +34,7 @@ RECIPE = RecordingLayout(
     orders={"type": ("Go", "Nogo")},
     selection=Selection(name="yu", trials=SELECTION),
     window=Window("pole_in_time", stop="pole_out_time"),
-    layout=(
+    columns=(
         "type",
         "response",
         "stim_present",

@@ -53,8 +53,8 @@ class SyntheticAnimal:
     """One animal's trials, and the truth about it."""
 
     subject: str
-    blocks: tuple[Trials, ...]
-    """Sessions: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``."""
+    sessions: tuple[Trials, ...]
+    """Every session: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``."""
     truth: NDArray[np.float64] = field(repr=False)
     """[P] correlation-distance RDM of its units' expected rates, free of noise."""
 
@@ -120,7 +120,7 @@ def measure_ceiling(
     scores: list[float] = []
     for number in range(simulations):
         for animal in simulate(geometry, design, seed=(*entropy(seed), number)):
-            means = np.concatenate([stimulus_means(block, stimuli) for block in animal.blocks], axis=1)
+            means = np.concatenate([stimulus_means(block, stimuli) for block in animal.sessions], axis=1)
             scores.append(_pearson(correlation_rdm(means), truth))
     known = np.array([score for score in scores if np.isfinite(score)])
     if not len(known):

@@ -221,7 +221,7 @@ def _first_contacts(
 
 
 def _expected(rates: NDArray[np.float64], afferents: Afferents, first: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected response [K, U] in the recipe's window, first contact to choice."""
+    """Expected response [K, U] in the layout's window, first contact to choice."""
     return window_rates(rates, afferents.frame, first, np.linspace(*CHOICE, 18))
 
 

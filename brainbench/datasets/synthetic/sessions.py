@@ -23,7 +23,7 @@ from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.truth import TRUTH, correlation_rdm
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts
-from brainbench.datasets.trials.joining import join
+from brainbench.datasets.trials.joining import join_sessions
 from brainbench.datasets.trials.selection import EVERYTHING, Tally
 from brainbench.datasets.trials.windows import Window
 
@@ -51,7 +51,7 @@ _TOUCH = 0.05
 def as_recordings(
     geometry: ResponseGeometry, design: Design | None = None, *, seed: int | Sequence[int] = 0
 ) -> xr.Dataset:
-    """Draw synthetic animals as a recordings data set, ready for ``blocks`` and ``score``.
+    """Draw synthetic animals as a recordings data set, ready for ``trials_by_subject`` and ``score``.
 
     Raises:
         DataError: the design leaves no trial or one condition only.
@@ -90,7 +90,7 @@ def as_recordings(
                     synthetic=True,
                 )
             )
-    return join(parts, plan, source="synthetic", recipe="", notes=[])
+    return join_sessions(parts, plan, source="synthetic", layout="", notes=[])
 
 
 def make_sessions(

@@ -51,8 +51,8 @@ class Conditions:
         return np.stack([as_labels(table.column(name)) for name in self.columns], axis=1)
 
 
-def join(values: NDArray[np.str_]) -> list[str]:
-    """Join condition values [rows, columns] to labels; "" where any value is missing."""
+def joined_labels(values: NDArray[np.str_]) -> list[str]:
+    """Return the label of each row of condition values [rows, columns]; "" where any value is missing."""
     return ["-".join(row) if all(row) else "" for row in values.tolist()]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, natural_key
-from brainbench.datasets.trials.conditions import Conditions, join
+from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.covariates import trial_covariates
 from brainbench.datasets.trials.selection import Selection, Tally
 from brainbench.datasets.trials.windows import Window
@@ -25,13 +25,15 @@ _MOST_COUNTS = 1 << 32
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How sessions are read; equal for all of them."""
+    """Everything that decides how sessions are read; equal for all sessions of a data set."""
 
     conditions: Conditions
     vocabulary: tuple[str, ...] | None
+    """Labels in their fixed order; None for those that are found, sorted naturally."""
     selection: Selection
     window: Window
-    bin: float | None
+    bin: float | None = None
+    """Bin width, s; None for one bin per window."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class SessionCounts:
     columns: dict[str, NDArray[Any]]
     """Unit columns [U]."""
     covariates: dict[str, NDArray[np.float64]]
-    """What else is known of the trials [R]."""
+    """Covariate → its value in each trial [R]."""
     tally: Tally
     trials: int
     """Rows of the condition table before any rule."""
@@ -65,8 +67,8 @@ class SessionCounts:
     synthetic: bool
 
 
-def extract(session: Session, plan: ReadingOptions) -> SessionCounts:
-    """Read one session by a plan.
+def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
+    """Count the trials of one session.
 
     Raises:
         UsageError: a table or column does not exist (the nearest is named).
@@ -75,31 +77,31 @@ def extract(session: Session, plan: ReadingOptions) -> SessionCounts:
     if session.units is None or not has_units(session):
         raise DataError(no_units(session))
     tally = Tally()
-    table = session.table(plan.conditions.table)
+    table = session.table(options.conditions.table)
     if "start_time" not in table:
         raise DataError(f"{table.label} has no start_time; conditions need a table of time intervals.")
-    values = plan.conditions.values(table)
-    labels = np.array(join(values), dtype=str)
-    kept = tally.select(table, plan.selection.trials, "trials")
-    kept = tally.apply(kept, labels != "", f"trials: no value of {','.join(plan.conditions.columns)}")
-    if plan.vocabulary is not None:
-        kept = tally.apply(kept, np.isin(labels, plan.vocabulary), "trials: label outside the vocabulary")
-    edges = plan.window.edges(session, table, tally.notes)
-    kept = tally.apply(kept, np.isfinite(edges).all(axis=1), f"trials: no event for the window {plan.window}")
+    values = options.conditions.values(table)
+    labels = np.array(joined_labels(values), dtype=str)
+    kept = tally.select(table, options.selection.trials, "trials")
+    kept = tally.apply(kept, labels != "", f"trials: no value of {','.join(options.conditions.columns)}")
+    if options.vocabulary is not None:
+        kept = tally.apply(kept, np.isin(labels, options.vocabulary), "trials: label outside the vocabulary")
+    edges = options.window.edges(session, table, tally.notes)
+    kept = tally.apply(kept, np.isfinite(edges).all(axis=1), f"trials: no event for the window {options.window}")
     kept = tally.apply(kept, ~(edges[:, 1] <= edges[:, 0]), "trials: window of no length")
     invalid = session.tables.get("invalid_times")
     if invalid is not None:
         kept = tally.apply(kept, ~_overlaps(edges, invalid), "trials: overlap with invalid_times")
 
     spikes = read_spikes(session.units, tally.notes)
-    covered, unit_kept = _coverage(session.units, spikes, edges, plan.selection, tally)
+    covered, unit_kept = _coverage(session.units, spikes, edges, options.selection, tally)
     kept = tally.apply(kept, covered.any(axis=1), "trials: outside the recorded span")
     unit_kept = tally.apply(unit_kept, covered[kept].any(axis=0) | ~kept.any(), "units: recorded in no kept trial")
 
     rows = _rows_in_order(np.flatnonzero(kept), table)
     units = _units_in_order(np.flatnonzero(unit_kept), session.units, spikes)
     counts, duration = count(
-        [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], plan.bin, plan.window.length
+        [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], options.bin, options.window.length
     )
     ids, unit_ids = as_labels(table.ids()), as_labels(session.units.ids())
     return SessionCounts(
@@ -123,12 +125,12 @@ def extract(session: Session, plan: ReadingOptions) -> SessionCounts:
 
 
 def has_units(session: Session) -> bool:
-    """Tell whether a session has at least one unit with spike times."""
+    """Return whether a session has at least one unit with spike times."""
     return session.units is not None and SPIKES in session.units and len(session.units) > 0
 
 
 def no_units(session: Session) -> str:
-    """Say in one sentence why a session without units cannot be used and what it holds instead."""
+    """Return one sentence: why a session without units cannot be used, and what it holds instead."""
     series = ", ".join(f"{number} {kind}" for kind, number in session.intracellular.items())
     total = sum(session.intracellular.values())
     if total:

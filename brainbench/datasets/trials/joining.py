@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,19 +14,22 @@ from brainbench.datasets.sessions import natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts
 from brainbench.datasets.trials.covariates import COVARIATES
+from brainbench.datasets.trials.session_trials import missing_labels
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-def join(parts: list[SessionCounts], plan: ReadingOptions, *, source: str, recipe: str, notes: list[str]) -> xr.Dataset:
+def join_sessions(
+    parts: list[SessionCounts], options: ReadingOptions, *, source: str, layout: str, notes: list[str]
+) -> xr.Dataset:
     """Join the sessions' trials and units, block by block, in canonical order.
 
     Args:
         parts: what was read of each session, in any order.
-        plan: how it was read.
+        options: how the sessions were read.
         source: what the user asked for.
-        recipe: name of the recipe, with how it was chosen, or "".
+        layout: name of the layout, with how it was chosen, or "".
         notes: what was noted before the sessions were read.
 
     Raises:
@@ -35,7 +38,9 @@ def join(parts: list[SessionCounts], plan: ReadingOptions, *, source: str, recip
     import xarray as xr
 
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
-    removed = _total(part.tally.removed for part in parts)
+    removed: Counter[str] = Counter()
+    for part in parts:
+        removed.update(part.tally.removed)
     everything, parts = parts, [part for part in parts if part.labels] or parts
     notes = [*notes, *(_left_out(part) for part in everything if not part.labels)]
     trials, units = sum(len(part.labels) for part in parts), sum(len(part.unit_ids) for part in parts)
@@ -43,12 +48,12 @@ def join(parts: list[SessionCounts], plan: ReadingOptions, *, source: str, recip
         what = "trial" if not trials else "unit"
         reasons = "; ".join(f"{rule} removed {number}" for rule, number in removed.items() if number)
         raise DataError(f"No {what} remains of {source}: {reasons or 'the tables are empty'}.")
-    vocabulary = plan.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
+    vocabulary = options.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
     present = {label for part in parts for label in part.labels}
     if len(present) < 2:
         raise DataError(
             f"All {trials} trials of {source} that remain have the one condition {next(iter(present))!r} "
-            f"({plan.conditions}); comparing responses needs at least two, choose another column."
+            f"({options.conditions}); comparing responses needs at least two, choose another column."
         )
     bins = max(part.counts.shape[1] for part in parts)
     counts = np.full((trials, bins, units), np.nan, dtype=np.float32)
@@ -61,7 +66,7 @@ def join(parts: list[SessionCounts], plan: ReadingOptions, *, source: str, recip
         row, column = row + count, column + width
     edges = np.concatenate([part.edges for part in parts])
     coordinates: dict[str, Any] = {
-        "time": ("time", np.arange(bins) * (plan.bin or 0.0)),
+        "time": ("time", np.arange(bins) * (options.bin or 0.0)),
         "stimulus": ("trial", [label for part in parts for label in part.labels]),
         "subject": ("trial", [part.subject for part in parts for _ in part.labels]),
         "session": ("trial", [part.session for part in parts for _ in part.labels]),
@@ -79,19 +84,19 @@ def join(parts: list[SessionCounts], plan: ReadingOptions, *, source: str, recip
     )
     dataset.attrs = {
         "vocabulary": list(vocabulary),
-        "conditions": str(plan.conditions),
-        "recipe": recipe,
-        "window": str(plan.window),
-        "bin": plan.bin,
-        "selection": {"name": plan.selection.name, "rules": list(plan.selection.lines())},
-        "removed": removed,
-        "missing": _missing(parts, vocabulary),
+        "conditions": str(options.conditions),
+        "layout": layout,
+        "window": str(options.window),
+        "bin": options.bin,
+        "selection": {"name": options.selection.name, "rules": list(options.selection.lines())},
+        "removed": dict(removed),
         "sessions": [_about(part) for part in everything],
         "notes": [*notes, *(note for part in everything for note in part.tally.notes)],
         "source": source,
         "synthetic": any(part.synthetic for part in everything),
         "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
     }
+    dataset.attrs["missing"] = missing_labels(dataset)
     return dataset
 
 
@@ -122,19 +127,3 @@ def _about(part: SessionCounts) -> dict[str, Any]:
         "removed": dict(part.tally.removed),
         "synthetic": part.synthetic,
     }
-
-
-def _missing(parts: list[SessionCounts], vocabulary: tuple[str, ...]) -> dict[str, list[str]]:
-    have: dict[str, set[str]] = {}
-    for part in parts:
-        have.setdefault(part.subject, set()).update(part.labels)
-    gaps = {subject: [label for label in vocabulary if label not in labels] for subject, labels in have.items()}
-    return {subject: labels for subject, labels in gaps.items() if labels}
-
-
-def _total(tallies: Iterable[dict[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for tally in tallies:
-        for rule, number in tally.items():
-            total[rule] = total.get(rule, 0) + number
-    return total

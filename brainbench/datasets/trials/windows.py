@@ -133,11 +133,6 @@ WHOLE = Window("start", stop="stop")
 """The whole interval of each row."""
 
 
-def resolve_window(window: Window | str) -> Window:
-    """Return a window from itself or from text."""
-    return Window.parse(window) if isinstance(window, str) else window
-
-
 def _event(table: SessionTable, anchor: str) -> NDArray[np.float64]:
     return table.times(_ANCHORS.get(anchor, anchor))
 

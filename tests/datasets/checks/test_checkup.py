@@ -9,9 +9,8 @@ from brainbench.core.errors import DataFileNotFoundError, UsageError
 from brainbench.datasets import Session, check, make_session, write_recordings
 from brainbench.datasets.checks.spikes import coincidences
 from brainbench.datasets.exports import subset
-from brainbench.datasets.reading import each_session
+from brainbench.datasets.reading import each_session, open_file
 from brainbench.datasets.sessions import SPIKES, SessionTable, ragged
-from brainbench.datasets.sources import open_file
 from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, make_sessions, write_files
 from tests.datasets.layouts.test_rodgers import detection, write_rodgers
 from tests.datasets.test_nwb import HUMAN, write_nwb
@@ -314,7 +313,7 @@ def test_labels_that_differ_in_case_or_are_missing_are_named(tmp_path):
     assert "did you mean 'stimulus'" in text
 
 
-def test_labels_are_held_against_the_vocabulary_of_the_recipe(tmp_path):
+def test_labels_are_held_against_the_vocabulary_of_the_layout(tmp_path):
     places = np.resize(np.array(["far", "medium", "close"]), 14)
     places[2] = "Close"
     _, text = found(write_rodgers(tmp_path / "a.h5", servo_position=places), "labels")

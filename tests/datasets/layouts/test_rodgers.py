@@ -8,9 +8,9 @@ import xarray as xr
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import (
     export,
-    get_recipe,
+    get_layout,
     inspect,
-    list_recipes,
+    list_layouts,
     make_session,
     open_recordings,
     write_recordings,
@@ -49,8 +49,8 @@ def one(index, value, other):
     return [value if row == index else other for row in range(ROWS)]
 
 
-def test_the_recipe_prints_every_rule():
-    text = get_recipe("rodgers").describe()
+def test_the_layout_prints_every_rule():
+    text = get_layout("rodgers").describe()
     for expected in (
         "conditions: trials:stimulus,servo_position",
         f"vocabulary: {', '.join(LABELS)}",
@@ -66,19 +66,19 @@ def test_the_recipe_prints_every_rule():
         "doi:10.1038/s41597-022-01728-1",
     ):
         assert expected in text
-    assert "rodgers" in list_recipes()
+    assert "rodgers" in list_layouts()
 
 
 def test_the_layout_is_detected_and_said(tmp_path):
     path = write_rodgers(tmp_path / "a.h5")
     dataset = open_recordings(path)
-    assert dataset.attrs["recipe"] == "rodgers (detected from the layout)"
+    assert dataset.attrs["layout"] == "rodgers (detected from its columns)"
     assert dataset.attrs["vocabulary"] == list(LABELS)
     assert dataset.attrs["conditions"] == "trials:stimulus,servo_position"
     np.testing.assert_allclose(dataset["window_start"].values, 10.0 * np.arange(ROWS) + 2)
     np.testing.assert_allclose(dataset["duration"].values, 1.0)
     assert np.all(dataset["counts"].values == 10)
-    assert open_recordings(f"rodgers:{path}").attrs["recipe"] == "rodgers"
+    assert open_recordings(f"rodgers:{path}").attrs["layout"] == "rodgers"
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_a_session_without_contact_tables_is_read_before_the_choice(tmp_path):
     assert f"window choice-1..+1 for its {ROWS} trials" in "".join(dataset.attrs["notes"])
 
 
-def test_arguments_replace_their_part_of_the_recipe_only(tmp_path):
+def test_arguments_replace_their_part_of_the_layout_only(tmp_path):
     path = write_rodgers(tmp_path / "a.h5", outcome=one(0, "spoil", "error"))
     shapes = open_recordings(path, conditions="trials:stimulus")
     assert shapes.attrs["vocabulary"] == ["convex", "concave"]
@@ -134,7 +134,7 @@ def test_arguments_replace_their_part_of_the_recipe_only(tmp_path):
     assert outcomes.attrs["vocabulary"] == ["error", "spoil"]
 
 
-def test_a_recipe_that_does_not_fit_names_what_is_missing(tmp_path):
+def test_a_layout_that_does_not_fit_names_what_is_missing(tmp_path):
     session = make_session("m", "1", [np.arange(5.0)], {"trials": {"start_time": [0.0, 1.0], "stim": ["a", "b"]}})
     with pytest.raises(UsageError, match="Unknown column 'stimulus'; did you mean 'stim'"):
         open_recordings(f"rodgers:{write_recordings(tmp_path / 'a.h5', session)}")
@@ -148,9 +148,9 @@ def test_files_of_different_layouts_are_not_mixed_silently(tmp_path):
         open_recordings(tmp_path)
 
 
-def test_inspection_proposes_the_conditions_of_the_recipe_first(tmp_path):
+def test_inspection_proposes_the_conditions_of_the_layout_first(tmp_path):
     report = inspect(write_rodgers(tmp_path / "a.h5"))
-    assert report.recipe == "rodgers"
+    assert report.layout == "rodgers"
     assert report.proposals[0].conditions == "trials:stimulus,servo_position"
     assert report.proposals[0].labels == LABELS
 

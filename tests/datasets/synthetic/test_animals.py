@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import blocks, open_recordings
+from brainbench.datasets import open_recordings, trials_by_subject
 from brainbench.datasets.synthetic.animals import (
     FAULTS,
     Design,
@@ -31,7 +31,7 @@ def make_geometry(seed=0, stimuli=6, features=4):
 
 
 def measured(animals, stimuli=6):
-    means = [np.concatenate([stimulus_means(block, stimuli) for block in item.blocks], axis=1) for item in animals]
+    means = [np.concatenate([stimulus_means(block, stimuli) for block in item.sessions], axis=1) for item in animals]
     return np.stack([rdm(item) for item in means])
 
 
@@ -104,14 +104,14 @@ def test_wrong_requests_say_what_is_allowed(make, error, message):
 def test_poisson_counts_have_a_variance_equal_to_the_mean():
     design = Design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0)
     (animal,) = simulate(make_geometry(), design)
-    counts = animal.blocks[0].responses[:, 0]
+    counts = animal.sessions[0].responses[:, 0]
     assert counts.mean() == pytest.approx(6.0, rel=0.01)
     assert counts.var(axis=0).mean() == pytest.approx(6.0, rel=0.02)
 
 
 def test_dispersion_is_that_of_the_negative_binomial():
     design = Design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0, dispersion=0.25)
-    counts = simulate(make_geometry(), design)[0].blocks[0].responses[:, 0]
+    counts = simulate(make_geometry(), design)[0].sessions[0].responses[:, 0]
     assert counts.mean() == pytest.approx(6.0, rel=0.01)
     assert counts.var(axis=0).mean() == pytest.approx(6.0 + 0.25 * 36.0, rel=0.03)
 
@@ -120,7 +120,7 @@ def test_a_shared_gain_correlates_units_and_nothing_else_does():
     design = Design(animals=1, units=60, trials=500, spread=0.0, modulation=0.0, rate=10.0)
 
     def correlation(**change):
-        counts = simulate(make_geometry(), replace(design, **change))[0].blocks[0].responses[:, 0]
+        counts = simulate(make_geometry(), replace(design, **change))[0].sessions[0].responses[:, 0]
         return np.corrcoef(counts.T)[np.triu_indices(60, 1)].mean()
 
     assert abs(correlation()) < 0.005
@@ -131,11 +131,11 @@ def test_a_shared_gain_correlates_units_and_nothing_else_does():
 def test_session_effects_change_rates_as_stated():
     design = Design(animals=1, units=300, trials=100, rate=10.0, drift=0.5)
     (animal,) = simulate(make_geometry(), design)
-    rates = animal.blocks[0].responses.mean(axis=(1, 2))
+    rates = animal.sessions[0].responses.mean(axis=(1, 2))
     slope = np.polyfit(np.linspace(-0.5, 0.5, len(rates)), rates / rates.mean(), 1)[0]
     assert slope == pytest.approx(0.5, abs=0.02)
     gains = [
-        np.log(item.blocks[0].responses.mean())
+        np.log(item.sessions[0].responses.mean())
         for item in simulate(make_geometry(), Design(animals=150, trials=2, session_gain=0.4, spread=0.0))
     ]
     assert np.std(gains) == pytest.approx(0.4, rel=0.15)
@@ -144,7 +144,7 @@ def test_session_effects_change_rates_as_stated():
 def test_trials_can_be_unbalanced_and_stimuli_missing():
     design = replace(SMALL, imbalance=0.6, trials=12, missing=((1, 2), (1, 4)))
     animals = simulate(make_geometry(), design)
-    number = np.array([[np.bincount(block.labels, minlength=6) for block in item.blocks] for item in animals])
+    number = np.array([[np.bincount(block.labels, minlength=6) for block in item.sessions] for item in animals])
     assert (number[1][:, [2, 4]] == 0).all()
     assert (np.delete(number.reshape(6, 6), [2, 3], axis=0) > 0).all()
     assert number[0].std() > 2
@@ -156,9 +156,9 @@ def test_trials_can_be_unbalanced_and_stimuli_missing():
 def test_animals_do_not_depend_on_how_many_there_are():
     few, many = (simulate(make_geometry(), replace(SMALL, animals=number), seed=4) for number in (2, 5))
     for one, two in zip(few, many, strict=False):
-        np.testing.assert_array_equal(one.blocks[1].responses, two.blocks[1].responses)
+        np.testing.assert_array_equal(one.sessions[1].responses, two.sessions[1].responses)
     other = simulate(make_geometry(), SMALL, seed=5)
-    assert not np.array_equal(few[0].blocks[0].responses, other[0].blocks[0].responses)
+    assert not np.array_equal(few[0].sessions[0].responses, other[0].sessions[0].responses)
 
 
 # Truth
@@ -186,7 +186,7 @@ def test_individual_geometry_bounds_what_animals_share():
     assert 0.4 < half < 0.9
     # One geometry for the animal, not one per session.
     (two,) = simulate(geometry, Design(animals=1, sessions=2, units=5000, trials=1, individual=1.0))
-    assert pearson(*measured([replace(two, blocks=two.blocks[:1]), replace(two, blocks=two.blocks[1:])])) > 0.5
+    assert pearson(*measured([replace(two, sessions=two.sessions[:1]), replace(two, sessions=two.sessions[1:])])) > 0.5
     assert abs(none) < 0.2
 
 
@@ -248,7 +248,7 @@ def test_the_released_faults_cost_agreement_between_animals():
 
 
 def test_zero_fill_answers_every_stimulus_on_every_trial():
-    plain, filled = (simulate(make_geometry(), SMALL, faults=faults)[0].blocks[0] for faults in ((), ("zero-fill",)))
+    plain, filled = (simulate(make_geometry(), SMALL, faults=faults)[0].sessions[0] for faults in ((), ("zero-fill",)))
     assert len(filled.labels) == 6 * len(plain.labels)
     assert filled.responses.sum() == plain.responses.sum()
     # Balanced trials of one session: all means shrink alike, six-fold.
@@ -260,7 +260,7 @@ def test_first_appearance_renumbers_each_session_by_itself():
     (plain,), (numbered,) = (
         simulate(make_geometry(), replace(SMALL, animals=1), faults=faults) for faults in ((), ("first-appearance",))
     )
-    for one, two in zip(plain.blocks, numbered.blocks, strict=True):
+    for one, two in zip(plain.sessions, numbered.sessions, strict=True):
         assert list(dict.fromkeys(two.labels.tolist())) == list(range(6))
         order = np.array(list(dict.fromkeys(one.labels.tolist())))
         np.testing.assert_array_equal(order[two.labels], one.labels)
@@ -271,9 +271,9 @@ def test_first_appearance_renumbers_each_session_by_itself():
 
 def test_a_data_set_holds_the_counts_of_the_arrays():
     geometry = make_geometry()
-    found = blocks(as_recordings(geometry, SMALL, seed=3))
+    found = trials_by_subject(as_recordings(geometry, SMALL, seed=3))
     for animal in simulate(geometry, SMALL, seed=3):
-        for one, two in zip(animal.blocks, found[animal.subject], strict=True):
+        for one, two in zip(animal.sessions, found[animal.subject], strict=True):
             np.testing.assert_array_equal(one.responses, two.responses)
             np.testing.assert_array_equal(one.labels, two.labels)
             assert one.keys == two.keys
@@ -317,7 +317,7 @@ def test_no_unit_fires_within_its_refractory_time():
 
 def test_trial_blocks_take_simulated_sessions_as_they_are():
     animal = simulate(make_geometry(), Design(animals=1))[0]
-    trials = [Trials(block.responses[:, 0], block.labels, block.keys) for block in animal.blocks]
+    trials = [Trials(block.responses[:, 0], block.labels, block.keys) for block in animal.sessions]
     found = subject_rdm(animal.subject, trials, 6, splits=50)
     np.testing.assert_allclose(found.rdm, measured([animal])[0])
     assert found.reliability > 0.8

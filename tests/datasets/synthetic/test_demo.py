@@ -10,7 +10,7 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import file_hash
-from brainbench.datasets import blocks, inspect, open_recordings
+from brainbench.datasets import inspect, open_recordings, trials_by_subject
 from brainbench.datasets.synthetic import demo
 from tests.factories.recordings import LABELS, make_stimuli
 
@@ -55,12 +55,12 @@ def half_rdms(sessions, seed):
 
 
 def test_four_animals_in_the_rodgers_layout_labelled_synthetic(folder, dataset):
-    assert dataset.attrs["recipe"] == "rodgers (detected from the layout)"
+    assert dataset.attrs["layout"] == "rodgers (detected from its columns)"
     assert dataset.attrs["vocabulary"] == list(LABELS)
     assert dataset.attrs["missing"] == {}
     assert dataset.attrs["synthetic"] is True
     assert all(session["synthetic"] for session in dataset.attrs["sessions"])
-    found = blocks(dataset)
+    found = trials_by_subject(dataset)
     assert list(found) == ["demo01", "demo02", "demo03", "demo04"]
     for sessions in found.values():
         assert 150 <= sum(len(block.labels) for block in sessions) <= 250
@@ -101,7 +101,7 @@ def test_firing_peaks_about_15_ms_after_the_first_contact(folder):
 
 def test_counts_are_over_dispersed(dataset):
     factors = []
-    for sessions in blocks(dataset).values():
+    for sessions in trials_by_subject(dataset).values():
         for trials in sessions:
             for index in range(6):
                 counts = trials.responses[trials.labels == index, 0] * 0.8
@@ -113,7 +113,7 @@ def test_counts_are_over_dispersed(dataset):
 def test_measured_geometry_tends_to_the_stored_truth(folder, dataset):
     truth = demo.read_truth(folder)
     assert truth["labels"] == list(LABELS)
-    measured = {name: mean_rdm(sessions) for name, sessions in blocks(dataset).items()}
+    measured = {name: mean_rdm(sessions) for name, sessions in trials_by_subject(dataset).items()}
     own = {name: correlation(rdm, truth["subjects"][name]) for name, rdm in measured.items()}
     assert min(own[name] for name in ("demo01", "demo02")) > 0.85
     assert correlation(np.mean(list(measured.values()), axis=0), truth["shared"]) > 0.8
@@ -121,7 +121,7 @@ def test_measured_geometry_tends_to_the_stored_truth(folder, dataset):
 
 def test_animals_are_reliable_except_the_one_made_hard_to_read(dataset):
     reliability = {}
-    for name, sessions in blocks(dataset).items():
+    for name, sessions in trials_by_subject(dataset).items():
         r = np.mean([correlation(*half_rdms(sessions, seed)) for seed in range(20)])
         reliability[name] = 2 * r / (1 + r)
     assert reliability["demo01"] > 0.6
@@ -153,7 +153,7 @@ def test_it_is_quick_and_small(tmp_path):
 
 def test_inspection_says_that_it_is_synthetic(folder):
     report = inspect(folder)
-    assert report.recipe == "rodgers"
+    assert report.layout == "rodgers"
     assert "SYNTHETIC" in str(report)
     assert report.proposals[0].labels == LABELS
 

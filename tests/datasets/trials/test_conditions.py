@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets.trials.conditions import Conditions, join, natural_vocabulary
+from brainbench.datasets.trials.conditions import Conditions, joined_labels, natural_vocabulary
 
 
 def test_conditions_are_a_table_and_columns():
@@ -19,7 +19,7 @@ def test_unreadable_conditions_show_the_form(source):
 
 
 def test_a_missing_value_leaves_no_label():
-    assert join(np.array([["a", "1"], ["b", ""]])) == ["a-1", ""]
+    assert joined_labels(np.array([["a", "1"], ["b", ""]])) == ["a-1", ""]
 
 
 def test_vocabulary_sorts_column_by_column_and_numbers_as_numbers():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brainbench.datasets import blocks, export, make_session, open_recordings, write_recordings
+from brainbench.datasets import export, make_session, open_recordings, trials_by_subject, write_recordings
 
 
 def _make_file(path, choices):
@@ -32,7 +32,7 @@ def test_contacts_licks_and_choices_are_counted_inside_the_window(tmp_path):
     assert dataset["contacts"].values.tolist() == [2, 2, 0, 0, 0, 0, 0, 0]
     assert dataset["licks"].values.tolist() == [1, 0, 0, 0, 0, 0, 0, 2]
     np.testing.assert_array_equal(dataset["choice"].values, [0, 1, np.nan, 0, 1, 0, 1, 0])
-    (block,) = blocks(dataset)["m"]
+    (block,) = trials_by_subject(dataset)["m"]
     assert {name: len(values) for name, values in block.covariates.items()} == dict.fromkeys(
         ("contacts", "licks", "choice"), len(block.labels)
     )

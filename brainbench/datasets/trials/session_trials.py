@@ -1,0 +1,119 @@
+"""Trials by animal and session: what counts as one brain, and the trials that the metrics take.
+
+Units differ between sessions, so every session stands for itself.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.contracts import check_recordings
+from brainbench.core.errors import unknown_name
+from brainbench.core.files import content_hash
+from brainbench.core.trials import Trials
+from brainbench.datasets.trials.covariates import COVARIATES
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+POOLS = ("subject", "session", "all")
+ALL = "all"
+"""Name of the one subject that pooling all animals makes."""
+
+
+def pooled(dataset: xr.Dataset, by: str = "subject") -> xr.Dataset:
+    """Return recordings whose subjects are animals, single sessions, or one pool of everything.
+
+    Only names change, no count does, so whatever takes recordings (``trials_by_subject``, ``score``) then gives one
+    RDM per pool: ``"subject"`` leaves the animals as they are, ``"session"`` makes every session its own
+    subject ``ANIMAL/SESSION``, ``"all"`` puts all sessions of all animals into the subject ``all``.
+
+    Raises:
+        UsageError: ``by`` is none of these.
+        DataError: ``dataset`` is not a recordings data set.
+    """
+    check_recordings(dataset)
+    if by not in POOLS:
+        raise unknown_name("pool", by, POOLS)
+    if by == "subject":
+        return dataset
+    changed = {}
+    for prefix in ("", "unit_"):
+        subject, session = dataset[f"{prefix}subject"], dataset[f"{prefix}session"]
+        pairs = zip(subject.values.astype(str).tolist(), session.values.astype(str).tolist(), strict=True)
+        both = np.array([f"{animal}/{name}" for animal, name in pairs], dtype=str)
+        if by == "session":
+            changed[f"{prefix}subject"] = (subject.dims, both)
+        else:
+            # Two animals may both have a session "1"; inside the pool they must stay apart.
+            changed[f"{prefix}subject"] = (subject.dims, np.full(subject.shape, ALL))
+            changed[f"{prefix}session"] = (session.dims, both)
+    result = dataset.assign_coords(changed)
+    result.attrs = {
+        **dataset.attrs,
+        "pool": by,
+        "missing": missing_labels(result),
+        "content_hash": content_hash(dataset.attrs["content_hash"], by),
+    }
+    return result
+
+
+def missing_labels(dataset: xr.Dataset) -> dict[str, list[str]]:
+    """Return the labels of the vocabulary without a trial, by subject; subjects that lack none do not appear."""
+    subjects, stimuli = (dataset[name].values.astype(str) for name in ("subject", "stimulus"))
+    gaps = {}
+    for subject in dict.fromkeys(subjects.tolist()):
+        have = set(stimuli[subjects == subject].tolist())
+        gaps[subject] = [label for label in dataset.attrs["vocabulary"] if label not in have]
+    return {subject: labels for subject, labels in gaps.items() if labels}
+
+
+def trials_by_subject(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
+    """Return firing rates [R, T, U] in Hz of every session by subject, both in the order of the data set.
+
+    Covariates are those of :mod:`brainbench.datasets.trials.covariates` that the data set holds. Trials and units
+    without any recorded value are left out, and so are sessions and subjects without a trial left.
+
+    Raises:
+        DataError: ``dataset`` is not a recordings data set.
+    """
+    check_recordings(dataset)
+    counts, duration = dataset["counts"].values, dataset["duration"].values
+    position = {label: index for index, label in enumerate(dataset.attrs["vocabulary"])}
+    labels = np.array([position[label] for label in dataset["stimulus"].values.astype(str).tolist()], dtype=np.int64)
+    ids, subjects, sessions, unit_subjects, unit_sessions = (
+        dataset[name].values.astype(str) for name in ("trial_id", "subject", "session", "unit_subject", "unit_session")
+    )
+    known = [name for name in COVARIATES if name in dataset.coords]
+    found: dict[str, list[Trials]] = {}
+    for subject, session in dict.fromkeys(zip(subjects.tolist(), sessions.tolist(), strict=True)):
+        rows = np.flatnonzero((subjects == subject) & (sessions == session))
+        columns = np.flatnonzero((unit_subjects == subject) & (unit_sessions == session))
+        own = counts[np.ix_(rows, np.arange(counts.shape[1]), columns)]
+        recorded = np.isfinite(own)
+        keep, units = recorded.any(axis=(1, 2)), recorded.any(axis=(0, 1))
+        if not keep.any():
+            continue
+        rows = rows[keep]
+        seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
+        found.setdefault(subject, []).append(
+            Trials(
+                responses=own[keep][:, :, units] / seconds[:, :, None],
+                labels=labels[rows],
+                keys=_unique([f"{subject}/{session}/{ids[row]}" for row in rows]),
+                covariates={name: dataset[name].values[rows].astype(np.float64) for name in known},
+            )
+        )
+    return {subject: tuple(items) for subject, items in found.items()}
+
+
+def _unique(keys: list[str]) -> tuple[str, ...]:
+    """Number repeated keys, in the canonical (time) order of the trials."""
+    seen: dict[str, int] = {}
+    result = []
+    for key in keys:
+        seen[key] = seen.get(key, 0) + 1
+        result.append(key if seen[key] == 1 else f"{key}#{seen[key]}")
+    return tuple(result)

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+import xarray as xr
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import open_recordings, pooled, trials_by_subject, write_recordings
+from tests.factories.recordings import make_simple_session
+
+
+def make_dataset(folder, **options):
+    sessions = [
+        make_simple_session(subject="m1", session="1", seed=1, observed=options.get("observed")),
+        make_simple_session(subject="m1", session="2", units=5, seed=2),
+        make_simple_session(subject="m2", session="1", units=2, seed=3),
+    ]
+    path = write_recordings(folder / "a.h5", sessions)
+    return open_recordings(path, conditions="trials:stimulus", bin=options.get("bin"))
+
+
+def test_each_session_is_one_block_of_rates(tmp_path):
+    dataset = make_dataset(tmp_path, bin=0.4)
+    found = trials_by_subject(dataset)
+    assert [(name, [block.responses.shape for block in items]) for name, items in found.items()] == [
+        ("m1", [(12, 3, 3), (12, 3, 5)]),
+        ("m2", [(12, 3, 2)]),
+    ]
+    block = found["m1"][1]
+    counts, duration = dataset["counts"].values[12:24, :, 3:8], dataset["duration"].values[12:24]
+    np.testing.assert_allclose(block.responses, counts / duration[..., None])
+    labels = [dataset.attrs["vocabulary"][index] for index in block.labels]
+    assert labels == dataset["stimulus"].values[12:24].tolist()
+
+
+def test_a_session_holds_one_response_label_and_key_per_trial(tmp_path):
+    trials = trials_by_subject(make_dataset(tmp_path))["m2"][0]
+    assert len(trials.responses) == len(trials.labels) == len(set(trials.keys)) == 12
+    assert trials.keys[0] == "m2/1/5"
+
+
+def test_trials_are_taken_with_all_that_belongs_to_them(tmp_path):
+    trials = trials_by_subject(make_dataset(tmp_path))["m2"][0]
+    some = trials.take(trials.labels > 0)
+    assert some.keys == tuple(key for key, label in zip(trials.keys, trials.labels, strict=True) if label)
+    np.testing.assert_array_equal(some.responses, trials.responses[trials.labels > 0])
+    np.testing.assert_array_equal(trials.take([3, 1]).labels, trials.labels[[3, 1]])
+
+
+def test_units_lost_in_some_trials_stay_missing_there(tmp_path):
+    observed = [[[0, 100]], [[0, 10.5]], [[0, 100]]]
+    responses = trials_by_subject(make_dataset(tmp_path, observed=observed))["m1"][0].responses[:, 0]
+    assert np.isnan(responses[:, 1]).sum() == 7
+    assert np.isfinite(responses[:, [0, 2]]).all()
+
+
+def test_other_data_sets_are_refused():
+    with pytest.raises(DataError, match="needs the variable 'counts'"):
+        trials_by_subject(xr.Dataset())
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Two animals; both have a session "1", the second also one without the stimulus "c"."""
+    sessions = [
+        make_simple_session(subject="m1"),
+        make_simple_session(subject="m2", seed=1),
+        make_simple_session(
+            subject="m2", session="2", seed=2, columns={"stimulus": np.resize(np.array(["a", "b"]), 12)}
+        ),
+    ]
+    return open_recordings(write_recordings(tmp_path / "a.h5", sessions), conditions="trials:stimulus")
+
+
+def test_an_animal_is_the_pool_unless_asked_otherwise(dataset):
+    xr.testing.assert_identical(pooled(dataset), dataset)
+    assert {name: len(items) for name, items in trials_by_subject(dataset).items()} == {"m1": 1, "m2": 2}
+
+
+def test_every_session_can_be_its_own_subject(dataset):
+    result = pooled(dataset, "session")
+    found = trials_by_subject(result)
+    assert list(found) == ["m1/1", "m2/1", "m2/2"]
+    assert result.attrs["missing"] == {"m2/2": ["c"]}
+    assert dataset.attrs["missing"] == {}
+    np.testing.assert_array_equal(found["m2/2"][0].responses, trials_by_subject(dataset)["m2"][1].responses)
+
+
+def test_all_animals_can_be_one_subject_with_their_sessions_apart(dataset):
+    ((name, sessions),) = trials_by_subject(pooled(dataset, "all")).items()
+    assert name == "all"
+    assert [block.responses.shape for block in sessions] == [(12, 1, 3)] * 3
+    assert len({key for block in sessions for key in block.keys}) == 36
+
+
+def test_pools_of_the_same_recordings_are_told_apart(dataset):
+    hashes = {pooled(dataset, by).attrs["content_hash"] for by in ("subject", "session", "all")}
+    assert len(hashes) == 3
+
+
+def test_an_unknown_pool_suggests_the_nearest(dataset):
+    with pytest.raises(UsageError, match="Unknown pool 'sesion'; did you mean 'session'"):
+        pooled(dataset, "sesion")
