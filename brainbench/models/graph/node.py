@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from brainbench.models.cells import CELLS, Cell, TimeDecay
 from brainbench.models.graph.spec import Convolution, Memory, Node, Pool, Shape
+from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear, activation
 
 
@@ -34,7 +35,7 @@ class NodeModule(nn.Module):
         """Join the resized inputs on channels and operate on them; return what the memory sees [B, ...]."""
         inputs = self.resized(inputs)
         if isinstance(self.operation, Conv2d) and not (self.training and self.dropout.p):
-            return self.before(self.operation.join(inputs))
+            return self.before(dispatch.conv_concat(self.operation, inputs))
         x = self.dropout(inputs[0] if len(inputs) == 1 else torch.cat(inputs, 1))
         return self.before(self.operation(x.flatten(1) if isinstance(self.operation, Linear) else x))
 

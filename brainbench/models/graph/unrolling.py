@@ -16,7 +16,7 @@ from brainbench.models.cells import GatedCell, IntersectionRNN
 from brainbench.models.graph.spec import GraphSpec, Unroll
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.convolution import DeferredWeightGrad
-from brainbench.models.ops.gates import DeferredNormGrad, recorded
+from brainbench.models.ops.gates import DeferredNormGrad
 from brainbench.models.ops.layers import Conv2d
 
 if TYPE_CHECKING:
@@ -76,19 +76,19 @@ class Sweep:
     def run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
         """Compute every group of nodes in turn; drop what no later one reads."""
         if torch.is_grad_enabled() and dispatch.usable(self.x):
-            with recorded(self._tapes()):
+            with dispatch.deferring(self._deferred()):
                 return self._run(wanted)
         return self._run(wanted)
 
-    def _tapes(self) -> Iterator[tuple[nn.Module, Any]]:
-        """Yield what convolutions and gates write down for their gradients."""
+    def _deferred(self) -> Iterator[tuple[nn.Module, Any]]:
+        """Yield convolutions and cells, each with the place where it leaves what its gradients need."""
         for name, node in self.graph.named_nodes():
             first, stop = self.steps[name]
             operation, memory = node.operation, node.memory
             if stop == first:
                 continue
             stimuli = self.batch * (stop - first)
-            if isinstance(operation, Conv2d) and operation.fits(self.x):
+            if isinstance(operation, Conv2d) and dispatch.knows(operation, self.x):
                 yield operation, DeferredWeightGrad(operation, node.grid, stimuli)
             if isinstance(memory, GatedCell):
                 grid = self.graph.memory_grid(name)

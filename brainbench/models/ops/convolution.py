@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch.autograd.function import once_differentiable
-from torch.nn import functional
 
 if TYPE_CHECKING:
     from brainbench.models.ops.layers import Conv2d
@@ -38,14 +37,10 @@ class ConvolutionShape:
     @classmethod
     def of(cls, conv: Conv2d, grid: Sequence[int]) -> ConvolutionShape:
         """Return that of a convolution on a grid (H, W)."""
-        left, right, top, bottom = conv.around
-        rows, columns = conv.kernel_size
-        return cls(
-            (rows, columns),
-            (top, left),
-            (int(grid[0]), int(grid[1])),
-            (int(grid[0]) + top + bottom - rows + 1, int(grid[1]) + left + right - columns + 1),
-        )
+        left, _, top, _ = conv.around
+        rows, columns = (int(length) for length in grid)
+        kernel = (int(conv.kernel_size[0]), int(conv.kernel_size[1]))
+        return cls(kernel, (top, left), (rows, columns), conv.output_grid(rows, columns))
 
     def reversed(self) -> ConvolutionShape:
         """Return that of the convolution which takes gradients back."""
@@ -57,14 +52,14 @@ def unfolded(
     inputs: Sequence[torch.Tensor], geometry: ConvolutionShape, out: torch.Tensor | None = None
 ) -> torch.Tensor:
     """Return the windows [R, taps · ΣC] of inputs [B, C, H, W] in half precision, in ``out`` if given."""
-    from brainbench.models.ops.kernels.intersection import by_places
+    from brainbench.models.ops.kernels.intersection import channels_innermost
     from brainbench.models.ops.kernels.unfold import unfold_into
 
     rows = len(inputs[0]) * math.prod(geometry.out)
     if out is None:
         width = math.prod(geometry.kernel) * sum(x.shape[1] for x in inputs)
         out = torch.empty(rows, width, dtype=HALF, device=inputs[0].device)
-    unfold_into(out, [by_places(x) for x in inputs], geometry.out, geometry.kernel, geometry.pads)
+    unfold_into(out, [channels_innermost(x) for x in inputs], geometry.out, geometry.kernel, geometry.pads)
     return out
 
 
@@ -113,13 +108,13 @@ class DeferredWeightGrad:
         self.written: set[tuple[int, int]] = set()
         self.span = (0, 0)
         """Rows of the last result."""
-        self.matrix: torch.Tensor = _Collected.apply(self, conv.weight, conv.bias)  # type: ignore[assignment]
+        self.matrix: torch.Tensor = _WeightMatrix.apply(self, conv.weight, conv.bias)  # type: ignore[assignment]
         flipped = conv.weight.detach().to(HALF).flip(2, 3).permute(2, 3, 0, 1)
         self.back = flipped.reshape(-1, conv.weight.shape[1])
 
     def convolve(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
         """Return the convolution [B, O, H', W'] of inputs side by side on channels, and remember what it read."""
-        return _Convolved.apply(self, self.matrix, *inputs)  # type: ignore[return-value]
+        return _Convolution.apply(self, self.matrix, *inputs)  # type: ignore[return-value]
 
     def reserve(self, stimuli: int) -> torch.Tensor | None:
         """Return where the windows of the next step are to be kept; None if nothing is learned from them."""
@@ -159,12 +154,14 @@ class DeferredWeightGrad:
         return gradients.t() @ columns, bias
 
 
-class _Collected(torch.autograd.Function):
+class _WeightMatrix(torch.autograd.Function):
     """The weights as a matrix. Its backward pass comes after that of all steps, and multiplies what they left."""
 
     @staticmethod
-    def forward(ctx: Any, tape: DeferredWeightGrad, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
-        ctx.tape, ctx.shape = tape, weight.shape
+    def forward(
+        ctx: Any, deferred: DeferredWeightGrad, weight: torch.Tensor, bias: torch.Tensor | None
+    ) -> torch.Tensor:
+        ctx.deferred, ctx.shape = deferred, weight.shape
         ctx.set_materialize_grads(False)
         return matrix_of(weight)
 
@@ -172,41 +169,31 @@ class _Collected(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *unused: Any) -> Any:
         outputs, channels, rows, columns = ctx.shape
-        weight, bias = ctx.tape.collect()
+        weight, bias = ctx.deferred.collect()
         if weight is not None:
             weight = weight.view(outputs, rows, columns, channels).permute(0, 3, 1, 2).float()
         return None, weight, bias
 
 
-class _Convolved(torch.autograd.Function):
+class _Convolution(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, tape: DeferredWeightGrad, matrix: torch.Tensor, *inputs: torch.Tensor) -> torch.Tensor:
-        columns = unfolded(inputs, tape.geometry, tape.reserve(len(inputs[0])))
-        ctx.tape, ctx.span = tape, tape.span
+    def forward(ctx: Any, deferred: DeferredWeightGrad, matrix: torch.Tensor, *inputs: torch.Tensor) -> torch.Tensor:
+        columns = unfolded(inputs, deferred.geometry, deferred.reserve(len(inputs[0])))
+        ctx.deferred, ctx.span = deferred, deferred.span
         ctx.inputs = [(x.shape[1], x.dtype) for x in inputs]
-        return _maps(_product(columns, matrix, tape.bias), tape.geometry)
+        return _maps(_product(columns, matrix, deferred.bias), deferred.geometry)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *given: Any) -> Any:
-        tape: DeferredWeightGrad = ctx.tape
-        place = tape.gradient(ctx.span)
-        gradient = given[0] if place is None else _maps(place, tape.geometry)
+        deferred: DeferredWeightGrad = ctx.deferred
+        place = deferred.gradient(ctx.span)
+        gradient = given[0] if place is None else _maps(place, deferred.geometry)
         if gradient.data_ptr() != given[0].data_ptr():
             gradient.copy_(given[0])
         if not any(ctx.needs_input_grad[2:]):
             return None, None, *(None for _ in ctx.inputs)
-        back = tape.geometry.reversed()
-        taken = _maps(unfolded([gradient], back) @ tape.back, back)
+        back = deferred.geometry.reversed()
+        taken = _maps(unfolded([gradient], back) @ deferred.back, back)
         parts = taken.split([channels for channels, _ in ctx.inputs], 1)
         return None, None, *(part.to(kind) for part, (_, kind) in zip(parts, ctx.inputs, strict=True))
-
-
-def unfolded_plainly(inputs: Sequence[torch.Tensor], geometry: ConvolutionShape) -> torch.Tensor:
-    """Return what :func:`unfolded` returns, by PyTorch's own operations: to compare with."""
-    x = torch.cat([item.float() for item in inputs], 1)
-    (top, left), (rows, columns) = geometry.pads, geometry.kernel
-    down = geometry.out[0] + rows - 1 - top - x.shape[2]
-    right = geometry.out[1] + columns - 1 - left - x.shape[3]
-    windows = functional.unfold(functional.pad(x, (left, right, top, down)), geometry.kernel)  # [B, C · taps, places]
-    return windows.unflatten(1, (x.shape[1], -1)).permute(0, 3, 2, 1).flatten(2).flatten(0, 1).to(HALF)

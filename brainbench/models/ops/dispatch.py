@@ -1,19 +1,34 @@
-"""Kernels of our own for recurrent convolutions in half precision on CUDA, where Triton is installed.
+"""The choice of how convolutions and gates are computed.
 
-Convolutions of small grids become matrix products of rows (one row per place of the grid, channels innermost), all that
-a gated cell does after its convolution is one kernel, and gradients of weights wait for the last step of a sweep, to be
-one product over all of them. Everywhere else, PyTorch's own operations compute the same.
+========================  ==================================================  ==========================================
+computed by               where                                               in
+========================  ==================================================  ==========================================
+deferred gradients        a pass with gradients that :func:`deferring` wraps  :mod:`.convolution`, :mod:`.gates`
+fused kernels             bfloat16 on CUDA with Triton, no gradients          :mod:`.convolution`, :mod:`.gates`
+packed weights            one stimulus on the CPU, after :mod:`.packing`      :class:`.layers.PackedMatrix`
+PyTorch                   everything else                                     :class:`.layers.Conv2d`
+========================  ==================================================  ==========================================
+
+The first two turn convolutions of small grids into matrix products of rows (one row per place of the grid, channels
+innermost) and all that a gated cell does after its convolution into one kernel. Results are equal to rounding.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
 
 import torch
+
+from brainbench.models.ops import convolution, gates
+from brainbench.models.ops.layers import Conv2d
+
+if TYPE_CHECKING:
+    from brainbench.models.cells import IntersectionRNN
 
 _wanted: ContextVar[bool] = ContextVar("brainbench_kernels", default=True)
 
@@ -24,6 +39,53 @@ def usable(x: torch.Tensor) -> bool:
         return False
     half = torch.get_autocast_dtype("cuda") if torch.is_autocast_enabled("cuda") else x.dtype
     return half == torch.bfloat16 and _installed()
+
+
+def knows(conv: Conv2d, x: torch.Tensor) -> bool:
+    """Return whether the kernels can compute this convolution of ``x``."""
+    return tuple(conv.stride) == (1, 1) and usable(x)
+
+
+def kernel_applies(conv: Conv2d, *inputs: torch.Tensor) -> bool:
+    """Return whether kernels compute :func:`conv_concat` here: in a deferring pass, or where there is no gradient."""
+    if conv.deferred is not None:
+        return True
+    learns = torch.is_grad_enabled() and any(item.requires_grad for item in (conv.weight, *inputs))
+    return not learns and knows(conv, inputs[0])
+
+
+def conv_concat(conv: Conv2d, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Convolve inputs [B, C, H, W] as if their channels lay side by side, in the first one's precision."""
+    if conv.deferred is not None:
+        return conv.deferred.convolve(inputs)
+    if kernel_applies(conv, *inputs):
+        return convolution.convolve(conv, inputs)
+    first = inputs[0]
+    # In mixed precision a memory is single and the convolution half: what it reads is rounded here, once.
+    return conv(first if len(inputs) == 1 else torch.cat([first, *(x.to(first.dtype) for x in inputs[1:])], 1))
+
+
+def apply_gates(
+    cell: IntersectionRNN, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor, *, projected: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return (y, state), both [B, C, H, W], from the gates' pre-activations; ``projected`` ones have no kernel."""
+    if cell.deferred is not None or (not projected and kernel_applies(cell.conv, x)):
+        return gates.apply_gates(cell, fused, x, state)
+    return cell.apply_gates(fused, x, state)
+
+
+@contextmanager
+def deferring(given: Iterable[tuple[Any, Any]]) -> Iterator[None]:
+    """Give modules a place for deferred gradients each (convolution or cell, its place), and take it away again."""
+    changed = []
+    try:
+        for module, place in given:
+            module.deferred = place
+            changed.append(module)
+        yield
+    finally:
+        for module in changed:
+            module.deferred = None
 
 
 @contextmanager

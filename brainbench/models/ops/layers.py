@@ -9,7 +9,7 @@ draw than normal ones, which is felt at 38 M parameters.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -17,7 +17,6 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.models.ops import dispatch
 
 if TYPE_CHECKING:
     from brainbench.models.ops.convolution import DeferredWeightGrad
@@ -89,7 +88,7 @@ def initialise(
             layer.bias.fill_(bias)
 
 
-class Packed:
+class PackedMatrix:
     """A matrix [out, in] laid out for products with few rows on the CPU, in single or half precision."""
 
     def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None, dtype: torch.dtype) -> None:
@@ -133,8 +132,8 @@ class Conv2d(nn.Conv2d):
     ) -> None:
         self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
         self._extra: tuple[int, int, int, int] | None = None
-        self._packed: Packed | None = None
-        self.tape: DeferredWeightGrad | None = None
+        self._packed: PackedMatrix | None = None
+        self.deferred: DeferredWeightGrad | None = None
         """Where the steps of a pass leave what the gradient of the weights needs; None outside of such a pass."""
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":
@@ -154,28 +153,10 @@ class Conv2d(nn.Conv2d):
             return self._convolve_packed(input, self._packed)
         return self._convolve(input, self.weight, self.bias)
 
-    def join(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Convolve inputs [B, C, H, W] as if their channels lay side by side, in the first one's precision."""
-        if self.tape is not None:
-            return self.tape.convolve(inputs)
-        if self.joins(*inputs):
-            from brainbench.models.ops.convolution import convolve
-
-            return convolve(self, inputs)
-        first = inputs[0]
-        # In mixed precision a memory is single and the convolution half: what it reads is rounded here, once.
-        return self(first if len(inputs) == 1 else torch.cat([first, *(x.to(first.dtype) for x in inputs[1:])], 1))
-
-    def joins(self, *inputs: torch.Tensor) -> bool:
-        """Return whether kernels of our own compute :meth:`join` here: on a tape, or where there is no gradient."""
-        if self.tape is not None:
-            return True
-        learns = torch.is_grad_enabled() and any(item.requires_grad for item in (self.weight, *inputs))
-        return not learns and self.fits(inputs[0])
-
-    def fits(self, x: torch.Tensor) -> bool:
-        """Return whether kernels of our own know this layer and apply to ``x``."""
-        return _two(self.stride) == (1, 1) and dispatch.usable(x)
+    def conv_slice(self, input: torch.Tensor, start: int, *, use_bias: bool) -> torch.Tensor:
+        """Convolve some of the input channels, those from ``start`` on; the sum over all slices is the whole."""
+        weight = self.weight[:, start : start + input.shape[1]]
+        return self._convolve(input, weight, self.bias if use_bias else None)
 
     @property
     def around(self) -> tuple[int, int, int, int]:
@@ -183,28 +164,28 @@ class Conv2d(nn.Conv2d):
         top, left = _two(self.padding)
         return self._extra or (left, left, top, top)
 
+    def output_grid(self, rows: int, columns: int) -> tuple[int, int]:
+        """Return (H', W') for an input of (H, W)."""
+        left, right, top, bottom = self.around
+        (down, aside), (height, width) = _two(self.stride), self.kernel_size
+        return (rows + top + bottom - height) // down + 1, (columns + left + right - width) // aside + 1
+
     def pack(self, dtype: torch.dtype) -> None:
         """Keep a copy of the weights in the order in which one stimulus is multiplied with them fastest, on the CPU."""
         rows = self.weight.detach().permute(0, 2, 3, 1).flatten(1)
-        self._packed = Packed(rows, self.bias, dtype)
+        self._packed = PackedMatrix(rows, self.bias, dtype)
 
-    def _convolve_packed(self, input: torch.Tensor, packed: Packed) -> torch.Tensor:
-        (top, left), (rows, columns), (down, right) = _two(self.padding), self.kernel_size, _two(self.stride)
-        padded = functional.pad(input, self._extra or (left, left, top, top))[0].permute(1, 2, 0).contiguous()
-        height, width, channels = padded.shape
-        size = ((height - rows) // down + 1, (width - columns) // right + 1)
+    def _convolve_packed(self, input: torch.Tensor, packed: PackedMatrix) -> torch.Tensor:
+        padded = functional.pad(input, self.around)[0].permute(1, 2, 0).contiguous()
+        size = self.output_grid(*input.shape[2:])
+        (rows, columns), (down, aside), (_, width, channels) = self.kernel_size, _two(self.stride), padded.shape
         # Channels innermost, the columns of a window lie side by side.
         windows = padded.as_strided(
             (*size, rows, columns * channels),
-            (down * width * channels, right * channels, width * channels, 1),
+            (down * width * channels, aside * channels, width * channels, 1),
         )
         y = packed(windows.reshape(size[0] * size[1], -1))
         return y.T.reshape(1, -1, *size)
-
-    def share(self, input: torch.Tensor, start: int, *, use_bias: bool) -> torch.Tensor:
-        """Convolve some of the input channels, those from ``start`` on; the shares of all add up to the whole."""
-        weight = self.weight[:, start : start + input.shape[1]]
-        return self._convolve(input, weight, self.bias if use_bias else None)
 
     def _convolve(self, input: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
         padded = input if self._extra is None else functional.pad(input, self._extra)
@@ -214,16 +195,10 @@ class Conv2d(nn.Conv2d):
         if len(input) > 1 or input.is_cuda or torch.is_grad_enabled():
             return self._conv_forward(padded, weight, bias)
         # The convolutions of CPUs rearrange their weights at every call, which for one stimulus takes longest.
-        size = [
-            (length + 2 * around - kernel) // stride + 1
-            for length, around, kernel, stride in zip(
-                padded.shape[2:], _two(self.padding), self.kernel_size, self.stride, strict=True
-            )
-        ]
         columns = functional.unfold(padded, self.kernel_size, padding=_two(self.padding), stride=_two(self.stride))
         y = weight.flatten(1) @ columns[0]
         y = y if bias is None else y + bias[:, None]
-        return y.view(1, -1, *size)
+        return y.view(1, -1, *self.output_grid(*input.shape[2:]))
 
 
 def _two(value: Any) -> tuple[int, int]:
@@ -244,7 +219,7 @@ class Linear(nn.Linear):
         method: Mapping[str, Any] | None = None,
     ) -> None:
         self._initial: dict[str, Any] = {"gain": gain, "bias": bias, "method": method}
-        self._packed: Packed | None = None
+        self._packed: PackedMatrix | None = None
         super().__init__(in_features, out_features, bias=use_bias)
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
@@ -255,7 +230,7 @@ class Linear(nn.Linear):
 
     def pack(self, dtype: torch.dtype) -> None:
         """Keep a copy of the weights in the order in which few inputs are multiplied with them fastest, on the CPU."""
-        self._packed = Packed(self.weight.detach(), self.bias, dtype)
+        self._packed = PackedMatrix(self.weight.detach(), self.bias, dtype)
 
     def reset_parameters(self) -> None:
         """Draw new weights from the global random state."""

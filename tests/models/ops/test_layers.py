@@ -66,5 +66,5 @@ def test_one_stimulus_gives_what_many_give(padding, stride):
     options = {} if padding == "same" and stride != (1, 1) else {"stride": stride}
     layer, x = Conv2d(400, 200, kernel_size=(2, 2), padding=padding, **options), torch.randn(3, 400, 4, 6)
     torch.testing.assert_close(layer(x[:1]), layer(x)[:1], atol=1e-4, rtol=1e-4)
-    whole = layer.share(x[:1, :150], 0, use_bias=True) + layer.share(x[:1, 150:], 150, use_bias=False)
+    whole = layer.conv_slice(x[:1, :150], 0, use_bias=True) + layer.conv_slice(x[:1, 150:], 150, use_bias=False)
     torch.testing.assert_close(whole, layer(x)[:1], atol=1e-4, rtol=1e-4)

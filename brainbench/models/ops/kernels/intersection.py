@@ -50,7 +50,7 @@ def _at(pointer, rows, c, batch_stride, PLACES: tl.constexpr, PLACE_STRIDE: tl.c
 
 
 @triton.jit
-def settle_kernel(
+def gates_kernel(
     fused,
     x,
     state,
@@ -109,7 +109,7 @@ def _add(at, gradient, c, C: tl.constexpr):
 
 
 @triton.jit
-def settle_backward_kernel(
+def gates_backward_kernel(
     fused,
     x,
     state,
@@ -195,7 +195,7 @@ def settle_backward_kernel(
         _add(at + 7 * C, shift3, c, C)
 
 
-def settle(
+def apply_gates(
     fused: torch.Tensor,
     x: torch.Tensor,
     state: torch.Tensor,
@@ -211,12 +211,12 @@ def settle(
         norms: [8, C], contiguous: scales of the four gates, then shifts; None without layer norms.
         state_type: Precision of the new state.
     """
-    x, state = by_places(x), by_places(state)
+    x, state = channels_innermost(x), channels_innermost(state)
     batch, channels, height, width = x.shape
     y = torch.empty(batch, height, width, channels, dtype=x.dtype, device=x.device).permute(0, 3, 1, 2)
     after = torch.empty(batch, height, width, channels, dtype=state_type, device=x.device).permute(0, 3, 1, 2)
     tall, wide = _tile(channels, 2048)
-    settle_kernel[(triton.cdiv(len(fused), tall),)](
+    gates_kernel[(triton.cdiv(len(fused), tall),)](
         fused,
         x,
         state,
@@ -239,7 +239,7 @@ def settle(
     return y, after
 
 
-def settle_backward(
+def apply_gates_backward(
     fused: torch.Tensor,
     x: torch.Tensor,
     state: torch.Tensor,
@@ -251,15 +251,15 @@ def settle_backward(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Fill ``d_fused`` [R, 4 C], add to ``sums`` [PROGRAMS, 8, C]; return the gradients of (x, state) [B, C, H, W].
 
-    The other arguments are those of :func:`settle`, and the gradients of its two results.
+    The other arguments are those of :func:`apply_gates`, and the gradients of its two results.
     """
-    x, state = by_places(x), by_places(state)
+    x, state = channels_innermost(x), channels_innermost(state)
     batch, channels, height, width = x.shape
     d_x = torch.empty(batch, height, width, channels, dtype=x.dtype, device=x.device).permute(0, 3, 1, 2)
     d_state = torch.empty(batch, height, width, channels, dtype=state.dtype, device=x.device).permute(0, 3, 1, 2)
-    d_y, d_after = by_places(d_y), by_places(d_after)
+    d_y, d_after = channels_innermost(d_y), channels_innermost(d_after)
     tall, wide = _tile(channels, 2048)
-    settle_backward_kernel[(min(PROGRAMS, triton.cdiv(len(fused), tall)),)](
+    gates_backward_kernel[(min(PROGRAMS, triton.cdiv(len(fused), tall)),)](
         fused,
         x,
         state,
@@ -290,7 +290,7 @@ def settle_backward(
     return d_x, d_state
 
 
-def by_places(x: torch.Tensor) -> torch.Tensor:
+def channels_innermost(x: torch.Tensor) -> torch.Tensor:
     """Return [B, C, H, W] with channels innermost and places one after the other, copied only if it is not so."""
     _, _, rows, columns = x.shape
     if x.stride(1) == 1 and (rows == 1 or x.stride(2) == columns * x.stride(3)):
