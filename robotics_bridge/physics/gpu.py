@@ -9,7 +9,6 @@ import numpy as np
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
-from robotics_bridge.physics.kernels.state import mujoco_kernels
 from robotics_bridge.physics.model_fields import check_fields, differing_fields
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
@@ -189,18 +188,22 @@ class MujocoWarpEngine:
         self._fill()
 
     def _fill_links(self) -> None:
-        wp, d, state, kernels = warp(), self._d, self.state, mujoco_kernels()
+        from robotics_bridge.physics.kernels.state import fill_links
+
+        wp, d, state = warp(), self._d, self.state
         poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
-        wp.launch(kernels.links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
+        wp.launch(fill_links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
 
     def _fill(self) -> None:
-        wp, d, state, kernels = warp(), self._d, self.state, mujoco_kernels()
+        from robotics_bridge.physics.kernels.state import fill_contacts
+
+        wp, d, state = warp(), self._d, self.state
         self._fill_links()
         pyramidal = int(self.model.opt.cone == 0)
         c = d.contact
         inputs = [d.nacon, c.worldid, c.frame, c.dim, c.efc_address, d.efc.force, pyramidal]
         inputs += [state.contact_normal, state.contact_force]
-        wp.launch(kernels.contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
+        wp.launch(fill_contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
 
 
 def _mujoco_warp() -> Any:

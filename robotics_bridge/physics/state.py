@@ -168,11 +168,10 @@ class HandState:
 
     def check(self) -> None:
         """Refresh :attr:`status`: which environments diverged, and whether contacts were lost."""
-        from robotics_bridge.physics.kernels.state import state_kernels
+        from robotics_bridge.physics.kernels.state import check_state
 
-        kernels = state_kernels()
         inputs = [self.pose, self.velocity, self.contact_count, self.contact_env.shape[0], self.status]
-        warp().launch(kernels.check, dim=self.num_envs, inputs=inputs, device=self.device)
+        warp().launch(check_state, dim=self.num_envs, inputs=inputs, device=self.device)
 
     def aliasing(self, buffers: Mapping[str, Any]) -> HandState:
         """Return a state that uses an engine's own arrays for some of the buffers."""

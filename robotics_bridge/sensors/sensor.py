@@ -15,7 +15,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, history_kernel, io_structs
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise, stream_seed
 from robotics_bridge.sensors.noise.stages import DelayLine, NoisePart, NoiseStage
 from robotics_bridge.sensors.probes.placement import Probes
@@ -205,17 +205,17 @@ class ReadoutRuntime(Runtime):
         self._stage = NoiseStage(parts, channels, context.num_envs, context) if staged else None
         late = any(noise.delays for noise in noises)
         self._delay = DelayLine(parts, channels, context.num_envs, context) if late else None
-        io = io_structs().Io()
+        io = ReadoutArrays()
         io.truth, io.measured = self._truth, self._measured
         io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
         io.age, io.episode = context.clock.age, context.clock.episode
         io.env_offset = context.clock.env_offset
         self.io = io
         self._channels = channels
-        from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+        from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
 
         params = [part.noise.params(stream_seed(context.seed, part.name)) for part in parts]
-        self.knobs = wp.array(params, dtype=noise_functions().NoiseParams, device=device)
+        self.knobs = wp.array(params, dtype=NoiseParams, device=device)
 
     def measured(self) -> Any:
         """Return the planar Warp array of measured readings."""
@@ -330,7 +330,7 @@ class ProbeRuntime(ReadoutRuntime):
             slots.append(np.full(len(sensor.probes), self._slot(sensor, members, reach)))
         self.kinds = context.solids.kinds_of(sorted(tracked))
         values = [sensor.probes for sensor in sensors.values()]
-        p = io_structs().ProbeSet()
+        p = ProbeArrays()
         p.position = wp.array(
             np.concatenate([v.position for v in values]).astype(np.float32), dtype=wp.vec3f, device=device
         )
@@ -417,4 +417,4 @@ class History:
         """Append the reading of this update; ``counter`` [1] counts updates on the device."""
         dim = (self._context.num_envs, self.place.count)
         inputs = [value, self.place.start, counter, self._context.clock.age, self.ring]
-        warp().launch(history_kernel(), dim=dim, inputs=inputs, device=self._context.device)
+        warp().launch(append_history, dim=dim, inputs=inputs, device=self._context.device)

@@ -12,7 +12,7 @@ from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.state import DIVERGED, HandState
 from robotics_bridge.sensors.probes.sensors import DistanceRuntime
-from robotics_bridge.sensors.queries.kernels.pairs import begin_kernel
+from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_clock
 from robotics_bridge.sensors.queries.pairs import PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.sensor import Clock, Context, History, ReadoutSlice, Runtime, Sensor
@@ -203,7 +203,7 @@ class SensorSuite:
                     raise UsageError(f"Environments are 0 to {self.num_envs - 1}; received {numbers.tolist()}.")
                 chosen[numbers] = True
         inputs = [wp.from_torch(chosen), self.clock.age, self.clock.episode]
-        wp.launch(begin_kernel().reset, dim=self.num_envs, inputs=inputs, device=self.device)
+        wp.launch(reset_clock, dim=self.num_envs, inputs=inputs, device=self.device)
 
     @property
     def diverged(self) -> torch.Tensor:
@@ -235,7 +235,7 @@ class SensorSuite:
         for name, history in self._histories.items():
             history.launch(self._owner[name].measured(), self._counter)
         if self._histories:
-            wp.launch(begin_kernel().begin, dim=1, inputs=[self._counter], device=self.device)
+            wp.launch(count_update, dim=1, inputs=[self._counter], device=self.device)
 
     def _check(self, state: HandState) -> None:
         wanted = (self.num_envs, len(self.scene.links))

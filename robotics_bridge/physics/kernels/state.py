@@ -1,108 +1,112 @@
-"""Warp kernels that fill and check a hand state on its own device."""
+"""Kernels that fill and check a hand state on its own device.
 
-from functools import cache
-from types import SimpleNamespace
+Letters: B environment, L link, C contact. World axes, metres, seconds, newtons; Warp's quaternions are (x, y, z, w).
+"""
 
+from brainbench.core.devices import warp
 
-@cache
-def state_kernels() -> SimpleNamespace:
-    """Return the kernel ``check`` and its functions ``status_of`` and ``link_fails``: where numbers are not finite."""
-    import warp as wp
-
-    @wp.func
-    def link_fails(
-        pose: wp.array2d(dtype=wp.transformf), velocity: wp.array2d(dtype=wp.spatial_vectorf), env: int, link: int
-    ) -> bool:
-        at = pose[env, link]
-        speed = velocity[env, link]
-        total = float(0.0)
-        # Adding zeros keeps a NaN and turns an infinity into one.
-        for k in range(7):
-            total += at[k] * 0.0
-        for k in range(6):
-            total += speed[k] * 0.0
-        return wp.isnan(total)
-
-    @wp.func
-    def status_of(
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
-        env: int,
-        contacts: int,
-        room: int,
-    ) -> int:
-        bits = int(0)
-        for link in range(pose.shape[1]):
-            if link_fails(pose, velocity, env, link):
-                bits = 1
-        if contacts > room:
-            bits = bits + 2
-        return bits
-
-    @wp.kernel(module="unique")
-    def check(
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
-        count: wp.array(dtype=wp.int32),
-        room: int,
-        status: wp.array(dtype=wp.int32),
-    ):
-        env = wp.tid()
-        status[env] = status_of(pose, velocity, env, count[0], room)
-
-    return SimpleNamespace(check=check, status_of=status_of, link_fails=link_fails)
+wp = warp()
 
 
-@cache
-def mujoco_kernels() -> SimpleNamespace:
-    """Return the kernels ``links`` and ``contacts`` that read the arrays of MuJoCo Warp."""
-    import warp as wp
+@wp.func
+def link_fails(
+    pose: wp.array2d(dtype=wp.transformf), velocity: wp.array2d(dtype=wp.spatial_vectorf), env: int, link: int
+) -> bool:
+    """Return whether a pose or a velocity holds a number that is not finite."""
+    at = pose[env, link]
+    speed = velocity[env, link]
+    total = float(0.0)
+    # Adding zeros keeps a NaN and turns an infinity into one.
+    for k in range(7):
+        total += at[k] * 0.0
+    for k in range(6):
+        total += speed[k] * 0.0
+    return wp.isnan(total)
 
-    @wp.kernel(module="unique")
-    def links(
-        xpos: wp.array2d(dtype=wp.vec3f),
-        xquat: wp.array2d(dtype=wp.quatf),
-        cvel: wp.array2d(dtype=wp.spatial_vectorf),
-        subtree_com: wp.array2d(dtype=wp.vec3f),
-        root: wp.array(dtype=wp.int32),
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
-    ):
-        env, link = wp.tid()
-        p = xpos[env, link]
-        # MuJoCo stores (w, x, y, z) in Warp's quaternions.
-        q = xquat[env, link]
-        pose[env, link] = wp.transformf(p, wp.quatf(q[1], q[2], q[3], q[0]))
-        twist = cvel[env, link]
-        omega = wp.vec3f(twist[0], twist[1], twist[2])
-        linear = wp.vec3f(twist[3], twist[4], twist[5]) + wp.cross(omega, p - subtree_com[env, root[link]])
-        velocity[env, link] = wp.spatial_vectorf(linear[0], linear[1], linear[2], omega[0], omega[1], omega[2])
 
-    @wp.kernel(module="unique")
-    def contacts(
-        count: wp.array(dtype=wp.int32),
-        env: wp.array(dtype=wp.int32),
-        frame: wp.array(dtype=wp.mat33f),
-        dim: wp.array(dtype=wp.int32),
-        address: wp.array2d(dtype=wp.int32),
-        efc_force: wp.array2d(dtype=wp.float32),
-        pyramidal: int,
-        normal: wp.array(dtype=wp.vec3f),
-        force: wp.array(dtype=wp.float32),
-    ):
-        c = wp.tid()
-        if c >= count[0]:
-            return
-        rows = frame[c]
-        normal[c] = wp.vec3f(rows[0, 0], rows[0, 1], rows[0, 2])
-        total = float(0.0)
-        edges = int(1)
-        if pyramidal == 1 and dim[c] > 1:
-            edges = 2 * (dim[c] - 1)
-        for edge in range(edges):
-            row = address[c, edge]
-            if row >= 0:
-                total += efc_force[env[c], row]
-        force[c] = total
+@wp.func
+def status_of(
+    pose: wp.array2d(dtype=wp.transformf),
+    velocity: wp.array2d(dtype=wp.spatial_vectorf),
+    env: int,
+    contacts: int,
+    room: int,
+) -> int:
+    """Return the status bits of an environment: 1 diverged, 2 more contacts than room."""
+    bits = int(0)
+    for link in range(pose.shape[1]):
+        if link_fails(pose, velocity, env, link):
+            bits = 1
+    if contacts > room:
+        bits = bits + 2
+    return bits
 
-    return SimpleNamespace(links=links, contacts=contacts)
+
+@wp.kernel
+def check_state(
+    pose: wp.array2d(dtype=wp.transformf),
+    velocity: wp.array2d(dtype=wp.spatial_vectorf),
+    count: wp.array(dtype=wp.int32),
+    room: int,
+    status: wp.array(dtype=wp.int32),
+):
+    """Refresh the status. Thread: environment [B]."""
+    env = wp.tid()
+    status[env] = status_of(pose, velocity, env, count[0], room)
+
+
+@wp.kernel
+def fill_links(
+    xpos: wp.array2d(dtype=wp.vec3f),
+    xquat: wp.array2d(dtype=wp.quatf),
+    cvel: wp.array2d(dtype=wp.spatial_vectorf),
+    subtree_com: wp.array2d(dtype=wp.vec3f),
+    root: wp.array(dtype=wp.int32),
+    pose: wp.array2d(dtype=wp.transformf),
+    velocity: wp.array2d(dtype=wp.spatial_vectorf),
+):
+    """Turn MuJoCo's poses and spatial velocities into those of link origins. Thread: environment and link [B, L].
+
+    MuJoCo's ``cvel`` is (ω, v) at the centre of mass of the kinematic tree: v_origin = v + ω × (origin − com).
+    """
+    env, link = wp.tid()
+    p = xpos[env, link]
+    # MuJoCo stores (w, x, y, z) in Warp's quaternions.
+    q = xquat[env, link]
+    pose[env, link] = wp.transformf(p, wp.quatf(q[1], q[2], q[3], q[0]))
+    twist = cvel[env, link]
+    omega = wp.vec3f(twist[0], twist[1], twist[2])
+    linear = wp.vec3f(twist[3], twist[4], twist[5]) + wp.cross(omega, p - subtree_com[env, root[link]])
+    velocity[env, link] = wp.spatial_vectorf(linear[0], linear[1], linear[2], omega[0], omega[1], omega[2])
+
+
+@wp.kernel
+def fill_contacts(
+    count: wp.array(dtype=wp.int32),
+    env: wp.array(dtype=wp.int32),
+    frame: wp.array(dtype=wp.mat33f),
+    dim: wp.array(dtype=wp.int32),
+    address: wp.array2d(dtype=wp.int32),
+    efc_force: wp.array2d(dtype=wp.float32),
+    pyramidal: int,
+    normal: wp.array(dtype=wp.vec3f),
+    force: wp.array(dtype=wp.float32),
+):
+    """Read normal and normal force (N) of every contact. Thread: contact [C].
+
+    With a pyramidal cone the normal force is the sum of the forces along its edges.
+    """
+    c = wp.tid()
+    if c >= count[0]:
+        return
+    rows = frame[c]
+    normal[c] = wp.vec3f(rows[0, 0], rows[0, 1], rows[0, 2])
+    total = float(0.0)
+    edges = int(1)
+    if pyramidal == 1 and dim[c] > 1:
+        edges = 2 * (dim[c] - 1)
+    for edge in range(edges):
+        row = address[c, edge]
+        if row >= 0:
+            total += efc_force[env[c], row]
+    force[c] = total

@@ -100,9 +100,9 @@ class Listener:
         Raises:
             UsageError: the time step changed.
         """
-        from robotics_bridge.sensors.audio.kernels.sound import microphone_kernels
+        from robotics_bridge.sensors.audio.kernels import sound as k
 
-        wp, suite, m, k = warp(), self._suite, self.microphone, microphone_kernels()
+        wp, suite, m = warp(), self._suite, self.microphone
         rate, envs = self.samples / dt, suite.num_envs
         blocks = math.ceil((m.reach / m.speed_of_sound * rate + 3) / self.samples) + 1
         if self._ring is None:
@@ -117,11 +117,11 @@ class Listener:
         for index, (name, runtime) in enumerate(self._sources.items()):
             place = runtime.places[name]
             sound = runtime.truth()
-            run(k.hear, (self.samples, envs), sound, place.start, place.count, self._slot, index, self._ring)
+            run(k.record_source, (self.samples, envs), sound, place.start, place.count, self._slot, index, self._ring)
         age, place = suite.clock.age, wp.vec3f(*m.position)
-        run(k.distances, self._now.shape, state.pose, self._links, self._link, place, age, self._now, self._before)
+        run(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, self._now, self._before)
         run(
-            k.mix, (self.samples, envs), self._ring, self._slot, self.samples, rate, m.speed_of_sound, m.nearest,
+            k.mix_sources, (self.samples, envs), self._ring, self._slot, self.samples, rate, m.speed_of_sound, m.nearest,
             m.power, age, self._now, self._before, self._out,
         )  # fmt: skip
         self._slot = (self._slot + self.samples) % self._ring.shape[0]

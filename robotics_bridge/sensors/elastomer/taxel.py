@@ -12,11 +12,11 @@ import numpy as np
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
-from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, drag_kernel
+from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, sum_shear
 from robotics_bridge.sensors.noise.model import TAXEL_KNOBS
 from robotics_bridge.sensors.queries.surface_points import sample_cloud
 from robotics_bridge.sensors.sensor import ProbeRuntime, QueryRequirements, QuerySensor
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import TouchScene
@@ -172,7 +172,7 @@ class ElastomerRuntime(ProbeRuntime):
         self._followed = first.points > 0 and bool(tracked)
         self._tracked = wp.array(np.array(tracked or [0], np.int32), dtype=wp.int32, device=device)
         cloud = sample_cloud(scene, tracked, first.points, context.solids.rows, device) if self._followed else None
-        self._points = cloud.struct if cloud else cloud_structs().Cloud()
+        self._points = cloud.struct if cloud else CloudArrays()
         self._total = cloud.total if cloud else 0
         own = [sensor.own(scene) if self._followed else () for sensor in self._sensors]
         self._own_kinds = context.solids.kinds_of(sorted({g for members in own for g in members}))
@@ -252,7 +252,7 @@ class ElastomerRuntime(ProbeRuntime):
         if self._apart:
             inputs = [self.probes, self.io, self._gels, self._blocks, self._tracked, pairs, self._points, *shear]
             inputs += [self._along, self._across, self._drag]
-            wp.launch(drag_kernel(), dim=c.num_envs, inputs=inputs, device=c.device)
+            wp.launch(sum_shear, dim=c.num_envs, inputs=inputs, device=c.device)
         way = ("direct", "separable", "fft").index(self._way)
         kernel = kernels.marker_kernel(
             way, self._layered, self._planes, self.mode, *self.stores, self._in_turn, self._apart
@@ -268,13 +268,13 @@ class ElastomerRuntime(ProbeRuntime):
         warp().launch(kernel, dim=dim, inputs=inputs, device=self.context.device)
 
     def _describe(self, own: list[tuple[int, ...]]) -> Any:
-        from robotics_bridge.sensors.elastomer.kernels.dilation import elastomer_structs
+        from robotics_bridge.sensors.elastomer.kernels.dilation import GelParams
 
-        wp, kind = warp(), elastomer_structs().Gel
+        wp = warp()
         slots = self.probes.slot.numpy()
         gels, owned = [], 0
         for index, (sensor, place) in enumerate(zip(self._sensors, self.places.values(), strict=True)):
-            gel, probes, layer = kind(), sensor.probes, sensor.layer or Layer()
+            gel, probes, layer = GelParams(), sensor.probes, sensor.layer or Layer()
             rows, columns = _sides(place)
             widening = layer.expansion if isinstance(layer.expansion, tuple) else (layer.expansion,) * 2
             along, across, normal = _axes(sensor)
@@ -312,7 +312,7 @@ class ElastomerRuntime(ProbeRuntime):
                 setattr(gel, name, wp.vec3f(*value.tolist()))
             gel.center = wp.vec3f(*probes.position[probes.active].mean(axis=0).tolist())
             gels.append(gel)
-        return wp.array(gels, dtype=kind, device=self.context.device)
+        return wp.array(gels, dtype=GelParams, device=self.context.device)
 
     def _weigh(self) -> tuple[Any, Any]:
         """One-dimensional weights [S, 2, K] along columns and rows, and how far [S, 2] they count."""

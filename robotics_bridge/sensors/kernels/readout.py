@@ -5,49 +5,68 @@ Planar storage [C, B, N]: neighbouring probes are neighbours in memory. Letters:
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.noise.kernels.noise import (
+    NoiseParams,
+    apply_drawn,
+    apply_noise,
+    decay,
+    pair_normals,
+)
+
+wp = warp()
 
 CLEAN, FUSED, STAGED = range(3)
 """Modes: no noise; noise applied in the sensor's kernel; radius noise and gain there, the rest in later kernels."""
 
 
+@wp.struct
+class ProbeArrays:
+    position: wp.array(dtype=wp.vec3f)
+    normal: wp.array(dtype=wp.vec3f)
+    radius: wp.array(dtype=wp.float32)
+    slot: wp.array(dtype=wp.int32)
+    part: wp.array(dtype=wp.int32)
+    probe: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class ReadoutArrays:
+    truth: wp.array3d(dtype=wp.float32)
+    measured: wp.array3d(dtype=wp.float32)
+    hysteresis: wp.array3d(dtype=wp.float32)
+    walk: wp.array3d(dtype=wp.float32)
+    age: wp.array(dtype=wp.int32)
+    episode: wp.array(dtype=wp.int32)
+    status: wp.array(dtype=wp.int32)
+    env_offset: wp.int32
+    dt: wp.float32
+
+
+@wp.func
+def lost(io: ReadoutArrays, channels: int, env: int, n: int):
+    """Mark the reading of a probe in a diverged environment as NaN. Without noise both planes are one array."""
+    for channel in range(channels):
+        io.truth[channel, env, n] = wp.nan
+        io.measured[channel, env, n] = wp.nan
+
+
+@wp.func
+def idle(io: ReadoutArrays, channels: int, env: int, n: int):
+    """Write the reading of a filler: zero."""
+    for channel in range(channels):
+        io.truth[channel, env, n] = 0.0
+        io.measured[channel, env, n] = 0.0
+
+
 @cache
-def io_structs() -> SimpleNamespace:
-    """Return the structures ``ProbeSet`` (where the probes of a group sit) and ``Io`` (where readings go)."""
-    import warp as wp
+def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> SimpleNamespace:
+    """Return the functions that write a reading, compiled for what the group stores.
 
-    @wp.struct
-    class ProbeSet:
-        position: wp.array(dtype=wp.vec3f)
-        normal: wp.array(dtype=wp.vec3f)
-        radius: wp.array(dtype=wp.float32)
-        slot: wp.array(dtype=wp.int32)
-        part: wp.array(dtype=wp.int32)
-        probe: wp.array(dtype=wp.int32)
-
-    @wp.struct
-    class Io:
-        truth: wp.array3d(dtype=wp.float32)
-        measured: wp.array3d(dtype=wp.float32)
-        hysteresis: wp.array3d(dtype=wp.float32)
-        walk: wp.array3d(dtype=wp.float32)
-        age: wp.array(dtype=wp.int32)
-        episode: wp.array(dtype=wp.int32)
-        status: wp.array(dtype=wp.int32)
-        env_offset: wp.int32
-        dt: wp.float32
-
-    return SimpleNamespace(ProbeSet=ProbeSet, Io=Io)
-
-
-@cache
-def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> SimpleNamespace:
-    """Return the functions that write a reading.
-
-    ``emit(io, knobs, env, n, probe, channel, truth, signal)`` writes one channel, ``emit_six`` up to six, drawing all
-    that they share once (``fixed`` is what ``episode_draw`` gave, ``lag`` and ``drift`` what ``recall_six`` read,
-    before anything else so that nothing waits for it); ``measure`` returns the measured
-    value and stores its memories without writing it; ``lost(io, channels, env, n)`` marks a diverged environment.
+    ``emit`` writes one channel, ``emit_six`` up to six, drawing all that they share once: ``fixed`` is what
+    ``episode_draw`` gave, ``lag`` and ``drift`` what ``recall_six`` read (before anything else, so that nothing waits
+    for memory). ``measure`` returns the measured value of one channel and stores its memories without writing it.
 
     Args:
         mode: :data:`CLEAN`, :data:`FUSED` or :data:`STAGED`.
@@ -55,20 +74,11 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
         walk: whether the group stores a drift.
         channels: that ``emit_six`` writes, known to the compiler so that vectors stay in registers.
     """
-    import warp as wp
-
-    from robotics_bridge.sensors.noise.kernels.noise import noise_functions
-
-    io_type = io_structs().Io
-    noise = noise_functions()
-    params_type, apply_noise = noise.NoiseParams, noise.apply_noise
-    apply_drawn, decay = noise.apply_drawn, noise.decay
-    episode_draw, pair_normals = noise.episode_draw, noise.pair_normals
 
     @wp.func
     def measure(
-        io: io_type,
-        knobs: params_type,
+        io: ReadoutArrays,
+        knobs: NoiseParams,
         env: int,
         n: int,
         probe: int,
@@ -93,8 +103,8 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
 
     @wp.func
     def emit(
-        io: io_type,
-        knobs: params_type,
+        io: ReadoutArrays,
+        knobs: NoiseParams,
         env: int,
         n: int,
         probe: int,
@@ -119,7 +129,7 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
         return kept
 
     @wp.func
-    def recall_six(io: io_type, env: int, n: int, age: int):
+    def recall_six(io: ReadoutArrays, env: int, n: int, age: int):
         lag = wp.spatial_vectorf()
         drift = wp.spatial_vectorf()
         if wp.static(hysteresis):
@@ -130,8 +140,8 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
 
     @wp.func
     def emit_six(
-        io: io_type,
-        knobs: params_type,
+        io: ReadoutArrays,
+        knobs: NoiseParams,
         env: int,
         n: int,
         probe: int,
@@ -173,56 +183,28 @@ def io_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> 
                         if wp.static(walk):
                             io.walk[channel, env, n] = y[2]
 
-    @wp.func
-    def lost(io: io_type, channels: int, env: int, n: int):
-        for channel in range(channels):
-            io.truth[channel, env, n] = wp.static(float("nan"))
-            if wp.static(mode != CLEAN):
-                io.measured[channel, env, n] = wp.static(float("nan"))
-
-    @wp.func
-    def idle(io: io_type, channels: int, env: int, n: int):
-        for channel in range(channels):
-            io.truth[channel, env, n] = 0.0
-            if wp.static(mode != CLEAN):
-                io.measured[channel, env, n] = 0.0
-
-    return SimpleNamespace(
-        emit=emit,
-        emit_six=emit_six,
-        recall_six=recall_six,
-        episode_draw=episode_draw,
-        measure=measure,
-        lost=lost,
-        idle=idle,
-    )
+    return SimpleNamespace(emit=emit, emit_six=emit_six, recall_six=recall_six, measure=measure)
 
 
-@cache
-def history_kernel() -> Any:
-    """Return the kernel ``keep`` that appends readings to a ring written twice, so that any window is contiguous.
+@wp.kernel
+def append_history(
+    value: wp.array3d(dtype=wp.float32),
+    start: int,
+    count: wp.array(dtype=wp.int32),
+    age: wp.array(dtype=wp.int32),
+    ring: wp.array4d(dtype=wp.float32),
+):
+    """Append readings to a ring [2 T, C, B, N] written twice, so that any window of T is contiguous. Thread: [B, N].
 
-    Ring [2 T, C, B, N]; dim [B, N]. An environment that starts anew clears its past.
+    An environment that starts anew clears its past.
     """
-    import warp as wp
-
-    @wp.kernel(module="unique")
-    def keep(
-        value: wp.array3d(dtype=wp.float32),
-        start: int,
-        count: wp.array(dtype=wp.int32),
-        age: wp.array(dtype=wp.int32),
-        ring: wp.array4d(dtype=wp.float32),
-    ):
-        env, n = wp.tid()
-        length = ring.shape[0] // 2
-        at = count[0] % length
-        for channel in range(value.shape[0]):
-            if age[env] == 0:
-                for slot in range(2 * length):
-                    ring[slot, channel, env, n] = 0.0
-            x = value[channel, env, start + n]
-            ring[at, channel, env, n] = x
-            ring[at + length, channel, env, n] = x
-
-    return keep
+    env, n = wp.tid()
+    length = ring.shape[0] // 2
+    at = count[0] % length
+    for channel in range(value.shape[0]):
+        if age[env] == 0:
+            for slot in range(2 * length):
+                ring[slot, channel, env, n] = 0.0
+        x = value[channel, env, start + n]
+        ring[at, channel, env, n] = x
+        ring[at + length, channel, env, n] = x

@@ -146,10 +146,10 @@ class Noise:
     def params(self, seed: int) -> Any:
         """Return the Warp structure ``NoiseParams`` for a 64-bit ``seed`` (see :func:`stream_seed`)."""
         from brainbench.core.devices import warp
-        from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+        from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
 
         wp = warp()
-        params = noise_functions().NoiseParams()
+        params = NoiseParams()
         params.key_low, params.key_high = wp.uint32(seed & 0xFFFFFFFF), wp.uint32((seed >> 32) & 0xFFFFFFFF)
         params.gain_low, params.gain_high = self.gain
         params.dead_low, params.dead_high = self.dead_range

@@ -44,7 +44,7 @@ class _Parts:
 
     def __init__(self, parts: Sequence[NoisePart], channels: int, num_envs: int, context: Any) -> None:
         from brainbench.core.devices import warp
-        from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+        from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
 
         self.wp = wp = warp()
         self.noises = [part.noise for part in parts]
@@ -57,7 +57,7 @@ class _Parts:
             active[place] = 1 if part.active is None else part.active
         self.part, self.probe, self.active = (self.array(item) for item in (index, probe, active))
         structures = [part.noise.params(stream_seed(context.seed, part.name)) for part in parts]
-        self.params = wp.array(structures, dtype=noise_functions().NoiseParams, device=self.device)
+        self.params = wp.array(structures, dtype=NoiseParams, device=self.device)
 
     def array(self, values: ArrayLike) -> Any:
         """Copy a NumPy array to the device."""
@@ -131,7 +131,7 @@ class NoiseStage:
 
     def launch(self, x: Any, out: Any, dt: float) -> None:
         """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out``; ``dt`` is the time step [s]."""
-        from robotics_bridge.sensors.noise.kernels.noise import crosstalk_kernel, measure_kernel
+        from robotics_bridge.sensors.noise.kernels.noise import crosstalk, measure
 
         own, clock = self._parts, self._parts.clock
         if own.total == 0 or own.num_envs == 0:
@@ -141,11 +141,11 @@ class NoiseStage:
             for along, source, target in ((1, x, self._buffers[0]), (0, self._buffers[0], self._buffers[1])):
                 shape, strength, weights = self._crosstalk
                 inputs = [along, x, source, own.part, own.probe, shape, strength, weights, target]
-                own.run(crosstalk_kernel(), (own.channels, own.num_envs, own.total), inputs)
+                own.run(crosstalk, (own.channels, own.num_envs, own.total), inputs)
             signal = self._buffers[1]
         inputs = [own.params, own.part, own.probe, own.active, clock.age, clock.episode, int(clock.env_offset)]
-        inputs += [float(dt), signal, self._hysteresis, self._walk, out]
-        own.run(measure_kernel(self._gained), (own.num_envs, own.total), inputs)
+        inputs += [int(self._gained), float(dt), signal, self._hysteresis, self._walk, out]
+        own.run(measure, (own.num_envs, own.total), inputs)
 
 
 class DelayLine:
@@ -182,7 +182,7 @@ class DelayLine:
         Raises:
             UsageError: the time step became so short that the ring does not reach back far enough.
         """
-        from robotics_bridge.sensors.noise.kernels.noise import delay_kernel
+        from robotics_bridge.sensors.noise.kernels.noise import delay_line
 
         own, clock = self._parts, self._parts.clock
         if own.total == 0 or own.num_envs == 0:
@@ -196,7 +196,7 @@ class DelayLine:
                 f"update made room for {self._ring.shape[0]}; build the sensors anew for the shorter step."
             )
         inputs = [own.params, own.part, self._delay, self._jitter, clock.age, clock.episode, int(clock.env_offset)]
-        own.run(delay_kernel(), (own.num_envs, own.total), [*inputs, float(dt), measured, self._ring, self.out])
+        own.run(delay_line, (own.num_envs, own.total), [*inputs, float(dt), measured, self._ring, self.out])
 
 
 def gaussian_weights(sigma: float, half: int) -> NDArray[np.float64]:

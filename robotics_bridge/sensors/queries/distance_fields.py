@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,17 +76,12 @@ def mesh_tree(mesh: Mesh, device: Any, *, winding: bool = False) -> Any:
 
 
 def _sample(mesh: Mesh, origin: NDArray, spacing: float, counts: NDArray, device: Any) -> NDArray[np.float32]:
+    from robotics_bridge.sensors.queries.kernels import distance
+
     wp = warp()
     tree = mesh_tree(mesh, device, winding=True)
     values = wp.zeros(tuple(int(n) for n in counts), dtype=wp.float32, device=device)
     reach = 4 * float(spacing * counts.max())
     inputs = [tree.id, wp.vec3f(*origin.tolist()), spacing, reach, values]
-    wp.launch(_field_kernel(), dim=values.shape, inputs=inputs, device=device)
+    wp.launch(distance.sample_field, dim=values.shape, inputs=inputs, device=device)
     return values.numpy()
-
-
-@cache
-def _field_kernel() -> Any:
-    from robotics_bridge.sensors.queries.kernels.distance_field import field_kernel
-
-    return field_kernel()

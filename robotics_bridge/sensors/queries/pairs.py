@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, pair_kernel, pair_structs, start_kernel
+from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -30,9 +30,9 @@ class PairTable:
         self._solids, self._num_envs, self._device = solids, num_envs, device
         self._slots: list[dict[str, Any]] = []
         self.struct: Any = None
-        """The Warp structure ``Pairs``; None before :meth:`freeze`."""
+        """The Warp structure ``PairArrays``; None before :meth:`freeze`."""
         self.plan: Any = None
-        """The Warp structure ``Slots``; None before :meth:`freeze`."""
+        """The Warp structure ``SlotArrays``; None before :meth:`freeze`."""
         self.crowded: Any = None
         """Warp array [B]: 1 where more geometries met a sensor than its list holds."""
 
@@ -91,7 +91,7 @@ class PairTable:
         def ints(values: Any) -> Any:
             return wp.array(np.asarray(values, dtype=np.int32).reshape(-1), dtype=wp.int32, device=device)
 
-        plan = pair_structs().Slots()
+        plan = SlotArrays()
         plan.link, plan.contact = ints([s["link"] for s in slots]), ints([int(s["contact"]) for s in slots])
         # The link of every geometry whose contacts matter, to turn the others away at once.
         links = self._solids.scene.link_of if self._solids.scene.geometries else np.full(1, -1)
@@ -106,7 +106,7 @@ class PairTable:
         plan.reach = wp.array(np.array([s["reach"] for s in slots], np.float32), dtype=wp.float32, device=device)
         self.plan = plan
         shape = (self._num_envs, max(int(first[-1]), 1))
-        found = pair_structs().Pairs()
+        found = PairArrays()
         found.first = plan.first
         found.count = wp.zeros((self._num_envs, max(count, 1)), dtype=wp.int32, device=device)
         found.geometry = wp.zeros(shape, dtype=wp.int32, device=device)

@@ -11,7 +11,7 @@ from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.scene import KINDS, Geometry
 from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
-from robotics_bridge.sensors.queries.kernels.distance import OTHER, query_structs
+from robotics_bridge.sensors.queries.kernels.distance import OTHER, SolidArrays
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -119,7 +119,7 @@ class Solids:
                 self.kinds[rows, index], size[rows, index], bound[rows, index] = described[:3]
                 frame[rows, index], field[rows, index], mesh[rows, index] = described[3:]
         self.field_count, self.tree_count = len(self._fields), len(self._trees)
-        s = query_structs().Solids()
+        s = SolidArrays()
         s.kind = wp.array(self.kinds, dtype=wp.int32, device=device)
         s.size = wp.array(size, dtype=wp.vec3f, device=device)
         s.frame = wp.array(frame, dtype=wp.transformf, device=device)

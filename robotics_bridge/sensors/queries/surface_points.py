@@ -11,7 +11,7 @@ import numpy as np
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.probes.placement import cover_evenly
 from robotics_bridge.sensors.queries.solids import tessellate
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,7 +24,7 @@ class Cloud:
     """Points of one sensor's tracked geometries, on a device."""
 
     struct: Any
-    """Warp structure ``Cloud``."""
+    """Warp structure ``CloudArrays``."""
     total: int
     """Most points that any environment has."""
     counts: NDArray[np.int64]
@@ -76,7 +76,7 @@ def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows
         first.append(row_first)
         blocks.append(row_blocks)
         start += place
-    s = cloud_structs().Cloud()
+    s = CloudArrays()
     empty = np.zeros((0, 3), np.float32)
     s.point = wp.array(np.concatenate([empty, *coordinates]).astype(np.float32), dtype=wp.vec3f, device=device)
     bounds = np.concatenate([np.zeros((0, 4), np.float32), *spheres]).astype(np.float32)

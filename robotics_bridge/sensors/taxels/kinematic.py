@@ -87,21 +87,20 @@ class KinematicRuntime(ProbeRuntime):
     """
 
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: Context) -> None:
-        from robotics_bridge.sensors.probes.kernels.probe import kinematic_params
+        from robotics_bridge.sensors.probes.kernels.probe import KinematicParams
 
         first = next(iter(sensors.values()))
         scaled = first.total == "engine"
         super().__init__(sensors, 6, context, fusable=not scaled)
         self._options = (first.query == "raycast", first.convention == "physical")
-        kind = kinematic_params()
         laws = []
         for sensor in sensors.values():
-            law = kind()
+            law = KinematicParams()
             for name in ("stiffness", "damping", "exponent", "shear", "twist"):
                 setattr(law, name, getattr(sensor, name))
             laws.append(law)
         wp = warp()
-        self._laws = wp.array(laws, dtype=kind, device=context.device)
+        self._laws = wp.array(laws, dtype=KinematicParams, device=context.device)
         self._loads: Any = (
             wp.zeros((len(laws), context.num_envs), dtype=wp.vec3f, device=context.device) if scaled else None
         )
@@ -128,9 +127,9 @@ class KinematicRuntime(ProbeRuntime):
 
     def _scale(self, state: HandState) -> None:
         """Make the field push as the engine does."""
-        from robotics_bridge.sensors.taxels.kernels.contact_load import load_kernels
+        from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
 
-        wp, c, kernels = warp(), self.context, load_kernels()
+        wp, c = warp(), self.context
         dim, device = self._loads.shape, c.device
         self._loads.zero_()
         contacts = [
@@ -141,8 +140,8 @@ class KinematicRuntime(ProbeRuntime):
             state.contact_force,
         ]
         inputs = [self._spans, c.pairs.plan, c.solids.struct.link, *contacts, self._loads]
-        wp.launch(kernels.gather, dim=state.contact_env.shape[0], inputs=inputs, device=device)
+        wp.launch(gather_loads, dim=state.contact_env.shape[0], inputs=inputs, device=device)
         inputs = [self._spans, c.pairs.plan, state.pose, self._truth, self._loads, self._scales]
-        wp.launch(kernels.weigh, dim=dim, inputs=inputs, device=device)
+        wp.launch(weigh_field, dim=dim, inputs=inputs, device=device)
         inputs = [self.probes.part, self._scales, self._truth, self._measured, int(self.noisy)]
-        self.launch(kernels.scale, *inputs)
+        self.launch(scale_field, *inputs)

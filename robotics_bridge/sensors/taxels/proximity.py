@@ -73,7 +73,7 @@ class ProximityRuntime(ProbeRuntime):
     """
 
     def __init__(self, sensors: Mapping[str, ProximityTaxel], context: Context) -> None:
-        from robotics_bridge.sensors.taxels.kernels.proximity import cloud_structs
+        from robotics_bridge.sensors.taxels.kernels.proximity import ProximityParams
 
         noise = max(sensor.noise.radius for sensor in sensors.values())
         super().__init__(sensors, 6, context, reach=noise)
@@ -82,14 +82,13 @@ class ProximityRuntime(ProbeRuntime):
         self._physical = first.convention == "physical"
         tracked, rows = first.tracked(context.scene), context.solids.rows
         self.cloud = sample_cloud(context.scene, tracked, first.points, rows, device)
-        kind = cloud_structs().ProximityParams
         laws, densities = [], np.zeros((len(sensors), rows), np.float32)
         for row, sensor in zip(densities, sensors.values(), strict=True):
-            law = kind()
+            law = ProximityParams()
             law.stiffness, law.coupling = sensor.stiffness, sensor.coupling
             laws.append(law)
             row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
-        self._laws = wp.array(laws, dtype=kind, device=device)
+        self._laws = wp.array(laws, dtype=ProximityParams, device=device)
         self._densities = wp.array(densities, dtype=wp.float32, device=device)
         links = [context.scene.link_index(sensor.link) for sensor in sensors.values()]
         self._links = wp.array(np.array(links, np.int32), dtype=wp.int32, device=device)

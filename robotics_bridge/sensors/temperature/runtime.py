@@ -24,11 +24,10 @@ class TemperatureRuntime(ReadoutRuntime):
     """Serves temperature grids."""
 
     def __init__(self, sensors: Mapping[str, TemperatureGrid], context: Context) -> None:
-        from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY, thermal_kernels
+        from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY, ThermalParams
 
         super().__init__(sensors, 1, context, fusable=False)
         wp, device, scene = warp(), context.device, context.scene
-        self._kernels = thermal_kernels()
         self._sensors = list(sensors.values())
         self._edges: list[NDArray[np.float64]] = []
         structures, part, exposed, source = [], [], [], []
@@ -42,7 +41,7 @@ class TemperatureRuntime(ReadoutRuntime):
         def floats(values: ArrayLike) -> Any:
             return wp.array(np.asarray(values, np.float32), dtype=wp.float32, device=device)
 
-        self._structures = wp.array(structures, dtype=self._kernels.Thermal, device=device)
+        self._structures = wp.array(structures, dtype=ThermalParams, device=device)
         self._part = wp.array(np.concatenate(part).astype(np.int32), dtype=wp.int32, device=device)
         self._exposed, self._source = floats(np.concatenate(exposed)), floats(np.concatenate(source))
         self._link_of = wp.array(scene.link_of.astype(np.int32), dtype=wp.int32, device=device)
@@ -70,8 +69,10 @@ class TemperatureRuntime(ReadoutRuntime):
         low, high = sensor.corners(self.context.scene)
         edges = (high - low) / np.array(sensor.cells)
         self._edges.append(edges)
+        from robotics_bridge.sensors.temperature.kernels.heat import ThermalParams
+
         own, wp = material(sensor.material), warp()
-        item = self._kernels.Thermal()
+        item = ThermalParams()
         item.link, item.first = self.context.scene.link_index(sensor.link), first
         item.shape, item.low, item.cell = wp.vec3i(*sensor.cells), wp.vec3f(*low), wp.vec3f(*edges)
         item.conductivity = own.conductivity
@@ -114,7 +115,9 @@ class TemperatureRuntime(ReadoutRuntime):
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; a new time step re-computes the diffusion matrices first."""
         self._set_step(dt)
-        wp, c, k = warp(), self.context, self._kernels
+        from robotics_bridge.sensors.temperature.kernels import heat as k
+
+        wp, c = warp(), self.context
         cells = (c.num_envs, self.count)
 
         def run(kernel: Any, dim: Any, *inputs: Any) -> None:
@@ -122,26 +125,26 @@ class TemperatureRuntime(ReadoutRuntime):
 
         self.found_contacts.zero_()
         run(
-            k.collect, state.contact_env.shape[0], state.contact_count, state.contact_env, state.contact_geom,
+            k.collect_contacts, state.contact_env.shape[0], state.contact_count, state.contact_env, state.contact_geom,
             self._link_of, self._structures, self.found_contacts, self._kept,
         )  # fmt: skip
         run(
-            k.conduct, self._kept.shape, state.contact_geom, state.contact_distance, state.contact_position,
+            k.conduct_contacts, self._kept.shape, state.contact_geom, state.contact_distance, state.contact_position,
             state.contact_normal, self._link_of, self._structures, self.found_contacts, self._kept, state.status,
             state.pose, self._conductivity, self._diffusivity, self.link_temperature, self._touched, dt, self._g,
             self._inflow,
         )  # fmt: skip
         age = c.clock.age
         run(
-            k.exchange, cells, self._structures, self._part, self._exposed, self._source, age, state.status, dt,
+            k.exchange_heat, cells, self._structures, self._part, self._exposed, self._source, age, state.status, dt,
             self._g, self._inflow, self._touched, self._field, self._first,
         )  # fmt: skip
         now, spare = self._first, self._second
         for axis in self._axes:
-            run(k.diffuse, cells, axis, self._structures, self._part, self._offset, self._matrix, now, spare)
+            run(k.diffuse_heat, cells, axis, self._structures, self._part, self._offset, self._matrix, now, spare)
             now, spare = spare, now
         run(
-            k.sense, cells, self._structures, self._part, age, state.status, dt, now, self._field, self._element,
+            k.sense_temperature, cells, self._structures, self._part, age, state.status, dt, now, self._field, self._element,
             self._truth, self._measured,
         )  # fmt: skip
         self.finish(dt)

@@ -6,11 +6,14 @@ Vectors are in the frame of the sensor link. Letters: B environment, P surface p
 from functools import cache
 from typing import Any
 
-from robotics_bridge.sensors.elastomer.kernels.dilation import elastomer_structs
-from robotics_bridge.sensors.kernels.readout import io_structs
-from robotics_bridge.sensors.queries.kernels.distance import FAR, distance_function, query_structs, shape_functions
-from robotics_bridge.sensors.queries.kernels.pairs import pair_structs
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.elastomer.kernels.dilation import GelParams
+from robotics_bridge.sensors.kernels.readout import ReadoutArrays
+from robotics_bridge.sensors.queries.kernels.distance import FAR, SolidArrays, SolidShape, shape_functions
+from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
+
+wp = warp()
 
 
 @cache
@@ -28,15 +31,11 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
         side_by_side: environments are neighbouring threads, dim [S · blocks, B]; otherwise dim [B, S · blocks].
         hoisted: what a pad of one geometry asks for each point is worked out once per block (costs registers).
     """
-    import warp as wp
-
-    structs, pairs_type, solids_type = cloud_structs(), pair_structs().Pairs, query_structs().Solids
-    io_type, gel_type, cloud_type = io_structs().Io, elastomer_structs().Gel, structs.Cloud
-    distance, functions = distance_function(kinds, raycast), shape_functions(kinds, raycast)
-    shape_of, distance_to, shape_type = functions.shape_of, functions.distance_to, query_structs().Shape
+    shapes = shape_functions(kinds, raycast)
+    shape_of, distance_to, distance = shapes.shape_of, shapes.distance_to, shapes.distance
 
     @wp.func
-    def height_over(solids: solids_type, own: wp.array(dtype=wp.int32), gel: gel_type, row: int, z: wp.vec3f) -> float:
+    def height_over(solids: SolidArrays, own: wp.array(dtype=wp.int32), gel: GelParams, row: int, z: wp.vec3f) -> float:
         """Signed distance of a point to the pad's surface, negative inside."""
         if gel.own_last == gel.own_first:
             return wp.dot(z - gel.center, gel.normal)
@@ -49,13 +48,13 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
 
     @wp.kernel(module="unique")
     def anchors(
-        gels: wp.array(dtype=gel_type),
+        gels: wp.array(dtype=GelParams),
         own: wp.array(dtype=wp.int32),
         tracked: wp.array(dtype=wp.int32),
-        solids: solids_type,
-        pairs: pairs_type,
-        cloud: cloud_type,
-        io: io_type,
+        solids: SolidArrays,
+        pairs: PairArrays,
+        cloud: CloudArrays,
+        io: ReadoutArrays,
         blocks: int,
         anchor: wp.array3d(dtype=wp.float32),
         held: wp.array2d(dtype=wp.int32),
@@ -106,7 +105,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
             return
         found = int(0)
         holds = int(0)
-        shape = shape_type()
+        shape = SolidShape()
         turn = wp.mat33f()
         shift = wp.vec3f()
         limit = float(0.0)

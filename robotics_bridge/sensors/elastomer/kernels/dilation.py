@@ -5,60 +5,57 @@ Letters: B environment, N marker, P surface point, S sensor of the group.
 """
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
-from robotics_bridge.sensors.kernels.readout import io_functions, io_structs
-from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, idle, lost, readout_functions
+from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.probes.kernels.probe import deepest_function
-from robotics_bridge.sensors.queries.kernels.distance import query_structs
-from robotics_bridge.sensors.queries.kernels.pairs import pair_structs
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, cloud_structs
+from robotics_bridge.sensors.queries.kernels.distance import SolidArrays
+from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
+
+wp = warp()
 
 NEGLIGIBLE = 17.0
 """Exponent of a Gaussian from which it is left out: 4e-8 of its middle."""
 
 
-@cache
-def elastomer_structs() -> SimpleNamespace:
-    """Return the structure ``Gel``: material and grid of one sensor."""
-    import warp as wp
+@wp.struct
+class GelParams:
+    """Material and grid of one sensor; material as in ``ElastomerTaxel`` and ``Layer``."""
 
-    @wp.struct
-    class Gel:
-        dilate: wp.float32
-        shear: wp.float32
-        spread: wp.float32
-        """λ_d of 4.19 [1/m²]."""
-        smear: wp.float32
-        """λ_s of 4.20 [1/m²]."""
-        exponent: wp.float32
-        enter: wp.float32
-        leave: wp.float32
-        layered: wp.int32
-        poisson: wp.float32
-        softening: wp.float32
-        thickness: wp.float32
-        recoil: wp.float32
-        expansion_x: wp.float32
-        expansion_y: wp.float32
-        frame_x: wp.float32
-        frame_y: wp.float32
-        center: wp.vec3f
-        along: wp.vec3f
-        across: wp.vec3f
-        normal: wp.vec3f
-        start: wp.int32
-        rows: wp.int32
-        columns: wp.int32
-        step_x: wp.float32
-        step_y: wp.float32
-        link: wp.int32
-        slot: wp.int32
-        own_first: wp.int32
-        own_last: wp.int32
-
-    return SimpleNamespace(Gel=Gel)
+    dilate: wp.float32
+    shear: wp.float32
+    spread: wp.float32
+    """λ_d of 4.19 [1/m²]."""
+    smear: wp.float32
+    """λ_s of 4.20 [1/m²]."""
+    exponent: wp.float32
+    enter: wp.float32
+    leave: wp.float32
+    layered: wp.int32
+    poisson: wp.float32
+    softening: wp.float32
+    thickness: wp.float32
+    recoil: wp.float32
+    expansion_x: wp.float32
+    expansion_y: wp.float32
+    frame_x: wp.float32
+    frame_y: wp.float32
+    center: wp.vec3f
+    along: wp.vec3f
+    across: wp.vec3f
+    normal: wp.vec3f
+    start: wp.int32
+    rows: wp.int32
+    columns: wp.int32
+    step_x: wp.float32
+    step_y: wp.float32
+    link: wp.int32
+    slot: wp.int32
+    own_first: wp.int32
+    own_last: wp.int32
 
 
 @cache
@@ -67,21 +64,15 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
 
     Dim [B, N], or [B, 1] if ``in_turn``: a thread serves all markers of an environment.
     """
-    import warp as wp
-
     deepest = deepest_function(kinds, raycast)
-    types, pairs_type, solids_type = io_structs(), pair_structs().Pairs, query_structs().Solids
-    probes_type, io_type = types.ProbeSet, types.Io
-    noise = noise_functions()
-    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
 
     @wp.func
     def indent_one(
-        probes: probes_type,
-        solids: solids_type,
-        pairs: pairs_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
+        probes: ProbeArrays,
+        solids: SolidArrays,
+        pairs: PairArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
         stamp: wp.array2d(dtype=wp.int32),
         exponent: wp.array(dtype=wp.float32),
         height: wp.array3d(dtype=wp.float32),
@@ -115,11 +106,11 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
 
     @wp.kernel(module="unique")
     def indent(
-        probes: probes_type,
-        solids: solids_type,
-        pairs: pairs_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
+        probes: ProbeArrays,
+        solids: SolidArrays,
+        pairs: PairArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
         stamp: wp.array2d(dtype=wp.int32),
         exponent: wp.array(dtype=wp.float32),
         height: wp.array3d(dtype=wp.float32),
@@ -142,15 +133,12 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
 
     With one-dimensional weights w(k) = exp(−λ (k·pitch)²): Σ h w, Σ h k·pitch·w and Σ h^α w.
     """
-    import warp as wp
-
-    probes_type, io_type, gel_type = io_structs().ProbeSet, io_structs().Io, elastomer_structs().Gel
 
     @wp.func
     def spread_one(
-        probes: probes_type,
-        io: io_type,
-        gels: wp.array(dtype=gel_type),
+        probes: ProbeArrays,
+        io: ReadoutArrays,
+        gels: wp.array(dtype=GelParams),
         weights: wp.array3d(dtype=wp.float32),
         reach: wp.array2d(dtype=wp.int32),
         stamp: wp.array2d(dtype=wp.int32),
@@ -185,9 +173,9 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
 
     @wp.kernel(module="unique")
     def spread(
-        probes: probes_type,
-        io: io_type,
-        gels: wp.array(dtype=gel_type),
+        probes: ProbeArrays,
+        io: ReadoutArrays,
+        gels: wp.array(dtype=GelParams),
         weights: wp.array3d(dtype=wp.float32),
         reach: wp.array2d(dtype=wp.int32),
         stamp: wp.array2d(dtype=wp.int32),
@@ -204,24 +192,32 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
     return spread
 
 
-@cache
-def block_function() -> Any:
-    """Return ``block_of(cloud, tracked, row, geometry, block)``."""
-    import warp as wp
+@wp.func
+def block_of(cloud: CloudArrays, tracked: wp.array(dtype=wp.int32), row: int, geometry: int, block: int) -> int:
+    """Number in the cloud of a block that was counted through all tracked geometries."""
+    before = int(0)
+    for member in range(tracked.shape[0]):
+        if tracked[member] == geometry:
+            return cloud.first[row, geometry] + block - before
+        before += cloud.blocks[row, tracked[member]]
+    return 0
 
-    cloud_type = cloud_structs().Cloud
 
-    @wp.func
-    def block_of(cloud: cloud_type, tracked: wp.array(dtype=wp.int32), row: int, geometry: int, block: int) -> int:
-        """Number in the cloud of a block that was counted through all tracked geometries."""
-        before = int(0)
-        for member in range(tracked.shape[0]):
-            if tracked[member] == geometry:
-                return cloud.first[row, geometry] + block - before
-            before += cloud.blocks[row, tracked[member]]
-        return 0
+@wp.func
+def across_plane(v: wp.vec3f, n: wp.vec3f) -> wp.vec3f:
+    return v - wp.dot(v, n) * n
 
-    return block_of
+
+@wp.func
+def traction(gel: GelParams, away: wp.vec3f, slip: wp.vec3f) -> wp.vec3f:
+    """Cerruti's surface displacement, softened over the contact, minus its image below the bonded base."""
+    square = wp.dot(away, away) + gel.softening * gel.softening
+    inverse = 1.0 / wp.sqrt(square)
+    u = inverse * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * inverse * inverse) * away)
+    if gel.thickness > 0.0:
+        deep = 1.0 / wp.sqrt(square + 4.0 * gel.thickness * gel.thickness)
+        u -= deep * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * deep * deep) * away)
+    return u
 
 
 @cache
@@ -247,38 +243,15 @@ def marker_kernel(
         in_turn: a thread serves all markers of an environment.
         apart: the shear of sensors without a layer was summed before, in ``drag``.
     """
-    import warp as wp
-
-    block_of = block_function()
-    io = io_functions(mode, hysteresis, walk, 3)
-    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
-    types, gel_type = io_structs(), elastomer_structs().Gel
-    pairs_type, cloud_type = pair_structs().Pairs, cloud_structs().Cloud
-    probes_type, io_type = types.ProbeSet, types.Io
-    noise = noise_functions()
-    params_type = noise.NoiseParams
-
-    @wp.func
-    def across_plane(v: wp.vec3f, n: wp.vec3f) -> wp.vec3f:
-        return v - wp.dot(v, n) * n
-
-    @wp.func
-    def traction(gel: gel_type, away: wp.vec3f, slip: wp.vec3f) -> wp.vec3f:
-        """Cerruti's surface displacement, softened over the contact, minus its image below the bonded base."""
-        square = wp.dot(away, away) + gel.softening * gel.softening
-        inverse = 1.0 / wp.sqrt(square)
-        u = inverse * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * inverse * inverse) * away)
-        if gel.thickness > 0.0:
-            deep = 1.0 / wp.sqrt(square + 4.0 * gel.thickness * gel.thickness)
-            u -= deep * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * deep * deep) * away)
-        return u
+    readout = readout_functions(mode, hysteresis, walk, 3)
+    emit_six, recall_six = readout.emit_six, readout.recall_six
 
     @wp.func
     def read_one(
-        probes: probes_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
-        gels: wp.array(dtype=gel_type),
+        probes: ProbeArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
+        gels: wp.array(dtype=GelParams),
         weights: wp.array3d(dtype=wp.float32),
         reach: wp.array2d(dtype=wp.int32),
         stamp: wp.array2d(dtype=wp.int32),
@@ -286,8 +259,8 @@ def marker_kernel(
         spread: wp.array3d(dtype=wp.float32),
         blocks: int,
         tracked: wp.array(dtype=wp.int32),
-        pairs: pairs_type,
-        cloud: cloud_type,
+        pairs: PairArrays,
+        cloud: CloudArrays,
         moved: wp.array2d(dtype=wp.int32),
         dragged: wp.array2d(dtype=wp.int32),
         anchor: wp.array3d(dtype=wp.float32),
@@ -425,10 +398,10 @@ def marker_kernel(
 
     @wp.kernel(module="unique")
     def markers(
-        probes: probes_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
-        gels: wp.array(dtype=gel_type),
+        probes: ProbeArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
+        gels: wp.array(dtype=GelParams),
         weights: wp.array3d(dtype=wp.float32),
         reach: wp.array2d(dtype=wp.int32),
         stamp: wp.array2d(dtype=wp.int32),
@@ -436,8 +409,8 @@ def marker_kernel(
         spread: wp.array3d(dtype=wp.float32),
         blocks: int,
         tracked: wp.array(dtype=wp.int32),
-        pairs: pairs_type,
-        cloud: cloud_type,
+        pairs: PairArrays,
+        cloud: CloudArrays,
         moved: wp.array2d(dtype=wp.int32),
         dragged: wp.array2d(dtype=wp.int32),
         anchor: wp.array3d(dtype=wp.float32),

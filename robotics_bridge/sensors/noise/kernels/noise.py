@@ -9,389 +9,350 @@ Order of the measured branch: radius noise and gain → crosstalk → hysteresis
 quantisation → dead taxels → (threshold, by the sensor) → delay. Letters: B environment, N probe, C channel.
 """
 
-from functools import cache
-from types import SimpleNamespace
-from typing import Any
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.kernels.series import power_of_two, split_log
 
-from robotics_bridge.sensors.kernels.series import series_functions
+wp = warp()
+wp.set_module_options({"fuse_fp": False})
 
 EPISODE, RADIUS, JITTER, CHANNELS = 0, 1, 2, 16
 """Purposes of random numbers: of an episode, the radius, the delay, and from 16 on of pairs of channels."""
 
 
-@cache
-def noise_functions() -> SimpleNamespace:
-    """Return the structure ``NoiseParams`` and the device functions that sensors call in their own kernels.
+@wp.struct
+class NoiseParams:
+    """The knobs of one sensor."""
 
-    ``radius_noise(p, env, probe, age, episode)``, ``gain(p, env, probe, episode)`` and ``apply_noise(...)``
-    as documented at each; ``philox``, ``uniform`` and ``normals`` below them.
-    """
-    import warp as wp
+    key_low: wp.uint32
+    key_high: wp.uint32
+    radius: wp.float32
+    """Half width of the uniform error of the sensing radius [m]."""
+    gain_low: wp.float32
+    gain_high: wp.float32
+    dead_probability: wp.float32
+    dead_low: wp.float32
+    dead_high: wp.float32
+    hysteresis: wp.float32
+    """Strength β."""
+    tau: wp.float32
+    """Time constant of the hysteresis [s]."""
+    walk: wp.float32
+    """Standard deviation of one step of the random walk [output unit]."""
+    white: wp.float32
+    """Standard deviation of the white noise [output unit]."""
+    bias: wp.float32
+    quantum: wp.float32
+    """Step of the quantisation [output unit]; 0 is none."""
+    levels: wp.float32
+    """1 / quantum, where there is one."""
 
-    series = series_functions()
-    split_log, power_of_two = series.split_log, series.power_of_two
 
-    @wp.struct
-    class NoiseParams:
-        """The knobs of one sensor."""
+@wp.func
+def philox(a: wp.uint32, b: wp.uint32, c: wp.uint32, d: wp.uint32, key_low: wp.uint32, key_high: wp.uint32):
+    """Return the four words of Philox 4×32-10 for a counter (a, b, c, d) and a key."""
+    c0 = a
+    c1 = b
+    c2 = c
+    c3 = d
+    k0 = key_low
+    k1 = key_high
+    # The constants are those of the paper, written as signed numbers.
+    for _ in range(10):
+        p0 = wp.uint64(wp.uint32(-766435501)) * wp.uint64(c0)
+        p1 = wp.uint64(wp.uint32(-845247145)) * wp.uint64(c2)
+        n0 = wp.uint32(p1 >> wp.uint64(32)) ^ c1 ^ k0
+        n2 = wp.uint32(p0 >> wp.uint64(32)) ^ c3 ^ k1
+        c1 = wp.uint32(p1)
+        c3 = wp.uint32(p0)
+        c0 = n0
+        c2 = n2
+        k0 = k0 + wp.uint32(-1640531527)
+        k1 = k1 + wp.uint32(-1150833019)
+    return c0, c1, c2, c3
 
-        key_low: wp.uint32
-        key_high: wp.uint32
-        radius: wp.float32
-        """Half width of the uniform error of the sensing radius [m]."""
-        gain_low: wp.float32
-        gain_high: wp.float32
-        dead_probability: wp.float32
-        dead_low: wp.float32
-        dead_high: wp.float32
-        hysteresis: wp.float32
-        """Strength β."""
-        tau: wp.float32
-        """Time constant of the hysteresis [s]."""
-        walk: wp.float32
-        """Standard deviation of one step of the random walk [output unit]."""
-        white: wp.float32
-        """Standard deviation of the white noise [output unit]."""
-        bias: wp.float32
-        quantum: wp.float32
-        """Step of the quantisation [output unit]; 0 is none."""
-        levels: wp.float32
-        """1 / quantum, where there is one."""
 
-    @wp.func
-    def philox(a: wp.uint32, b: wp.uint32, c: wp.uint32, d: wp.uint32, key_low: wp.uint32, key_high: wp.uint32):
-        """Return the four words of Philox 4×32-10 for a counter (a, b, c, d) and a key."""
-        c0 = a
-        c1 = b
-        c2 = c
-        c3 = d
-        k0 = key_low
-        k1 = key_high
-        # The constants are those of the paper, written as signed numbers.
-        for _ in range(10):
-            p0 = wp.uint64(wp.uint32(-766435501)) * wp.uint64(c0)
-            p1 = wp.uint64(wp.uint32(-845247145)) * wp.uint64(c2)
-            n0 = wp.uint32(p1 >> wp.uint64(32)) ^ c1 ^ k0
-            n2 = wp.uint32(p0 >> wp.uint64(32)) ^ c3 ^ k1
-            c1 = wp.uint32(p1)
-            c3 = wp.uint32(p0)
-            c0 = n0
-            c2 = n2
-            k0 = k0 + wp.uint32(-1640531527)
-            k1 = k1 + wp.uint32(-1150833019)
-        return c0, c1, c2, c3
+@wp.func
+def draw(p: NoiseParams, env: int, probe: int, age: int, episode: int, purpose: int):
+    """Return four random words; ``env`` is the number in the whole experiment."""
+    last = (wp.uint32(episode) << wp.uint32(8)) | wp.uint32(purpose)
+    return philox(wp.uint32(probe), wp.uint32(env), wp.uint32(age), last, p.key_low, p.key_high)
 
-    @wp.func
-    def draw(p: NoiseParams, env: int, probe: int, age: int, episode: int, purpose: int):
-        """Return four random words; ``env`` is the number in the whole experiment."""
-        last = (wp.uint32(episode) << wp.uint32(8)) | wp.uint32(purpose)
-        return philox(wp.uint32(probe), wp.uint32(env), wp.uint32(age), last, p.key_low, p.key_high)
 
-    @wp.func
-    def uniform(word: wp.uint32) -> float:
-        """Return a number in [0, 1) with 24 random bits."""
-        return float(word >> wp.uint32(8)) * float(5.9604644775390625e-08)
+@wp.func
+def uniform(word: wp.uint32) -> float:
+    """Return a number in [0, 1) with 24 random bits."""
+    return float(word >> wp.uint32(8)) * float(5.9604644775390625e-08)
 
-    @wp.func
-    def minus_two_log(word: wp.uint32) -> float:
-        """Return −2 ln(word / 2³²), odd words only, by a series: libraries of devices differ in the last digit."""
-        split = split_log(float(word | wp.uint32(1)))
-        return (float(32.0) - split[0]) * float(1.3862943611198906) - float(2.0) * split[1]
 
-    @wp.func
-    def normals(first: wp.uint32, second: wp.uint32) -> wp.vec2:
-        """Return two independent standard normal numbers of two random words (Box and Muller 1958)."""
-        length = wp.sqrt(minus_two_log(first))
-        # The angle within a quarter turn, counted from its middle: −π/4 … π/4.
-        part = float((second >> wp.uint32(7)) & wp.uint32(0x7FFFFF)) - float(4194303.5)
-        x = part * float(1.8725351414619535e-07)
-        q = x * x
-        sine = x + x * q * (float(-0.16666655) + q * (float(0.008332178) + q * float(-0.000195173)))
-        cosine = float(1.0) + q * (
-            float(-0.5) + q * (float(0.041666646) + q * (float(-0.0013887368) + q * float(2.4438452e-05)))
-        )
-        # The upper two bits turn by quarters: (c, s), (−s, c), (−c, −s), (s, −c).
-        odd = (second & wp.uint32(0x40000000)) != wp.uint32(0)
-        turned = (second ^ (second << wp.uint32(1))) & wp.uint32(-2147483648)
-        below = second & wp.uint32(-2147483648)
-        a = wp.cast(wp.where(odd, sine, cosine), wp.uint32) ^ turned
-        b = wp.cast(wp.where(odd, cosine, sine), wp.uint32) ^ below
-        return wp.vec2(length * wp.cast(a, wp.float32), length * wp.cast(b, wp.float32))
+@wp.func
+def minus_two_log(word: wp.uint32) -> float:
+    """Return −2 ln(word / 2³²), odd words only, by a series: libraries of devices differ in the last digit."""
+    split = split_log(float(word | wp.uint32(1)))
+    return (float(32.0) - split[0]) * float(1.3862943611198906) - float(2.0) * split[1]
 
-    @wp.func
-    def radius_noise(p: NoiseParams, env: int, probe: int, age: int, episode: int) -> float:
-        """Return the error of the sensing radius in this update [m] (4.23)."""
-        if p.radius <= float(0.0):
-            return float(0.0)
-        w0, _w1, _w2, _w3 = draw(p, env, probe, age, episode, wp.static(RADIUS))
-        return p.radius * (float(2.0) * uniform(w0) - float(1.0))
 
-    @wp.func
-    def gain(p: NoiseParams, env: int, probe: int, episode: int) -> float:
-        """Return the gain γ of a probe in this episode (4.24)."""
-        if p.gain_high <= p.gain_low:
-            return p.gain_low
-        w0, _w1, _w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
-        return p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
-
-    @wp.func
-    def decay(t: float) -> float:
-        """Return exp(−t) for t ≥ 0, by a series."""
-        return power_of_two(float(0.0), wp.max(t * float(-1.4426950408889634), float(-150.0)))
-
-    @wp.func
-    def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, episode: int) -> wp.vec4:
-        """Return (white, walk) of channel 2 ``pair`` and of the next, from one Philox call; 0 where neither is set."""
-        if p.white <= float(0.0) and p.walk <= float(0.0):
-            return wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
-        w0, w1, w2, w3 = draw(p, env, probe, age, episode, wp.static(CHANNELS) + pair)
-        first = normals(w0, w1)
-        second = normals(w2, w3)
-        return wp.vec4(first[0], first[1], second[0], second[1])
-
-    @wp.func
-    def episode_draw(p: NoiseParams, env: int, probe: int, episode: int) -> wp.vec3:
-        """Return what holds for an episode: (gain, 1 if the probe is dead, the value it is stuck at)."""
-        out = wp.vec3(p.gain_low, float(0.0), float(0.0))
-        if p.gain_high > p.gain_low or p.dead_probability > float(0.0):
-            w0, w1, w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
-            if p.gain_high > p.gain_low:
-                out[0] = p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
-            if uniform(w1) < p.dead_probability:
-                out[1] = float(1.0)
-                out[2] = p.dead_low + (p.dead_high - p.dead_low) * uniform(w2)
-        return out
-
-    @wp.func
-    def apply_drawn(
-        p: NoiseParams,
-        x: float,
-        white: float,
-        walk: float,
-        fixed: wp.vec3,
-        fading: float,
-        hysteresis_state: float,
-        walk_state: float,
-    ) -> wp.vec3:
-        """Return what :func:`apply_noise` does, from numbers drawn before.
-
-        Args:
-            p: Knobs of the sensor.
-            x: The signal.
-            white: Standard normal number of the white noise.
-            walk: Standard normal number of the drift.
-            fixed: Of :func:`episode_draw`.
-            fading: e^(−Δt/τ).
-            hysteresis_state: As there.
-            walk_state: As there.
-        """
-        # Knobs that are off add zeros, which costs less than asking.
-        xi = hysteresis_state + x
-        drift = walk_state + p.walk * walk
-        y = x + p.hysteresis * xi + drift + p.white * white + p.bias
-        lag = fading * xi - x
-        y = wp.where(p.quantum > float(0.0), p.quantum * wp.rint(y * p.levels), y)
-        y = wp.where(fixed[1] > float(0.0), fixed[2], y)
-        finite = wp.isfinite(x)
-        return wp.vec3(
-            wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state)
-        )
-
-    @wp.func
-    def apply_noise(
-        p: NoiseParams,
-        x: float,
-        env: int,
-        probe: int,
-        channel: int,
-        age: int,
-        episode: int,
-        dt: float,
-        hysteresis_state: float,
-        walk_state: float,
-    ) -> wp.vec3:
-        """Return the measured value of one channel and the two memories to keep for the next update.
-
-        Args:
-            p: Knobs of the sensor.
-            x: The signal after radius noise, gain and crosstalk. A value that is not finite is returned as it
-                is, and the memories as they were.
-            env: Number of the environment in the whole experiment.
-            probe: Number of the probe within its sensor.
-            channel: Channel.
-            age: Updates since the reset, 0 at the first.
-            episode: Resets so far.
-            dt: Time step [s].
-            hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
-            walk_state: Drift d of the last update (0 at first).
-        """
-        z = pair_normals(p, env, probe, channel // 2, age, episode)
-        white = z[0]
-        walk = z[1]
-        if channel % 2 == 1:
-            white = z[2]
-            walk = z[3]
-        fading = float(0.0)
-        if p.hysteresis != float(0.0):
-            fading = decay(dt / p.tau)
-        fixed = episode_draw(p, env, probe, episode)
-        return apply_drawn(p, x, white, walk, fixed, fading, hysteresis_state, walk_state)
-
-    @wp.func
-    def delay_jitter(p: NoiseParams, env: int, age: int, episode: int) -> float:
-        """Return a number in [−1, 1) for the delay of a sensor in this update."""
-        w0, _w1, _w2, _w3 = draw(p, env, -1, age, episode, wp.static(JITTER))
-        return float(2.0) * uniform(w0) - float(1.0)
-
-    return SimpleNamespace(
-        NoiseParams=NoiseParams,
-        philox=philox,
-        uniform=uniform,
-        normals=normals,
-        radius_noise=radius_noise,
-        gain=gain,
-        apply_noise=apply_noise,
-        apply_drawn=apply_drawn,
-        decay=decay,
-        episode_draw=episode_draw,
-        pair_normals=pair_normals,
-        delay_jitter=delay_jitter,
+@wp.func
+def normals(first: wp.uint32, second: wp.uint32) -> wp.vec2:
+    """Return two independent standard normal numbers of two random words (Box and Muller 1958)."""
+    length = wp.sqrt(minus_two_log(first))
+    # The angle within a quarter turn, counted from its middle: −π/4 … π/4.
+    part = float((second >> wp.uint32(7)) & wp.uint32(0x7FFFFF)) - float(4194303.5)
+    x = part * float(1.8725351414619535e-07)
+    q = x * x
+    sine = x + x * q * (float(-0.16666655) + q * (float(0.008332178) + q * float(-0.000195173)))
+    cosine = float(1.0) + q * (
+        float(-0.5) + q * (float(0.041666646) + q * (float(-0.0013887368) + q * float(2.4438452e-05)))
     )
+    # The upper two bits turn by quarters: (c, s), (−s, c), (−c, −s), (s, −c).
+    odd = (second & wp.uint32(0x40000000)) != wp.uint32(0)
+    turned = (second ^ (second << wp.uint32(1))) & wp.uint32(-2147483648)
+    below = second & wp.uint32(-2147483648)
+    a = wp.cast(wp.where(odd, sine, cosine), wp.uint32) ^ turned
+    b = wp.cast(wp.where(odd, cosine, sine), wp.uint32) ^ below
+    return wp.vec2(length * wp.cast(a, wp.float32), length * wp.cast(b, wp.float32))
 
 
-@cache
-def measure_kernel(gained: bool) -> Any:
-    """Return the kernel that measures a whole reading; ``gained``: the sensor has applied the gain. Dim [B, N]."""
-    import warp as wp
+@wp.func
+def radius_noise(p: NoiseParams, env: int, probe: int, age: int, episode: int) -> float:
+    """Return the error of the sensing radius in this update [m] (4.23)."""
+    if p.radius <= float(0.0):
+        return float(0.0)
+    w0, _w1, _w2, _w3 = draw(p, env, probe, age, episode, wp.static(RADIUS))
+    return p.radius * (float(2.0) * uniform(w0) - float(1.0))
 
-    f = noise_functions()
-    params, gain, apply_noise = f.NoiseParams, f.gain, f.apply_noise
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"fuse_fp": False})
-    def measure(
-        p: wp.array(dtype=params),
-        part: wp.array(dtype=wp.int32),
-        probe: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
-        age: wp.array(dtype=wp.int32),
-        episode: wp.array(dtype=wp.int32),
-        env_offset: int,
-        dt: float,
-        x: wp.array3d(dtype=wp.float32),
-        hysteresis: wp.array3d(dtype=wp.float32),
-        walk: wp.array3d(dtype=wp.float32),
-        out: wp.array3d(dtype=wp.float32),
-    ):
-        env, n = wp.tid()
-        if active[n] == 0:
-            for channel in range(x.shape[0]):
-                out[channel, env, n] = float(0.0)
-            return
-        knobs = p[part[n]]
-        number = env_offset + env
-        scale = float(1.0)
-        if not wp.static(gained):
-            scale = gain(knobs, number, probe[n], episode[env])
+@wp.func
+def gain(p: NoiseParams, env: int, probe: int, episode: int) -> float:
+    """Return the gain γ of a probe in this episode (4.24)."""
+    if p.gain_high <= p.gain_low:
+        return p.gain_low
+    w0, _w1, _w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
+    return p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
+
+
+@wp.func
+def decay(t: float) -> float:
+    """Return exp(−t) for t ≥ 0, by a series."""
+    return power_of_two(float(0.0), wp.max(t * float(-1.4426950408889634), float(-150.0)))
+
+
+@wp.func
+def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, episode: int) -> wp.vec4:
+    """Return (white, walk) of channel 2 ``pair`` and of the next, from one Philox call; 0 where neither is set."""
+    if p.white <= float(0.0) and p.walk <= float(0.0):
+        return wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
+    w0, w1, w2, w3 = draw(p, env, probe, age, episode, wp.static(CHANNELS) + pair)
+    first = normals(w0, w1)
+    second = normals(w2, w3)
+    return wp.vec4(first[0], first[1], second[0], second[1])
+
+
+@wp.func
+def episode_draw(p: NoiseParams, env: int, probe: int, episode: int) -> wp.vec3:
+    """Return what holds for an episode: (gain, 1 if the probe is dead, the value it is stuck at)."""
+    out = wp.vec3(p.gain_low, float(0.0), float(0.0))
+    if p.gain_high > p.gain_low or p.dead_probability > float(0.0):
+        w0, w1, w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
+        if p.gain_high > p.gain_low:
+            out[0] = p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
+        if uniform(w1) < p.dead_probability:
+            out[1] = float(1.0)
+            out[2] = p.dead_low + (p.dead_high - p.dead_low) * uniform(w2)
+    return out
+
+
+@wp.func
+def apply_drawn(
+    p: NoiseParams,
+    x: float,
+    white: float,
+    walk: float,
+    fixed: wp.vec3,
+    fading: float,
+    hysteresis_state: float,
+    walk_state: float,
+) -> wp.vec3:
+    """Return what :func:`apply_noise` does, from numbers drawn before.
+
+    Args:
+        p: Knobs of the sensor.
+        x: The signal.
+        white: Standard normal number of the white noise.
+        walk: Standard normal number of the drift.
+        fixed: Of :func:`episode_draw`.
+        fading: e^(−Δt/τ).
+        hysteresis_state: As there.
+        walk_state: As there.
+    """
+    # Knobs that are off add zeros, which costs less than asking.
+    xi = hysteresis_state + x
+    drift = walk_state + p.walk * walk
+    y = x + p.hysteresis * xi + drift + p.white * white + p.bias
+    lag = fading * xi - x
+    y = wp.where(p.quantum > float(0.0), p.quantum * wp.rint(y * p.levels), y)
+    y = wp.where(fixed[1] > float(0.0), fixed[2], y)
+    finite = wp.isfinite(x)
+    return wp.vec3(wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state))
+
+
+@wp.func
+def apply_noise(
+    p: NoiseParams,
+    x: float,
+    env: int,
+    probe: int,
+    channel: int,
+    age: int,
+    episode: int,
+    dt: float,
+    hysteresis_state: float,
+    walk_state: float,
+) -> wp.vec3:
+    """Return the measured value of one channel and the two memories to keep for the next update.
+
+    Args:
+        p: Knobs of the sensor.
+        x: The signal after radius noise, gain and crosstalk. A value that is not finite is returned as it
+            is, and the memories as they were.
+        env: Number of the environment in the whole experiment.
+        probe: Number of the probe within its sensor.
+        channel: Channel.
+        age: Updates since the reset, 0 at the first.
+        episode: Resets so far.
+        dt: Time step [s].
+        hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
+        walk_state: Drift d of the last update (0 at first).
+    """
+    z = pair_normals(p, env, probe, channel // 2, age, episode)
+    white = z[0]
+    walk = z[1]
+    if channel % 2 == 1:
+        white = z[2]
+        walk = z[3]
+    fading = float(0.0)
+    if p.hysteresis != float(0.0):
+        fading = decay(dt / p.tau)
+    fixed = episode_draw(p, env, probe, episode)
+    return apply_drawn(p, x, white, walk, fixed, fading, hysteresis_state, walk_state)
+
+
+@wp.func
+def delay_jitter(p: NoiseParams, env: int, age: int, episode: int) -> float:
+    """Return a number in [−1, 1) for the delay of a sensor in this update."""
+    w0, _w1, _w2, _w3 = draw(p, env, -1, age, episode, wp.static(JITTER))
+    return float(2.0) * uniform(w0) - float(1.0)
+
+
+@wp.kernel
+def measure(
+    p: wp.array(dtype=NoiseParams),
+    part: wp.array(dtype=wp.int32),
+    probe: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),
+    age: wp.array(dtype=wp.int32),
+    episode: wp.array(dtype=wp.int32),
+    env_offset: int,
+    gained: int,
+    dt: float,
+    x: wp.array3d(dtype=wp.float32),
+    hysteresis: wp.array3d(dtype=wp.float32),
+    walk: wp.array3d(dtype=wp.float32),
+    out: wp.array3d(dtype=wp.float32),
+):
+    """Measure a whole reading ``x`` [C, B, N]; ``gained`` 1: the sensor has applied the gain. Thread: [B, N]."""
+    env, n = wp.tid()
+    if active[n] == 0:
         for channel in range(x.shape[0]):
-            lag = float(0.0)
-            drift = float(0.0)
-            if age[env] > 0:
-                if hysteresis.shape[1] > 0:
-                    lag = hysteresis[channel, env, n]
-                if walk.shape[1] > 0:
-                    drift = walk[channel, env, n]
-            y = apply_noise(
-                knobs, scale * x[channel, env, n], number, probe[n], channel, age[env], episode[env], dt, lag, drift
-            )
-            out[channel, env, n] = y[0]
+            out[channel, env, n] = float(0.0)
+        return
+    knobs = p[part[n]]
+    number = env_offset + env
+    scale = float(1.0)
+    if gained == 0:
+        scale = gain(knobs, number, probe[n], episode[env])
+    for channel in range(x.shape[0]):
+        lag = float(0.0)
+        drift = float(0.0)
+        if age[env] > 0:
             if hysteresis.shape[1] > 0:
-                hysteresis[channel, env, n] = y[1]
+                lag = hysteresis[channel, env, n]
             if walk.shape[1] > 0:
-                walk[channel, env, n] = y[2]
+                drift = walk[channel, env, n]
+        y = apply_noise(
+            knobs, scale * x[channel, env, n], number, probe[n], channel, age[env], episode[env], dt, lag, drift
+        )
+        out[channel, env, n] = y[0]
+        if hysteresis.shape[1] > 0:
+            hysteresis[channel, env, n] = y[1]
+        if walk.shape[1] > 0:
+            walk[channel, env, n] = y[2]
 
-    return measure
 
-
-@cache
-def crosstalk_kernel() -> Any:
-    """Return the kernel of one half of the crosstalk (4.28), zero outside the grid. Dim [C, B, N].
+@wp.kernel
+def crosstalk(
+    along: int,
+    signal: wp.array3d(dtype=wp.float32),
+    value: wp.array3d(dtype=wp.float32),
+    part: wp.array(dtype=wp.int32),
+    probe: wp.array(dtype=wp.int32),
+    shape: wp.array2d(dtype=wp.int32),
+    strength: wp.array(dtype=wp.float32),
+    weights: wp.array2d(dtype=wp.float32),
+    out: wp.array3d(dtype=wp.float32),
+):
+    """Compute one half of the crosstalk (4.28), zero outside the grid. Thread: channel, environment, probe [C, B, N].
 
     Launched along the rows into a buffer, then along the columns, where the signal is mixed in.
     """
-    import warp as wp
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"fuse_fp": False})
-    def crosstalk(
-        along: int,
-        signal: wp.array3d(dtype=wp.float32),
-        value: wp.array3d(dtype=wp.float32),
-        part: wp.array(dtype=wp.int32),
-        probe: wp.array(dtype=wp.int32),
-        shape: wp.array2d(dtype=wp.int32),
-        strength: wp.array(dtype=wp.float32),
-        weights: wp.array2d(dtype=wp.float32),
-        out: wp.array3d(dtype=wp.float32),
-    ):
-        channel, env, n = wp.tid()
-        i = part[n]
-        x = value[channel, env, n]
-        if strength[i] <= float(0.0):
-            out[channel, env, n] = x
-            return
-        columns = shape[i, 1]
-        place = probe[n] % columns
-        length = columns
-        stride = 1
-        if along == 0:
-            place = probe[n] // columns
-            length = shape[i, 0]
-            stride = columns
-        half = weights.shape[1] - 1
-        total = weights[i, 0] * x
-        for k in range(1, half + 1):
-            if place + k < length:
-                total = total + weights[i, k] * value[channel, env, n + k * stride]
-            if place >= k:
-                total = total + weights[i, k] * value[channel, env, n - k * stride]
-        if along == 0:
-            total = (float(1.0) - strength[i]) * signal[channel, env, n] + strength[i] * total
-        out[channel, env, n] = total
-
-    return crosstalk
+    channel, env, n = wp.tid()
+    i = part[n]
+    x = value[channel, env, n]
+    if strength[i] <= float(0.0):
+        out[channel, env, n] = x
+        return
+    columns = shape[i, 1]
+    place = probe[n] % columns
+    length = columns
+    stride = 1
+    if along == 0:
+        place = probe[n] // columns
+        length = shape[i, 0]
+        stride = columns
+    half = weights.shape[1] - 1
+    total = weights[i, 0] * x
+    for k in range(1, half + 1):
+        if place + k < length:
+            total = total + weights[i, k] * value[channel, env, n + k * stride]
+        if place >= k:
+            total = total + weights[i, k] * value[channel, env, n - k * stride]
+    if along == 0:
+        total = (float(1.0) - strength[i]) * signal[channel, env, n] + strength[i] * total
+    out[channel, env, n] = total
 
 
-@cache
-def delay_kernel() -> Any:
-    """Return the kernel that records a reading and reads an earlier one (zero-order hold). Dim [B, N]."""
-    import warp as wp
-
-    f = noise_functions()
-    params, delay_jitter = f.NoiseParams, f.delay_jitter
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"fuse_fp": False})
-    def delay_line(
-        p: wp.array(dtype=params),
-        part: wp.array(dtype=wp.int32),
-        delay: wp.array(dtype=wp.float32),
-        jitter: wp.array(dtype=wp.float32),
-        age: wp.array(dtype=wp.int32),
-        episode: wp.array(dtype=wp.int32),
-        env_offset: int,
-        dt: float,
-        value: wp.array3d(dtype=wp.float32),
-        ring: wp.array4d(dtype=wp.float32),
-        out: wp.array3d(dtype=wp.float32),
-    ):
-        env, n = wp.tid()
-        i = part[n]
-        wait = delay[i]
-        if jitter[i] > float(0.0):
-            wait = wait + jitter[i] * delay_jitter(p[i], env_offset + env, age[env], episode[env])
-        size = ring.shape[0]
-        # The last reading at or before the moment; before the first has arrived, the first.
-        back = wp.min(wp.min(int(wp.ceil(wait / dt - float(1.0e-4))), age[env]), size - 1)
-        for channel in range(value.shape[0]):
-            ring[age[env] % size, channel, env, n] = value[channel, env, n]
-            out[channel, env, n] = ring[(age[env] - back) % size, channel, env, n]
-
-    return delay_line
+@wp.kernel
+def delay_line(
+    p: wp.array(dtype=NoiseParams),
+    part: wp.array(dtype=wp.int32),
+    delay: wp.array(dtype=wp.float32),
+    jitter: wp.array(dtype=wp.float32),
+    age: wp.array(dtype=wp.int32),
+    episode: wp.array(dtype=wp.int32),
+    env_offset: int,
+    dt: float,
+    value: wp.array3d(dtype=wp.float32),
+    ring: wp.array4d(dtype=wp.float32),
+    out: wp.array3d(dtype=wp.float32),
+):
+    """Record a reading and read an earlier one (zero-order hold). Thread: environment and probe [B, N]."""
+    env, n = wp.tid()
+    i = part[n]
+    wait = delay[i]
+    if jitter[i] > float(0.0):
+        wait = wait + jitter[i] * delay_jitter(p[i], env_offset + env, age[env], episode[env])
+    size = ring.shape[0]
+    # The last reading at or before the moment; before the first has arrived, the first.
+    back = wp.min(wp.min(int(wp.ceil(wait / dt - float(1.0e-4))), age[env]), size - 1)
+    for channel in range(value.shape[0]):
+        ring[age[env] % size, channel, env, n] = value[channel, env, n]
+        out[channel, env, n] = ring[(age[env] - back) % size, channel, env, n]

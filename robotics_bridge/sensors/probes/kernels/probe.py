@@ -1,16 +1,29 @@
-"""Kernels of the sensors that ask how deep a probe lies in what it touches: one thread per environment and probe.
+"""Kernels of the sensors that ask how deep a probe lies in what it touches: distance, depth, contact, force field.
 
-Equation numbers are those of the thesis. Vectors are in the frame of the sensor link.
+Equation numbers are those of the thesis. Vectors are in the frame of the sensor link (m, N, N m).
+Letters: B environment, N probe, R row of probes that one thread takes in turn.
 """
 
 from functools import cache
 from typing import Any
 
-from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, io_functions, io_structs
-from robotics_bridge.sensors.kernels.series import series_functions
-from robotics_bridge.sensors.noise.kernels.noise import noise_functions
-from robotics_bridge.sensors.queries.kernels.distance import FAR, distance_function, query_structs, shape_functions
-from robotics_bridge.sensors.queries.kernels.pairs import pair_structs
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.kernels.readout import (
+    CLEAN,
+    FUSED,
+    STAGED,
+    ProbeArrays,
+    ReadoutArrays,
+    idle,
+    lost,
+    readout_functions,
+)
+from robotics_bridge.sensors.kernels.series import power as series_power
+from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, episode_draw, gain, radius_noise
+from robotics_bridge.sensors.queries.kernels.distance import FAR, SolidArrays, SolidShape, shape_functions
+from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
+
+wp = warp()
 
 THREADS = 256
 """Threads of a block."""
@@ -25,14 +38,10 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
     The least signed distance of a probe to what its slot lists, the outward normal there and its place in the list
     (−1: nothing). ``reach`` 0 means: whatever lies inside or within the probe's radius.
     """
-    import warp as wp
-
-    probes_type, pairs_type = io_structs().ProbeSet, pair_structs().Pairs
-    solids_type = query_structs().Solids
-    distance = distance_function(kinds, raycast)
+    distance = shape_functions(kinds, raycast).distance
 
     @wp.func
-    def deepest(probes: probes_type, solids: solids_type, pairs: pairs_type, env: int, n: int, reach: float):
+    def deepest(probes: ProbeArrays, solids: SolidArrays, pairs: PairArrays, env: int, n: int, reach: float):
         row = env % solids.kind.shape[0]
         slot = probes.slot[n]
         x = probes.position[n]
@@ -63,23 +72,15 @@ def distance_kernel(
     kinds: frozenset[int], raycast: bool, nearest: bool, mode: int, hysteresis: bool, walk: bool
 ) -> Any:
     """Return the kernel of SurfaceDistanceProbe. Dim [B, N]."""
-    import warp as wp
-
-    deepest = deepest_function(kinds, raycast)
-    io = io_functions(mode, hysteresis, walk)
-    emit, lost, idle = io.emit, io.lost, io.idle
-    types, pairs_type, solids_type = io_structs(), pair_structs().Pairs, query_structs().Solids
-    probes_type, io_type = types.ProbeSet, types.Io
-    noise = noise_functions()
-    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
+    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk).emit
 
     @wp.kernel(module="unique")
     def surface_distance(
-        probes: probes_type,
-        solids: solids_type,
-        pairs: pairs_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
+        probes: ProbeArrays,
+        solids: SolidArrays,
+        pairs: PairArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
         limits: wp.array(dtype=wp.float32),
         points: wp.array3d(dtype=wp.float32),
     ):
@@ -114,33 +115,27 @@ def distance_kernel(
     return surface_distance
 
 
+@wp.func
+def latch(before: float, age: int, value: float, limits: wp.vec2f) -> float:
+    """Apply the Schmitt trigger (4.3); a lost reading before counts as no contact."""
+    if value > limits[0] or (age > 0 and before > 0.5 and value > limits[1]):
+        return 1.0
+    return 0.0
+
+
 @cache
 def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
     """Return the kernel of ContactDepthProbe (4.2) or, ``binary``, of ContactProbe (4.3). Dim [B, N]."""
-    import warp as wp
-
-    deepest = deepest_function(kinds, raycast)
-    io = io_functions(mode, hysteresis, walk)
-    emit, measure, lost, idle = io.emit, io.measure, io.lost, io.idle
-    types, pairs_type, solids_type = io_structs(), pair_structs().Pairs, query_structs().Solids
-    probes_type, io_type = types.ProbeSet, types.Io
-    noise = noise_functions()
-    params_type, radius_noise, gain = noise.NoiseParams, noise.radius_noise, noise.gain
-
-    @wp.func
-    def latch(before: float, age: int, value: float, limits: wp.vec2f) -> float:
-        """Schmitt trigger (4.3); a lost reading before counts as no contact."""
-        if value > limits[0] or (age > 0 and before > 0.5 and value > limits[1]):
-            return 1.0
-        return 0.0
+    deepest, readout = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk)
+    emit, measure = readout.emit, readout.measure
 
     @wp.kernel(module="unique")
     def contact_depth(
-        probes: probes_type,
-        solids: solids_type,
-        pairs: pairs_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
+        probes: ProbeArrays,
+        solids: SolidArrays,
+        pairs: PairArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
         limits: wp.array(dtype=wp.vec2f),
     ):
         env, n = wp.tid()
@@ -172,20 +167,15 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
     return contact_depth
 
 
-@cache
-def kinematic_params() -> Any:
-    """Return the structure ``KinematicParams``."""
-    import warp as wp
+@wp.struct
+class KinematicParams:
+    """Law of one force field; units as in ``KinematicTaxel``."""
 
-    @wp.struct
-    class KinematicParams:
-        stiffness: wp.float32
-        damping: wp.float32
-        exponent: wp.float32
-        shear: wp.float32
-        twist: wp.float32
-
-    return KinematicParams
+    stiffness: wp.float32
+    damping: wp.float32
+    exponent: wp.float32
+    shear: wp.float32
+    twist: wp.float32
 
 
 @cache
@@ -196,14 +186,11 @@ def kinematic_function(physical: bool, fast: bool = False) -> Any:
         physical: friction and twist follow the object and the normal force never pulls; otherwise as published.
         fast: the power is the GPU's own (in modules with the option ``fast_math``) in place of a series.
     """
-    import warp as wp
-
-    params_type = kinematic_params()
-    power = wp.pow if fast else series_functions().power
+    power = wp.pow if fast else series_power
 
     @wp.func
     def wrench(
-        p: params_type, x: wp.vec3f, depth: float, normal: wp.vec3f, velocity: wp.vec3f, spin: wp.vec3f
+        p: KinematicParams, x: wp.vec3f, depth: float, normal: wp.vec3f, velocity: wp.vec3f, spin: wp.vec3f
     ) -> wp.spatial_vectorf:
         s = power(depth, p.exponent)
         relative = velocity + wp.cross(spin, x)
@@ -240,18 +227,11 @@ def kinematic_kernel(
         walk: whether it is stored.
         fast: square roots and quotients of the GPU's approximate units (2 units in the last place).
     """
-    import warp as wp
-
-    structs, functions = query_structs(), shape_functions(kinds, raycast)
-    shape_of, distance_to = functions.shape_of, functions.distance_to
-    io = io_functions(mode, hysteresis, walk)
-    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
-    types, pairs_type, solids_type, shape_type = io_structs(), pair_structs().Pairs, structs.Solids, structs.Shape
-    probes_type, io_type = types.ProbeSet, types.Io
-    noise = noise_functions()
-    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
+    shapes, readout = shape_functions(kinds, raycast), readout_functions(mode, hysteresis, walk)
+    shape_of, distance_to = shapes.shape_of, shapes.distance_to
+    emit_six, recall_six = readout.emit_six, readout.recall_six
     fast = fast and not raycast
-    law_type, wrench = kinematic_params(), kinematic_function(physical, fast)
+    wrench = kinematic_function(physical, fast)
 
     @wp.kernel(
         module="unique",
@@ -260,13 +240,13 @@ def kinematic_kernel(
         module_options={"fast_math": fast},
     )
     def kinematic(
-        probes: probes_type,
+        probes: ProbeArrays,
         rows: wp.array(dtype=wp.vec4i),
-        solids: solids_type,
-        pairs: pairs_type,
-        io: io_type,
-        all_knobs: wp.array(dtype=params_type),
-        laws: wp.array(dtype=law_type),
+        solids: SolidArrays,
+        pairs: PairArrays,
+        io: ReadoutArrays,
+        all_knobs: wp.array(dtype=NoiseParams),
+        laws: wp.array(dtype=KinematicParams),
     ):
         env, at_row = wp.tid()
         span = rows[at_row]
@@ -287,7 +267,7 @@ def kinematic_kernel(
         first = pairs.first[slot]
         count = pairs.count[env, slot]
         law = laws[part]
-        knobs = params_type()
+        knobs = NoiseParams()
         age = int(0)
         episode = int(0)
         if wp.static(mode != CLEAN):
@@ -295,7 +275,7 @@ def kinematic_kernel(
             age = io.age[env]
             episode = io.episode[env]
         held = int(-1)
-        shape = shape_type()
+        shape = SolidShape()
         rotation = wp.mat33f()
         offset = wp.vec3f()
         limit = float(0.0)

@@ -1,11 +1,15 @@
-"""How far a point lies from a solid, as Warp functions: closed forms, sampled distance fields and triangles.
+"""Signed distance of a point to a solid, as Warp functions: closed forms, sampled distance fields and triangles.
 
-All in the frame of the geometry, in metres: distances are negative inside, normals point out of the solid.
+Every function ``name(…, x) -> (normal, distance)`` gives a vec4 in the frame of the geometry: the outward unit normal
+and the distance (m), negative inside. Letters: R variant row (1 or B environments), G geometry, F distance field.
 """
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+
+from brainbench.core.devices import warp
+
+wp = warp()
 
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, OTHER = range(8)
 """Numbers of the kinds, in the order of :data:`robotics_bridge.physics.scene.KINDS`."""
@@ -14,255 +18,244 @@ FAR = 1.0e6
 """Distance that stands for "out of reach" (m)."""
 
 
-@cache
-def query_structs() -> SimpleNamespace:
-    """Return the structures ``Solids`` and ``Shape``: the geometries of a scene on a device, and one of them.
+@wp.struct
+class SolidArrays:
+    """The geometries of a scene on a device."""
 
-    R variant row (1 or B), G geometry.
-    """
-    import warp as wp
-
-    @wp.struct
-    class Solids:
-        kind: wp.array2d(dtype=wp.int32)
-        size: wp.array2d(dtype=wp.vec3f)
-        frame: wp.array2d(dtype=wp.transformf)
-        bound: wp.array2d(dtype=wp.vec4f)
-        link: wp.array(dtype=wp.int32)
-        field: wp.array2d(dtype=wp.int32)
-        mesh: wp.array2d(dtype=wp.uint64)
-        first: wp.array(dtype=wp.int32)
-        counts: wp.array(dtype=wp.vec3i)
-        origin: wp.array(dtype=wp.vec3f)
-        spacing: wp.array(dtype=wp.float32)
-        values: wp.array(dtype=wp.float32)
-
-    @wp.struct
-    class Shape:
-        kind: wp.int32
-        size: wp.vec3f
-        mesh: wp.uint64
-        first: wp.int32
-        counts: wp.vec3i
-        origin: wp.vec3f
-        spacing: wp.float32
-
-    return SimpleNamespace(Solids=Solids, Shape=Shape)
+    kind: wp.array2d(dtype=wp.int32)
+    """[R, G] number of the kind."""
+    size: wp.array2d(dtype=wp.vec3f)
+    """[R, G] (m), as in ``Geometry.size``."""
+    frame: wp.array2d(dtype=wp.transformf)
+    """[R, G] pose in the frame of the link."""
+    bound: wp.array2d(dtype=wp.vec4f)
+    """[R, G] centre and radius of an enclosing sphere (m)."""
+    link: wp.array(dtype=wp.int32)
+    """[G]."""
+    field: wp.array2d(dtype=wp.int32)
+    """[R, G] number of the distance field, −1 for none."""
+    mesh: wp.array2d(dtype=wp.uint64)
+    """[R, G] id of the triangle tree."""
+    first: wp.array(dtype=wp.int32)
+    """[F] first sample of a field in ``values``."""
+    counts: wp.array(dtype=wp.vec3i)
+    """[F] samples along each axis."""
+    origin: wp.array(dtype=wp.vec3f)
+    """[F] position of the first sample (m)."""
+    spacing: wp.array(dtype=wp.float32)
+    """[F] (m)."""
+    values: wp.array(dtype=wp.float32)
+    """Samples of all fields (m)."""
 
 
-@cache
-def primitive_functions() -> SimpleNamespace:
-    """Return ``name(size, x) -> (normal, distance)`` of every primitive, as vec4."""
-    import warp as wp
+@wp.struct
+class SolidShape:
+    """One geometry, read once for many points."""
 
-    @wp.func
-    def plane(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-        return wp.vec4f(0.0, 0.0, 1.0, x[2])
+    kind: wp.int32
+    size: wp.vec3f
+    mesh: wp.uint64
+    first: wp.int32
+    counts: wp.vec3i
+    origin: wp.vec3f
+    spacing: wp.float32
 
-    @wp.func
-    def sphere(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-        far = wp.length(x)
-        n = wp.vec3f(0.0, 0.0, 1.0)
-        if far > 1.0e-12:
-            n = x / far
-        return wp.vec4f(n[0], n[1], n[2], far - size[0])
 
-    @wp.func
-    def capsule(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-        return sphere(size, wp.vec3f(x[0], x[1], x[2] - wp.clamp(x[2], -size[1], size[1])))
+@wp.func
+def plane(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    return wp.vec4f(0.0, 0.0, 1.0, x[2])
 
-    @wp.func
-    def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-        radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
-        side = radial - size[0]
-        end = wp.abs(x[2]) - size[1]
-        ux = float(1.0)
-        uy = float(0.0)
-        if radial > 1.0e-12:
-            ux = x[0] / radial
-            uy = x[1] / radial
-        uz = wp.where(x[2] < 0.0, -1.0, 1.0)
-        if side > 0.0 and end > 0.0:
-            far = wp.sqrt(side * side + end * end)
-            return wp.vec4f(ux * side / far, uy * side / far, uz * end / far, far)
-        if side > end:
-            return wp.vec4f(ux, uy, 0.0, side)
-        return wp.vec4f(0.0, 0.0, uz, end)
 
-    @wp.func
-    def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-        ox = wp.abs(x[0]) - size[0]
-        oy = wp.abs(x[1]) - size[1]
-        oz = wp.abs(x[2]) - size[2]
-        sx = wp.where(x[0] < 0.0, -1.0, 1.0)
-        sy = wp.where(x[1] < 0.0, -1.0, 1.0)
-        sz = wp.where(x[2] < 0.0, -1.0, 1.0)
-        if ox > 0.0 or oy > 0.0 or oz > 0.0:
-            bx = wp.max(ox, 0.0)
-            by = wp.max(oy, 0.0)
-            bz = wp.max(oz, 0.0)
-            far = wp.sqrt(bx * bx + by * by + bz * bz)
-            inverse = 1.0 / far
-            return wp.vec4f(sx * bx * inverse, sy * by * inverse, sz * bz * inverse, far)
-        if ox >= oy and ox >= oz:
-            return wp.vec4f(sx, 0.0, 0.0, ox)
-        if oy >= oz:
-            return wp.vec4f(0.0, sy, 0.0, oy)
-        return wp.vec4f(0.0, 0.0, sz, oz)
+@wp.func
+def sphere(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    far = wp.length(x)
+    n = wp.vec3f(0.0, 0.0, 1.0)
+    if far > 1.0e-12:
+        n = x / far
+    return wp.vec4f(n[0], n[1], n[2], far - size[0])
 
-    @wp.func
-    def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-        """Nearest point e² x / (e² + t) with t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
-        # Coordinates of exactly zero hide the root at the short axis.
-        shift = 1.0e-6 * wp.min(size)
-        y = wp.vec3f(wp.max(wp.abs(x[0]), shift), wp.max(wp.abs(x[1]), shift), wp.max(wp.abs(x[2]), shift))
-        short = wp.min(size)
-        squares = wp.cw_mul(size, size)
-        scaled = wp.cw_mul(size, y)
-        low = -short * short
-        high = wp.length(scaled)
-        for _ in range(40):
-            t = 0.5 * (low + high)
-            a = scaled[0] / (squares[0] + t)
-            b = scaled[1] / (squares[1] + t)
-            c = scaled[2] / (squares[2] + t)
-            if a * a + b * b + c * c > 1.0:
-                low = t
-            else:
-                high = t
+
+@wp.func
+def capsule(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    return sphere(size, wp.vec3f(x[0], x[1], x[2] - wp.clamp(x[2], -size[1], size[1])))
+
+
+@wp.func
+def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+    side = radial - size[0]
+    end = wp.abs(x[2]) - size[1]
+    ux = float(1.0)
+    uy = float(0.0)
+    if radial > 1.0e-12:
+        ux = x[0] / radial
+        uy = x[1] / radial
+    uz = wp.where(x[2] < 0.0, -1.0, 1.0)
+    if side > 0.0 and end > 0.0:
+        far = wp.sqrt(side * side + end * end)
+        return wp.vec4f(ux * side / far, uy * side / far, uz * end / far, far)
+    if side > end:
+        return wp.vec4f(ux, uy, 0.0, side)
+    return wp.vec4f(0.0, 0.0, uz, end)
+
+
+@wp.func
+def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    ox = wp.abs(x[0]) - size[0]
+    oy = wp.abs(x[1]) - size[1]
+    oz = wp.abs(x[2]) - size[2]
+    sx = wp.where(x[0] < 0.0, -1.0, 1.0)
+    sy = wp.where(x[1] < 0.0, -1.0, 1.0)
+    sz = wp.where(x[2] < 0.0, -1.0, 1.0)
+    if ox > 0.0 or oy > 0.0 or oz > 0.0:
+        bx = wp.max(ox, 0.0)
+        by = wp.max(oy, 0.0)
+        bz = wp.max(oz, 0.0)
+        far = wp.sqrt(bx * bx + by * by + bz * bz)
+        inverse = 1.0 / far
+        return wp.vec4f(sx * bx * inverse, sy * by * inverse, sz * bz * inverse, far)
+    if ox >= oy and ox >= oz:
+        return wp.vec4f(sx, 0.0, 0.0, ox)
+    if oy >= oz:
+        return wp.vec4f(0.0, sy, 0.0, oy)
+    return wp.vec4f(0.0, 0.0, sz, oz)
+
+
+@wp.func
+def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    """Nearest point e² x / (e² + t) with t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
+    # Coordinates of exactly zero hide the root at the short axis.
+    shift = 1.0e-6 * wp.min(size)
+    y = wp.vec3f(wp.max(wp.abs(x[0]), shift), wp.max(wp.abs(x[1]), shift), wp.max(wp.abs(x[2]), shift))
+    short = wp.min(size)
+    squares = wp.cw_mul(size, size)
+    scaled = wp.cw_mul(size, y)
+    low = -short * short
+    high = wp.length(scaled)
+    for _ in range(40):
         t = 0.5 * (low + high)
-        near = wp.vec3f(
-            squares[0] * y[0] / (squares[0] + t),
-            squares[1] * y[1] / (squares[1] + t),
-            squares[2] * y[2] / (squares[2] + t),
-        )
-        n = wp.normalize(wp.cw_div(near, squares))
-        distance = wp.dot(y - near, n)
-        sx = wp.where(x[0] < 0.0, -1.0, 1.0)
-        sy = wp.where(x[1] < 0.0, -1.0, 1.0)
-        sz = wp.where(x[2] < 0.0, -1.0, 1.0)
-        return wp.vec4f(sx * n[0], sy * n[1], sz * n[2], distance)
+        a = scaled[0] / (squares[0] + t)
+        b = scaled[1] / (squares[1] + t)
+        c = scaled[2] / (squares[2] + t)
+        if a * a + b * b + c * c > 1.0:
+            low = t
+        else:
+            high = t
+    t = 0.5 * (low + high)
+    near = wp.vec3f(
+        squares[0] * y[0] / (squares[0] + t),
+        squares[1] * y[1] / (squares[1] + t),
+        squares[2] * y[2] / (squares[2] + t),
+    )
+    n = wp.normalize(wp.cw_div(near, squares))
+    distance = wp.dot(y - near, n)
+    sx = wp.where(x[0] < 0.0, -1.0, 1.0)
+    sy = wp.where(x[1] < 0.0, -1.0, 1.0)
+    sz = wp.where(x[2] < 0.0, -1.0, 1.0)
+    return wp.vec4f(sx * n[0], sy * n[1], sz * n[2], distance)
 
-    return SimpleNamespace(plane=plane, sphere=sphere, capsule=capsule, ellipsoid=ellipsoid, cylinder=cylinder, box=box)
 
-
-@cache
-def field_function() -> Any:
-    """Return ``field(values, shape, x) -> (normal, distance)``: a sampled field, linear within its cells.
+@wp.func
+def field(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f) -> wp.vec4f:
+    """Interpolate a sampled field linearly within its cells.
 
     Beyond the samples the distance is that to the surface point which the nearest border sample points at.
     """
-    import warp as wp
-
-    shape_type = query_structs().Shape
-
-    @wp.func
-    def field(values: wp.array(dtype=wp.float32), shape: shape_type, x: wp.vec3f) -> wp.vec4f:
-        spacing = shape.spacing
-        n = shape.counts
-        u = (x - shape.origin) / spacing
-        limit = wp.vec3f(float(n[0] - 1), float(n[1] - 1), float(n[2] - 1))
-        c = wp.vec3f(wp.clamp(u[0], 0.0, limit[0]), wp.clamp(u[1], 0.0, limit[1]), wp.clamp(u[2], 0.0, limit[2]))
-        i = wp.min(int(c[0]), n[0] - 2)
-        j = wp.min(int(c[1]), n[1] - 2)
-        k = wp.min(int(c[2]), n[2] - 2)
-        fx = c[0] - float(i)
-        fy = c[1] - float(j)
-        fz = c[2] - float(k)
-        at = shape.first + (i * n[1] + j) * n[2] + k
-        row = n[2]
-        sheet = n[1] * n[2]
-        v000 = values[at]
-        v001 = values[at + 1]
-        v010 = values[at + row]
-        v011 = values[at + row + 1]
-        v100 = values[at + sheet]
-        v101 = values[at + sheet + 1]
-        v110 = values[at + sheet + row]
-        v111 = values[at + sheet + row + 1]
-        v00 = v000 + fz * (v001 - v000)
-        v01 = v010 + fz * (v011 - v010)
-        v10 = v100 + fz * (v101 - v100)
-        v11 = v110 + fz * (v111 - v110)
-        v0 = v00 + fy * (v01 - v00)
-        v1 = v10 + fy * (v11 - v10)
-        gy = (1.0 - fx) * (v01 - v00) + fx * (v11 - v10)
-        gz0 = (1.0 - fy) * (v001 - v000) + fy * (v011 - v010)
-        gz1 = (1.0 - fy) * (v101 - v100) + fy * (v111 - v110)
-        gradient = wp.vec3f(v1 - v0, gy, (1.0 - fx) * gz0 + fx * gz1)
-        far = wp.length(gradient)
-        normal = wp.vec3f(0.0, 0.0, 1.0)
-        if far > 1.0e-12:
-            normal = gradient / far
-        distance = v0 + fx * (v1 - v0)
-        out = (u - c) * spacing
-        if wp.dot(out, out) > 0.0:
-            away = out + normal * distance
-            distance = wp.length(away)
-            normal = away / wp.max(distance, 1.0e-12)
-        return wp.vec4f(normal[0], normal[1], normal[2], distance)
-
-    return field
+    spacing = shape.spacing
+    n = shape.counts
+    u = (x - shape.origin) / spacing
+    limit = wp.vec3f(float(n[0] - 1), float(n[1] - 1), float(n[2] - 1))
+    c = wp.vec3f(wp.clamp(u[0], 0.0, limit[0]), wp.clamp(u[1], 0.0, limit[1]), wp.clamp(u[2], 0.0, limit[2]))
+    i = wp.min(int(c[0]), n[0] - 2)
+    j = wp.min(int(c[1]), n[1] - 2)
+    k = wp.min(int(c[2]), n[2] - 2)
+    fx = c[0] - float(i)
+    fy = c[1] - float(j)
+    fz = c[2] - float(k)
+    at = shape.first + (i * n[1] + j) * n[2] + k
+    row = n[2]
+    sheet = n[1] * n[2]
+    v000 = values[at]
+    v001 = values[at + 1]
+    v010 = values[at + row]
+    v011 = values[at + row + 1]
+    v100 = values[at + sheet]
+    v101 = values[at + sheet + 1]
+    v110 = values[at + sheet + row]
+    v111 = values[at + sheet + row + 1]
+    v00 = v000 + fz * (v001 - v000)
+    v01 = v010 + fz * (v011 - v010)
+    v10 = v100 + fz * (v101 - v100)
+    v11 = v110 + fz * (v111 - v110)
+    v0 = v00 + fy * (v01 - v00)
+    v1 = v10 + fy * (v11 - v10)
+    gy = (1.0 - fx) * (v01 - v00) + fx * (v11 - v10)
+    gz0 = (1.0 - fy) * (v001 - v000) + fy * (v011 - v010)
+    gz1 = (1.0 - fy) * (v101 - v100) + fy * (v111 - v110)
+    gradient = wp.vec3f(v1 - v0, gy, (1.0 - fx) * gz0 + fx * gz1)
+    far = wp.length(gradient)
+    normal = wp.vec3f(0.0, 0.0, 1.0)
+    if far > 1.0e-12:
+        normal = gradient / far
+    distance = v0 + fx * (v1 - v0)
+    out = (u - c) * spacing
+    if wp.dot(out, out) > 0.0:
+        away = out + normal * distance
+        distance = wp.length(away)
+        normal = away / wp.max(distance, 1.0e-12)
+    return wp.vec4f(normal[0], normal[1], normal[2], distance)
 
 
-@cache
-def triangle_function() -> Any:
-    """Return ``triangles(mesh, x, reach) -> (normal, distance)``: the nearest triangle of a closed mesh."""
-    import warp as wp
+@wp.func
+def triangles(mesh: wp.uint64, x: wp.vec3f, reach: float) -> wp.vec4f:
+    """Find the nearest triangle of a closed mesh."""
+    found = wp.mesh_query_point_sign_normal(mesh, x, reach)
+    if not found.result:
+        return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
+    away = x - wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+    far = wp.length(away)
+    normal = wp.mesh_eval_face_normal(mesh, found.face)
+    # Nearer than rounding can tell a direction, the face knows it.
+    if far > 1.2e-4 * wp.length(x):
+        normal = away * (found.sign / far)
+    return wp.vec4f(normal[0], normal[1], normal[2], found.sign * far)
 
-    @wp.func
-    def triangles(mesh: wp.uint64, x: wp.vec3f, reach: float) -> wp.vec4f:
-        found = wp.mesh_query_point_sign_normal(mesh, x, reach)
-        if not found.result:
-            return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
-        away = x - wp.mesh_eval_position(mesh, found.face, found.u, found.v)
-        far = wp.length(away)
-        normal = wp.mesh_eval_face_normal(mesh, found.face)
-        # Nearer than rounding can tell a direction, the face knows it.
-        if far > 1.2e-4 * wp.length(x):
-            normal = away * (found.sign / far)
-        return wp.vec4f(normal[0], normal[1], normal[2], found.sign * far)
 
-    return triangles
+@wp.kernel(module="unique")
+def sample_field(mesh: wp.uint64, origin: wp.vec3f, spacing: float, reach: float, values: wp.array3d(dtype=wp.float32)):
+    """Write the signed distance (m) to a mesh at every sample of a grid. Thread: a sample [nx, ny, nz]."""
+    i, j, k = wp.tid()
+    x = origin + wp.vec3f(float(i), float(j), float(k)) * spacing
+    found = wp.mesh_query_point_sign_winding_number(mesh, x, reach, 2.0, 0.5)
+    near = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+    values[i, j, k] = found.sign * wp.length(x - near)
 
 
 @cache
 def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
-    """Return what finds distances for the kinds a scene has.
+    """Return the functions that find distances for the kinds a scene has.
 
     ``shape_of(solids, row, geometry)`` reads what is known of a geometry, once for many points;
-    ``distance_to(values, shape, x, reach) -> (normal, distance)`` asks it, with ``solids.values``.
+    ``distance_to(solids.values, shape, x, reach) -> (normal, distance)`` asks it;
+    ``distance(solids, row, geometry, x, reach)`` does both.
 
     Args:
         kinds: only their code is compiled.
         raycast: ask triangles instead of closed forms and fields; planes stay planes.
     """
-    import warp as wp
-
-    structs = query_structs()
-    solids_type, shape_type = structs.Solids, structs.Shape
-    p = primitive_functions()
-    plane, sphere, capsule, ellipsoid, cylinder, box = p.plane, p.sphere, p.capsule, p.ellipsoid, p.cylinder, p.box
     curved = not raycast
-    has_plane = PLANE in kinds
-    has_sphere, has_capsule = curved and SPHERE in kinds, curved and CAPSULE in kinds
-    has_ellipsoid, has_cylinder = curved and ELLIPSOID in kinds, curved and CYLINDER in kinds
-    has_box = curved and BOX in kinds
-    has_field = curved and MESH in kinds
     has_triangles = raycast and bool(kinds - {PLANE})
     sized = curved and bool(kinds - {PLANE, MESH})
-    field = field_function() if has_field else None
-    triangles = triangle_function() if has_triangles else None
 
     @wp.func
-    def shape_of(solids: solids_type, row: int, geometry: int) -> shape_type:
-        shape = shape_type()
+    def shape_of(solids: SolidArrays, row: int, geometry: int) -> SolidShape:
+        shape = SolidShape()
         shape.kind = solids.kind[row, geometry]
         if wp.static(sized):
             shape.size = solids.size[row, geometry]
         if wp.static(has_triangles):
             shape.mesh = solids.mesh[row, geometry]
-        if wp.static(has_field):
+        if wp.static(curved and MESH in kinds):
             number = wp.max(solids.field[row, geometry], 0)
             shape.first = solids.first[number]
             shape.counts = solids.counts[number]
@@ -271,46 +264,34 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
         return shape
 
     @wp.func
-    def distance_to(values: wp.array(dtype=wp.float32), shape: shape_type, x: wp.vec3f, reach: float) -> wp.vec4f:
-        if wp.static(has_plane):
+    def distance_to(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, reach: float) -> wp.vec4f:
+        if wp.static(PLANE in kinds):
             if shape.kind == wp.static(PLANE):
                 return plane(shape.size, x)
         if wp.static(has_triangles):
             return triangles(shape.mesh, x, reach)
-        if wp.static(has_box):
+        if wp.static(curved and BOX in kinds):
             if shape.kind == wp.static(BOX):
                 return box(shape.size, x)
-        if wp.static(has_sphere):
+        if wp.static(curved and SPHERE in kinds):
             if shape.kind == wp.static(SPHERE):
                 return sphere(shape.size, x)
-        if wp.static(has_capsule):
+        if wp.static(curved and CAPSULE in kinds):
             if shape.kind == wp.static(CAPSULE):
                 return capsule(shape.size, x)
-        if wp.static(has_cylinder):
+        if wp.static(curved and CYLINDER in kinds):
             if shape.kind == wp.static(CYLINDER):
                 return cylinder(shape.size, x)
-        if wp.static(has_ellipsoid):
+        if wp.static(curved and ELLIPSOID in kinds):
             if shape.kind == wp.static(ELLIPSOID):
                 return ellipsoid(shape.size, x)
-        if wp.static(has_field):
+        if wp.static(curved and MESH in kinds):
             if shape.kind == wp.static(MESH):
                 return field(values, shape, x)
         return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
 
-    return SimpleNamespace(shape_of=shape_of, distance_to=distance_to)
-
-
-@cache
-def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
-    """Return ``distance(solids, row, geometry, x, reach) -> (normal, distance)``, both of :func:`shape_functions`."""
-    import warp as wp
-
-    solids_type = query_structs().Solids
-    functions = shape_functions(kinds, raycast)
-    shape_of, distance_to = functions.shape_of, functions.distance_to
-
     @wp.func
-    def distance(solids: solids_type, row: int, geometry: int, x: wp.vec3f, reach: float) -> wp.vec4f:
+    def distance(solids: SolidArrays, row: int, geometry: int, x: wp.vec3f, reach: float) -> wp.vec4f:
         return distance_to(solids.values, shape_of(solids, row, geometry), x, reach)
 
-    return distance
+    return SimpleNamespace(shape_of=shape_of, distance_to=distance_to, distance=distance)

@@ -6,66 +6,91 @@ pose arithmetic of their own. Letters: B environment, S slot, P place in the lis
 """
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
-from robotics_bridge.physics.kernels.state import state_kernels
-from robotics_bridge.sensors.queries.kernels.distance import PLANE, query_structs
+from brainbench.core.devices import warp
+from robotics_bridge.physics.kernels.state import link_fails, status_of
+from robotics_bridge.sensors.queries.kernels.distance import PLANE, SolidArrays
 
-
-@cache
-def pair_structs() -> SimpleNamespace:
-    """Return the structures ``Slots`` (the plan) and ``Pairs`` (what was found)."""
-    import warp as wp
-
-    @wp.struct
-    class Slots:
-        link: wp.array(dtype=wp.int32)
-        watched: wp.array(dtype=wp.int32)
-        contact: wp.array(dtype=wp.int32)
-        first: wp.array(dtype=wp.int32)
-        room: wp.array(dtype=wp.int32)
-        members: wp.array(dtype=wp.int32)
-        member_first: wp.array(dtype=wp.int32)
-        place: wp.array2d(dtype=wp.int32)
-        center: wp.array(dtype=wp.vec3f)
-        reach: wp.array(dtype=wp.float32)
-
-    @wp.struct
-    class Pairs:
-        count: wp.array2d(dtype=wp.int32)
-        first: wp.array(dtype=wp.int32)
-        geometry: wp.array2d(dtype=wp.int32)
-        rotation: wp.array2d(dtype=wp.mat33f)
-        offset: wp.array2d(dtype=wp.vec3f)
-        velocity: wp.array2d(dtype=wp.vec3f)
-        spin: wp.array2d(dtype=wp.vec3f)
-
-    return SimpleNamespace(Slots=Slots, Pairs=Pairs)
-
-
-@cache
-def begin_kernel() -> SimpleNamespace:
-    """Return the kernel ``begin`` that counts the update and ``reset`` that starts episodes. Dim [B]."""
-    import warp as wp
-
-    @wp.kernel(module="unique")
-    def begin(age: wp.array(dtype=wp.int32)):
-        env = wp.tid()
-        age[env] = age[env] + 1
-
-    @wp.kernel(module="unique")
-    def reset(mask: wp.array(dtype=wp.bool), age: wp.array(dtype=wp.int32), episode: wp.array(dtype=wp.int32)):
-        env = wp.tid()
-        if mask[env]:
-            age[env] = -1
-            episode[env] = episode[env] + 1
-
-    return SimpleNamespace(begin=begin, reset=reset)
-
+wp = warp()
 
 CONTACTS = 4
 """Contacts that one thread looks at, so that it waits for memory once for all of them."""
+
+
+@wp.struct
+class SlotArrays:
+    """Plan of who may meet whom."""
+
+    link: wp.array(dtype=wp.int32)
+    """[S] sensor link."""
+    watched: wp.array(dtype=wp.int32)
+    """[G] link of a geometry whose contacts matter, else −1."""
+    contact: wp.array(dtype=wp.int32)
+    """[S] 1: only geometries in contact are listed."""
+    first: wp.array(dtype=wp.int32)
+    """[S + 1] first place of the list."""
+    room: wp.array(dtype=wp.int32)
+    """[S] places of the list."""
+    members: wp.array(dtype=wp.int32)
+    """Geometries that may be met, slot by slot."""
+    member_first: wp.array(dtype=wp.int32)
+    """[S + 1] first member."""
+    place: wp.array2d(dtype=wp.int32)
+    """[S, G] number of a geometry among the members, −1 for none."""
+    center: wp.array(dtype=wp.vec3f)
+    """[S] middle of the probes, link frame (m)."""
+    reach: wp.array(dtype=wp.float32)
+    """[S] how far from it a geometry matters (m); 0 is unlimited."""
+
+
+@wp.struct
+class PairArrays:
+    """Geometries that the slots meet now."""
+
+    count: wp.array2d(dtype=wp.int32)
+    """[B, S]."""
+    first: wp.array(dtype=wp.int32)
+    """[S + 1] first place of a slot's list."""
+    geometry: wp.array2d(dtype=wp.int32)
+    """[B, P]."""
+    rotation: wp.array2d(dtype=wp.mat33f)
+    """[B, P] from the link's to the geometry's frame."""
+    offset: wp.array2d(dtype=wp.vec3f)
+    """[B, P] of the link's origin in the geometry's frame (m)."""
+    velocity: wp.array2d(dtype=wp.vec3f)
+    """[B, P] of the geometry at the link's origin, relative to the link, link frame (m/s)."""
+    spin: wp.array2d(dtype=wp.vec3f)
+    """[B, P] relative angular velocity, link frame (rad/s)."""
+
+
+@wp.kernel(module="unique")
+def count_update(age: wp.array(dtype=wp.int32)):
+    """Count an update. Thread: a counter."""
+    env = wp.tid()
+    age[env] = age[env] + 1
+
+
+@wp.kernel(module="unique")
+def reset_clock(mask: wp.array(dtype=wp.bool), age: wp.array(dtype=wp.int32), episode: wp.array(dtype=wp.int32)):
+    """Start an episode in chosen environments. Thread: environment [B]."""
+    env = wp.tid()
+    if mask[env]:
+        age[env] = -1
+        episode[env] = episode[env] + 1
+
+
+@wp.func
+def mark(slots: SlotArrays, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
+    """Note in the bits of every slot of a link that it touches a geometry."""
+    for slot in range(slots.link.shape[0]):
+        if slots.contact[slot] == 1 and slots.link[slot] == link:
+            place = slots.place[slot, other]
+            if place >= 0:
+                word = slot * words + place // 32
+                bit = wp.int32(1) << wp.int32(place % 32)
+                if (bits[env, word] & bit) == 0:
+                    wp.atomic_or(bits, env, word, bit)
 
 
 @cache
@@ -79,24 +104,10 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
         contacts: whether any slot looks at them.
         apart: whether :func:`pair_kernel` looks at the numbers of the state, a thread for each link.
     """
-    import warp as wp
-
-    slots_type, status_of = pair_structs().Slots, state_kernels().status_of
-
-    @wp.func
-    def mark(slots: slots_type, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
-        for slot in range(slots.link.shape[0]):
-            if slots.contact[slot] == 1 and slots.link[slot] == link:
-                place = slots.place[slot, other]
-                if place >= 0:
-                    word = slot * words + place // 32
-                    bit = wp.int32(1) << wp.int32(place % 32)
-                    if (bits[env, word] & bit) == 0:
-                        wp.atomic_or(bits, env, word, bit)
 
     @wp.kernel(module="unique", grid_stride=False)
     def start(
-        slots: slots_type,
+        slots: SlotArrays,
         pose: wp.array2d(dtype=wp.transformf),
         velocity: wp.array2d(dtype=wp.spatial_vectorf),
         count: wp.array(dtype=wp.int32),
@@ -167,21 +178,16 @@ def pair_kernel(apart: bool) -> Any:
 
     Dim [B S], and ``apart`` B L more threads, which look for numbers of the state that are not finite.
     """
-    import warp as wp
-
-    structs = pair_structs()
-    slots_type, pairs_type, solids_type = structs.Slots, structs.Pairs, query_structs().Solids
-    link_fails = state_kernels().link_fails
 
     @wp.kernel(module="unique", grid_stride=False)
     def pairs(
-        slots: slots_type,
-        solids: solids_type,
+        slots: SlotArrays,
+        solids: SolidArrays,
         pose: wp.array2d(dtype=wp.transformf),
         velocity: wp.array2d(dtype=wp.spatial_vectorf),
         words: int,
         bits: wp.array2d(dtype=wp.int32),
-        out: pairs_type,
+        out: PairArrays,
         crowded: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
     ):

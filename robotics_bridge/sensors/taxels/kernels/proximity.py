@@ -1,12 +1,17 @@
-"""Surface points in blocks of neighbours, and the proximity taxel that sums over them (thesis 4.11–4.16)."""
+"""Surface points in blocks of neighbours, and the proximity taxel that sums over them (thesis 4.11–4.16).
+
+Letters: B environment, N taxel, P surface point, K block of points, R variant row, G geometry, S sensor.
+"""
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
-from robotics_bridge.sensors.kernels.readout import CLEAN, io_functions, io_structs
-from robotics_bridge.sensors.noise.kernels.noise import noise_functions
-from robotics_bridge.sensors.queries.kernels.pairs import pair_structs
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, idle, lost, readout_functions
+from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, episode_draw, radius_noise
+from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
+
+wp = warp()
 
 BLOCK = 32
 """Points of a block."""
@@ -14,24 +19,24 @@ CELL = 16
 """Neighbouring probes that ask for the points around them together."""
 
 
-@cache
-def cloud_structs() -> SimpleNamespace:
-    """Return the structure ``Cloud``: points, a bounding sphere per block, and the blocks of a geometry per row."""
-    import warp as wp
+@wp.struct
+class CloudArrays:
+    """Surface points of the geometries that a sensor tracks."""
 
-    @wp.struct
-    class Cloud:
-        point: wp.array(dtype=wp.vec3f)
-        sphere: wp.array(dtype=wp.vec4f)
-        first: wp.array2d(dtype=wp.int32)
-        blocks: wp.array2d(dtype=wp.int32)
+    point: wp.array(dtype=wp.vec3f)
+    """[P] in the geometry's frame (m); NaN fills the last block of a geometry."""
+    sphere: wp.array(dtype=wp.vec4f)
+    """[K] centre and radius of a sphere around each block (m)."""
+    first: wp.array2d(dtype=wp.int32)
+    """[R, G] first block of a geometry."""
+    blocks: wp.array2d(dtype=wp.int32)
+    """[R, G] number of its blocks."""
 
-    @wp.struct
-    class ProximityParams:
-        stiffness: wp.float32
-        coupling: wp.float32
 
-    return SimpleNamespace(Cloud=Cloud, ProximityParams=ProximityParams)
+@wp.struct
+class ProximityParams:
+    stiffness: wp.float32
+    coupling: wp.float32
 
 
 @cache
@@ -46,19 +51,18 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         gathered: a thread serves all probes of an environment, and lists the points around each cell of neighbouring
             probes before these look at them. The terms of a sum, and their order, are the same.
     """
-    import warp as wp
-
-    io = io_functions(mode, hysteresis, walk)
-    emit_six, recall_six, episode_draw, lost, idle = io.emit_six, io.recall_six, io.episode_draw, io.lost, io.idle
-    types, pairs_type, structs = io_structs(), pair_structs().Pairs, cloud_structs()
-    probes_type, io_type = types.ProbeSet, types.Io
-    cloud_type, law_type = structs.Cloud, structs.ProximityParams
-    noise = noise_functions()
-    params_type, radius_noise = noise.NoiseParams, noise.radius_noise
+    readout = readout_functions(mode, hysteresis, walk)
+    emit_six, recall_six = readout.emit_six, readout.recall_six
 
     @wp.func
     def wrench(
-        law: law_type, density: float, x: wp.vec3f, normal: wp.vec3f, mass: float, moment: wp.vec3f, slip: wp.vec3f
+        law: ProximityParams,
+        density: float,
+        x: wp.vec3f,
+        normal: wp.vec3f,
+        mass: float,
+        moment: wp.vec3f,
+        slip: wp.vec3f,
     ) -> wp.spatial_vectorf:
         """Force and torque of the summed overlaps: ``mass`` ΣP, ``moment`` ΣP (p − x), ``slip`` ΣP v."""
         push = law.stiffness * density * mass
@@ -79,12 +83,12 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
 
     @wp.func
     def feel(
-        probes: probes_type,
-        pairs: pairs_type,
-        cloud: cloud_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
-        laws: wp.array(dtype=law_type),
+        probes: ProbeArrays,
+        pairs: PairArrays,
+        cloud: CloudArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
+        laws: wp.array(dtype=ProximityParams),
         densities: wp.array2d(dtype=wp.float32),
         links: wp.array(dtype=wp.int32),
         pose: wp.array2d(dtype=wp.transformf),
@@ -186,12 +190,12 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
 
     @wp.kernel(module="unique")
     def proximity(
-        probes: probes_type,
-        pairs: pairs_type,
-        cloud: cloud_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
-        laws: wp.array(dtype=law_type),
+        probes: ProbeArrays,
+        pairs: PairArrays,
+        cloud: CloudArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
+        laws: wp.array(dtype=ProximityParams),
         densities: wp.array2d(dtype=wp.float32),
         links: wp.array(dtype=wp.int32),
         pose: wp.array2d(dtype=wp.transformf),
@@ -203,12 +207,12 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
 
     @wp.kernel(module="unique")
     def proximity_gathered(
-        probes: probes_type,
-        pairs: pairs_type,
-        cloud: cloud_type,
-        io: io_type,
-        knobs: wp.array(dtype=params_type),
-        laws: wp.array(dtype=law_type),
+        probes: ProbeArrays,
+        pairs: PairArrays,
+        cloud: CloudArrays,
+        io: ReadoutArrays,
+        knobs: wp.array(dtype=NoiseParams),
+        laws: wp.array(dtype=ProximityParams),
         densities: wp.array2d(dtype=wp.float32),
         links: wp.array(dtype=wp.int32),
         pose: wp.array2d(dtype=wp.transformf),
