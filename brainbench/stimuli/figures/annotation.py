@@ -9,6 +9,7 @@ import numpy as np
 from brainbench.stimuli.figures.canvas import (
     DOTS_PER_INCH,
     INK,
+    MOMENT_MAP,
     PALE,
     ROW_COLORS,
     new_figure,
@@ -129,7 +130,6 @@ class Annotation:
             self._text(self._edge + 40 * self._unit, y, f"row {ROWS[row]}", size=15, va="center_baseline")
 
     def _moment_bar(self) -> None:
-        from brainbench.stimuli.figures.scenes import MOMENT_MAP
 
         left, top, long, wide = self._edge, self._edge + 84 * self._unit, 220 * self._unit, 16 * self._unit
         ramp = np.linspace(0, 1, 256)[None]

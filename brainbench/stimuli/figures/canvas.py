@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 ROW_COLORS = ("#3466ac", "#1b9aa0", "#d1495b", "#7b4fa3", "#e08e1b")
 """Colours of the whisker rows A to E."""
+MOMENT_MAP = "plasma"
+"""Colour map of bending moments, by its name in matplotlib."""
 INK, PALE = "#22262b", "#6c757d"
 DOTS_PER_INCH = 100
 

@@ -17,7 +17,7 @@ from brainbench.core.errors import UsageError, listing, unknown_name
 from brainbench.stimuli.engines import DEFAULT_BACKEND
 from brainbench.stimuli.figures.annotation import Annotation
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.canvas import ROW_COLORS, check_format, round_up
+from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, check_format, round_up
 from brainbench.stimuli.figures.films import require_writer, write_film
 from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
 from brainbench.stimuli.figures.shading import floor, lamp, paint, shade
@@ -200,9 +200,6 @@ class Picture:
             for index in ({0} if surface.motion is None else moments)
         ]
         return np.concatenate([np.zeros((0, 3)), *found])
-
-
-MOMENT_MAP = "plasma"
 
 
 def render(
