@@ -24,7 +24,7 @@ from brainbench.stimuli import (
     Translation,
     WhiskerArray,
     Whisking,
-    get_backend,
+    get_engine,
     get_recipe,
 )
 from brainbench.stimuli.engines.protocol import Trace
@@ -61,7 +61,7 @@ def scenes() -> Iterator[Scene]:
 def compare(scene: Scene) -> Iterator[str]:
     jobs = scene.jobs()
     runs = [
-        get_backend(name).run(jobs, fidelity, workers=1) for fidelity in (USUAL, FINE) for name in ("mujoco", "bullet")
+        get_engine(name).run(jobs, fidelity, workers=1) for fidelity in (USUAL, FINE) for name in ("mujoco", "bullet")
     ]
     for mount, mujoco, bullet, fine_mujoco, fine_bullet in zip(scene.array, *runs, strict=True):
         if any(trace.status != "ok" for trace in (mujoco, bullet, fine_mujoco, fine_bullet)):

@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.report import table, write_section
 from benchmarks.whiskers.rod_agreement import HOW, differences
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.mujoco.model import build_model, engine
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import Reach
@@ -242,7 +242,7 @@ def main() -> None:
                 )
                 for backend, step in ENGINES:
                     fidelity = Fidelity(links=args.links, time_step=1e-6 * step)
-                    trace = get_backend(backend).run([passing.job(args.duration)], fidelity)[0]
+                    trace = get_engine(backend).run([passing.job(args.duration)], fidelity)[0]
                     key = f"{backend}, {step} µs"
                     gathered.setdefault(key, []).append(misses(trace.wrench[: len(truth)], truth))
         for key, values in gathered.items():

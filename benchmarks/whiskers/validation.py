@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.report import table, write_section
 from brainbench.core.errors import BrainbenchError
-from brainbench.stimuli.engines import list_backends
+from brainbench.stimuli.engines import list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.validation import bench_tests, references
 from brainbench.stimuli.whiskers.array import WhiskerArray
@@ -148,7 +148,7 @@ def report(results: dict[str, dict]) -> tuple[str, list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--backend", default="mujoco", choices=list_backends())
+    parser.add_argument("--backend", default="mujoco", choices=list_engines())
     arguments = parser.parse_args()
     backend = arguments.backend
     with ProcessPoolExecutor(arguments.workers) as pool:

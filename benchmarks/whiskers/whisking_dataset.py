@@ -23,13 +23,13 @@ from benchmarks.report import table, write_section
 from brainbench.core.files import hash_arrays
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.stimuli import Fidelity
+from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.objects.collections import NamedObject, resolve_objects
 from brainbench.stimuli.objects.primitives import box
-from brainbench.stimuli.sweeps import local_pool, simulation
+from brainbench.stimuli.sweeps import local_pool, shards
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
 from brainbench.stimuli.sweeps.shards import _write_all, prepare_shard
-from brainbench.stimuli.sweeps.simulation import SweepBatch
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
 WHISKERS, FRAMES = 30, 110
@@ -105,7 +105,7 @@ def write_parts(folder: Path) -> list[list[str]]:
 
 def write_set(folder: Path, sweeps: int) -> list[list[str]]:
     """Write a data set through the path that a GPU takes, its objects built before."""
-    simulation.FAST_PATHS["mujoco"] = (__name__, "made_up")
+    shards.simulate_sweeps = made_up
     objects = {
         name: NamedObject(name, "box", "made up", partial(box, (1.0, 1.0, 1.0)))
         for name in (f"box-{index}" for index in range(sweeps // 16))

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.output import JsonOption, emit, progress_bar, table
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
 
@@ -20,7 +20,7 @@ def whisker(
     ),
     links: Annotated[str, typer.Option(help="Links per whisker, comma-separated; the default grid if empty.")] = "",
     time_steps: Annotated[str, typer.Option(help="Time steps in ms, comma-separated; the default grid if empty.")] = "",
-    backends: Annotated[str, typer.Option(help="Backends, comma-separated.")] = DEFAULT_BACKEND,
+    backends: Annotated[str, typer.Option(help="Backends, comma-separated.")] = DEFAULT_ENGINE,
     collisions: Annotated[
         str, typer.Option(help="Collision geometries of a concave object to measure too, comma-separated, or all.")
     ] = "",

@@ -76,6 +76,11 @@ def _without_driver_warning() -> Iterator[None]:
         os.close(kept)
 
 
+def usable_processors() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def mujoco_module() -> Any:
     """Return the module ``mujoco``; its names are made at run time, so type checkers do not know them."""
     return import_module("mujoco")

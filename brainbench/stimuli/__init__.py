@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.engines import get_backend
+    from brainbench.stimuli.engines import get_engine
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.motion.recorded import Recorded, load_trajectory
     from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation, Whisking
@@ -47,7 +47,7 @@ __all__ = [
     "WhiskerArray",
     "Whisking",
     "describe_recipe",
-    "get_backend",
+    "get_engine",
     "get_recipe",
     "list_recipes",
     "load_scene",
@@ -84,7 +84,7 @@ __getattr__, __dir__ = lazy_exports(
         "WhiskerArray": ".whiskers.array",
         "Whisking": ".motion.trajectories",
         "describe_recipe": ".scenes.recipes",
-        "get_backend": ".engines",
+        "get_engine": ".engines",
         "get_recipe": ".scenes.recipes",
         "list_recipes": ".scenes.recipes",
         "load_scene": ".scenes.scene_files",

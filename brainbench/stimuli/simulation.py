@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import math
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import cache_dir, content_hash, to_json
 from brainbench.core.progress import Progress
-from brainbench.stimuli.engines import DEFAULT_BACKEND, get_backend
+from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
@@ -34,18 +32,16 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from brainbench.stimuli.engines.protocol import Backend, Trace
+    from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 
 _LOG = logging.getLogger(__name__)
-
-_PACKAGES = {"bullet": "pybullet", "mujoco": "mujoco-core", "rod": "warp-lang"}
 
 
 def simulate(
     scenes: Scene | Iterable[Scene],
     *,
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = DEFAULT_BACKEND,
+    backend: WhiskerEngine | str = DEFAULT_ENGINE,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> xr.Dataset:
@@ -54,7 +50,7 @@ def simulate(
     Args:
         scenes: scenes with different labels, the same whiskers and the same frames.
         fidelity: how finely; a preset's name or a :class:`Fidelity`; ``balanced`` when None.
-        backend: a backend's name, or any object that follows the backend protocol (never cached).
+        backend: an engine's name, or any :class:`brainbench.stimuli.engines.protocol.WhiskerEngine` (never cached).
         progress: called as ``progress(done, total, what)`` after each simulated whisker.
         cache: read and keep results under ``brainbench.core.files.cache_dir("stimuli")``.
 
@@ -78,8 +74,8 @@ def simulate(
     chosen = _checked(scenes)
     fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
     fidelity = Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
-    engine = get_backend(backend) if isinstance(backend, str) else backend
-    path = cache_path(chosen, fidelity, engine.name) if cache and isinstance(backend, str) else None
+    engine = get_engine(backend) if isinstance(backend, str) else backend
+    path = cache_path(chosen, fidelity, engine) if cache and isinstance(backend, str) else None
     if path is not None and path.exists():
         started = time.perf_counter()
         try:
@@ -88,7 +84,8 @@ def simulate(
             return dataset
         except DataError as error:
             _LOG.warning("cached stimuli are damaged and are simulated again: %s", error)
-    dataset = _simulate(chosen, fidelity, engine, progress)
+    dataset = simulate_uncached(chosen, fidelity, engine, progress=progress)
+    _warn_unstable(dataset)
     if path is not None:
         try:
             write_stimulus_set(dataset, path)
@@ -101,7 +98,7 @@ def prepare(
     scenes: Iterable[Scene],
     *,
     fidelity: Fidelity | str | None = None,
-    backend: str = DEFAULT_BACKEND,
+    backend: str = DEFAULT_ENGINE,
     progress: Progress | None = None,
 ) -> None:
     """Begin, in a thread, what simulating these scenes will wait for, unless the cache holds their simulation.
@@ -111,24 +108,21 @@ def prepare(
     """
     chosen = list(scenes)
     fidelity = Fidelity.parse(fidelity or "balanced") if not isinstance(fidelity, Fidelity) else fidelity
-    engine = get_backend(backend)
-    if not cache_path(chosen, fidelity, engine.name).exists():
+    engine = get_engine(backend)
+    if not cache_path(chosen, fidelity, engine).exists():
         _begin(engine, chosen, fidelity, progress)
 
 
 def _begin(
-    engine: Backend, scenes: Sequence[Scene], fidelity: Fidelity, progress: Progress | None
-) -> threading.Thread | None:
-    """Let an engine get ready in a thread, if it has anything to do for that."""
-    get_ready = getattr(engine, "prepare", None)
-    if get_ready is None:
-        return None
+    engine: WhiskerEngine, scenes: Sequence[Scene], fidelity: Fidelity, progress: Progress | None
+) -> threading.Thread:
+    """Let an engine get ready in a thread."""
     lengths = {mount.whisker.arc_length for scene in scenes for mount in scene.mounts}
 
     def work() -> None:
         # What is wrong here is wrong again in the simulation, which says so.
         with contextlib.suppress(BrainbenchError):
-            get_ready(lengths, fidelity, progress=progress)
+            engine.prepare(lengths, fidelity, progress=progress)
 
     thread = threading.Thread(target=work, name="brainbench-prepare")
     thread.start()
@@ -151,16 +145,27 @@ def _checked(scenes: Scene | Iterable[Scene]) -> list[Scene]:
     return chosen
 
 
-def _simulate(scenes: Sequence[Scene], fidelity: Fidelity, engine: Backend, progress: Progress | None) -> xr.Dataset:
-    """Simulate every distinct job once; put the traces together and say what was done."""
+def simulate_uncached(
+    scenes: Sequence[Scene],
+    fidelity: Fidelity,
+    engine: WhiskerEngine,
+    *,
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> xr.Dataset:
+    """Simulate every distinct job of scenes that fit together once, and return their stimulus set.
+
+    Args:
+        scenes, fidelity, engine, progress: as for :func:`simulate`.
+        workers: native threads; all usable processors when None.
+    """
     clock = [time.perf_counter()]
     making = _begin(engine, scenes, fidelity, progress)
-    planned = plan(scenes, surfaces=getattr(engine, "surfaces", False))
+    planned = plan(scenes, surfaces=engine.surfaces)
     clock.append(time.perf_counter())
-    if making is not None:
-        making.join()
+    making.join()
     report = None if progress is None else lambda done, total: progress(done, total, "simulating whiskers")
-    traces = engine.run(planned.jobs, fidelity, progress=report)
+    traces = engine.run(planned.jobs, fidelity, progress=report, workers=workers)
     clock.append(time.perf_counter())
     rows = [[traces[index] for index in row] for row in planned.places]
     dataset = _assemble(scenes, rows, fidelity, engine.name)
@@ -240,7 +245,6 @@ def _assemble(
         dataset.attrs["clipped"] = _count_clipped(dataset, clipped, frames.clip)
     dataset.attrs["config_hash"] = _config_hash(scenes, fidelity, backend)
     dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
-    _warn_unstable(dataset)
     return check_stimulus_set(dataset)
 
 
@@ -305,19 +309,16 @@ def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> s
     return content_hash(backend, fidelity, [scene.config() for scene in scenes], arrays)
 
 
-def cache_path(scenes: Sequence[Scene], fidelity: Fidelity, backend: str, *more: Any, folder: str = "stimuli") -> Path:
-    """Return where the cache keeps what these scenes give; ``more`` is whatever else determines it."""
+def cache_path(
+    scenes: Sequence[Scene], fidelity: Fidelity, engine: WhiskerEngine, *more: Any, folder: str = "stimuli"
+) -> Path:
+    """Return where the cache keeps what these scenes give; ``more`` is whatever else determines it.
+
+    The name changes with the scenes, the fidelity, the engine, the version of the engine's library and
+    :data:`brainbench.stimuli.engines.PHYSICS_VERSION`; not with the rest of the code.
+    """
     from importlib import metadata
 
-    package = _PACKAGES.get(backend)
-    engine = metadata.version(package) if package else ""
-    key = content_hash(_config_hash(scenes, fidelity, backend), engine, _code_hash(), *more, length=24)
+    library = metadata.version(engine.package) if engine.package else ""
+    key = content_hash(_config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"
-
-
-@functools.cache
-def _code_hash() -> str:
-    """Hash the source of this package, so that no other version's results are ever taken for its own."""
-    with resources.as_file(resources.files("brainbench.stimuli")) as root:
-        code = {path.relative_to(root).as_posix(): path.read_text(encoding="utf-8") for path in root.rglob("*.py")}
-    return content_hash(__version__, dict(sorted(code.items())))

@@ -13,7 +13,7 @@ import numpy as np
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, listing, unknown_name
 from brainbench.core.files import content_hash
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.recipes import get_recipe, is_recipe, list_recipes
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from brainbench.core.progress import Progress
     from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Backend
+    from brainbench.stimuli.engines.protocol import WhiskerEngine
     from brainbench.stimuli.scenes.scene_files import Recipe
 
 _HDF5 = (".h5", ".hdf5", ".nc")
@@ -58,7 +58,7 @@ def load_stimuli(
     *,
     whiskers: str = "all",
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = DEFAULT_BACKEND,
+    backend: WhiskerEngine | str = DEFAULT_ENGINE,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> Stimuli:
@@ -118,7 +118,7 @@ def prepare_stimuli(
 def _from_recipe(
     recipe: Recipe,
     fidelity: Fidelity | str | None,
-    backend: Backend | str,
+    backend: WhiskerEngine | str,
     progress: Progress | None,
     cache: bool,
 ) -> Stimuli:

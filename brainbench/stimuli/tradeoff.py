@@ -38,7 +38,7 @@ from brainbench.core.errors import BrainbenchError, DataError, missing_dependenc
 from brainbench.core.files import atomic_path, read_json, write_json, write_text
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
-from brainbench.stimuli.engines import DEFAULT_BACKEND, get_backend
+from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import SOLVERS, Fidelity, list_presets
 from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.engines.reach import touched
@@ -74,7 +74,7 @@ class SimulationSetting:
     """One point of the trade-off."""
 
     fidelity: Fidelity
-    backend: str = DEFAULT_BACKEND
+    backend: str = DEFAULT_ENGINE
     collision: str | None = None
     """How a concave object is touched, as in :data:`COLLISIONS`; None for the bench tests without one."""
 
@@ -93,7 +93,7 @@ def settings(
     *,
     links: Sequence[int] = LINKS,
     time_steps: Sequence[tuple[float, float | None]] = TIME_STEPS,
-    backends: Sequence[str] = (DEFAULT_BACKEND,),
+    backends: Sequence[str] = (DEFAULT_ENGINE,),
     collisions: Sequence[str] = (),
     solvers: Sequence[str] = ("dynamic",),
 ) -> list[SimulationSetting]:
@@ -148,7 +148,7 @@ def measure_tradeoff(
     """
     wanted = settings() if chosen is None else list(chosen)
     for name in {setting.backend for setting in wanted}:
-        get_backend(name)
+        get_engine(name)
     head, points = _header(), []
     if Path(path).exists():
         table = read_json(path)
@@ -327,8 +327,8 @@ def _into_hollow(setting: SimulationSetting) -> tuple[Trace, int]:
     # The hollow is a trough along the whisker, turned a little and aside, so that the whisker slides down its slope.
     obstacle = PlacedObject(solid, (0.01, 0.0042, 0.002), (0.0, math.pi / 2, 0.3), friction=0.0).obstacle()
     job = Job(_straight("C2"), _Whisk(math.radians(22)), (obstacle,), _FRAMES)
-    engine = get_backend(setting.backend)
-    body = touched(obstacle, surfaces=getattr(engine, "surfaces", False))
+    engine = get_engine(setting.backend)
+    body = touched(obstacle, surfaces=engine.surfaces)
     pieces = len(body.parts) if body.surface is None else len(body.surface.faces)
     # What an engine loads or compiles at first use is no cost of the setting.
     engine.run([replace(job, times=_FRAMES[:2])], setting.fidelity, workers=1)
@@ -375,7 +375,7 @@ def _whisking(setting: SimulationSetting) -> list[Trace]:
     for friction, degrees in ((0.0, 12), (0.48, 12), (0.48, 25)):
         post = Obstacle((Capsule((0.0107, 0.0012, -0.02), (0.0107, 0.0012, 0.02), 1e-3),), friction=friction)
         jobs.append(Job(whisker, _Whisk(math.radians(degrees)), (post,), _FRAMES))
-    engine = get_backend(setting.backend)
+    engine = get_engine(setting.backend)
     engine.run([replace(job, times=_FRAMES[:2]) for job in jobs], setting.fidelity, workers=1)
     traces = engine.run(jobs, setting.fidelity, workers=1)
     for trace in traces:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines import DEFAULT_BACKEND, get_backend
+from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from brainbench.core.progress import Progress
-    from brainbench.stimuli.engines.protocol import Backend, Job
+    from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
     from brainbench.stimuli.scenes.scene import Scene
 
 _LOG = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ def record(
     times: ArrayLike,
     *,
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = DEFAULT_BACKEND,
+    backend: WhiskerEngine | str = DEFAULT_ENGINE,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> Recording:
@@ -73,11 +73,11 @@ def record(
     times = np.atleast_1d(np.asarray(times, dtype=float))
     fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
     fidelity = Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
-    engine = get_backend(backend) if isinstance(backend, str) else backend
+    engine = get_engine(backend) if isinstance(backend, str) else backend
     jobs = [replace(job, times=times) for job in scene.jobs()]
     path = None
     if cache and isinstance(backend, str):
-        path = cache_path([scene], fidelity, engine.name, times, folder="shapes").with_suffix(".npz")
+        path = cache_path([scene], fidelity, engine, times, folder="shapes").with_suffix(".npz")
     local = None if path is None else _read(path, len(jobs))
     if local is None:
         local = _simulate(jobs, fidelity, engine, progress)
@@ -124,7 +124,7 @@ def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _simulate(
-    jobs: Sequence[Job], fidelity: Fidelity, engine: Backend, progress: Progress | None
+    jobs: Sequence[Job], fidelity: Fidelity, engine: WhiskerEngine, progress: Progress | None
 ) -> list[NDArray[np.float64]]:
     report = None if progress is None else lambda done, total: progress(done, total, "simulating shapes")
     traces = engine.run(jobs, fidelity, progress=report, record_shape=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
 
 
-class FakeBackend:
+class FakeEngine(WhiskerEngine):
     """Force = base position (as N), moment = where the whisker points (as N·m), both in the job's frame.
 
     A whisker "touches" while its unbent tip lies inside an obstacle's bounding box.
@@ -16,6 +16,7 @@ class FakeBackend:
     name = "fake"
 
     def __init__(self, unstable: dict[int, str] | None = None) -> None:
+        super().__init__()
         self.jobs = []
         self.unstable = unstable or {}
 

@@ -23,7 +23,7 @@ from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.chain import build_chain
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
 # The same step on every whisker, so that steps can be counted by hand.
 FAST = Fidelity(links=6, time_step=2e-4)
@@ -71,7 +71,7 @@ def test_whiskers_without_motion_or_object_are_silent_and_a_full_simulation_feel
 @pytest.mark.parametrize("label", ["convex-far", "concave-far"])
 def test_whiskers_that_the_rodgers_solid_cannot_touch_feel_the_same_in_a_full_simulation(in_full, monkeypatch, label):
     (scene,) = (scene for scene in get_recipe("rodgers").scenes if scene.label == label)
-    out = Explanation.of(simulate(scene, fidelity=FAST, backend=FakeBackend())).out_of_reach[label]
+    out = Explanation.of(simulate(scene, fidelity=FAST, backend=FakeEngine())).out_of_reach[label]
     assert 5 < len(out) < 30
     short = Scene(
         label, scene.array.select(",".join(out)), scene.objects, scene.whisking, scene.head, Frames(0, 2e-3, 30)
@@ -104,7 +104,7 @@ def test_the_pairs_told_are_the_pairs_the_engine_builds():
 
 
 def test_pairs_of_an_engine_that_touches_surfaces_are_counted_in_triangles():
-    class Touching(FakeBackend):
+    class Touching(FakeEngine):
         surfaces = True
 
     crescent = PlacedObject(rodgers_solid(0.055), position=(0.0137, 0.0045, 0.003))
@@ -162,7 +162,7 @@ def test_equal_runs_are_planned_once():
 
 
 def test_the_same_simulation_is_explained_in_the_same_words_and_survives_the_cache(monkeypatch, tmp_path):
-    monkeypatch.setattr(simulation, "get_backend", lambda name: FakeBackend())
+    monkeypatch.setattr(simulation, "get_engine", lambda name: FakeEngine())
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
     first = simulate(_scene("near", NEAR), fidelity=FAST, backend="fake")
     second = simulate(_scene("near", NEAR), fidelity=FAST, backend="fake")
@@ -190,13 +190,13 @@ def test_the_text_says_what_was_saved():
 
 
 def test_steps_that_had_to_be_shorter_are_no_saving():
-    told = Explanation.of(simulate(_scene("near", NEAR), fidelity=FAST, backend=FakeBackend()))
+    told = Explanation.of(simulate(_scene("near", NEAR), fidelity=FAST, backend=FakeEngine()))
     more = dataclasses.replace(told, steps=told.steps_in_full * 106 // 100)
     assert "saved          none of the steps (6 % more: some contacts needed shorter ones)" in str(more)
 
 
 def test_a_set_without_or_with_a_damaged_explanation_is_refused_in_words():
-    dataset = simulate(_scene("near", NEAR), fidelity=FAST, backend=FakeBackend())
+    dataset = simulate(_scene("near", NEAR), fidelity=FAST, backend=FakeEngine())
     data = json.loads(dataset.attrs["explanation"])
     del data["steps"]
     with pytest.raises(DataError, match=r"damaged \(.*steps"):

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
@@ -24,7 +24,7 @@ LONG_STEPS, SHORT_STEPS = (1e-5, 1e-4, 1e-3, 5e-3), (1e-6,)
 
 
 def _run(job, fidelity, **options):
-    return get_backend("mujoco").run([job], fidelity, workers=1, **options)[0]
+    return get_engine("mujoco").run([job], fidelity, workers=1, **options)[0]
 
 
 def _moving(shape, start, end, duration, friction=0.0):

@@ -7,14 +7,14 @@ from brainbench.stimuli.readout import to_frame, to_grid
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
 
 def _dataset(whiskers="all", side="right", count=110, unstable=None):
     scenes = [
         Scene(label, WhiskerArray.mouse(side=side, whiskers=whiskers), frames=Frames(count=count)) for label in "ab"
     ]
-    return simulate(scenes, fidelity=Fidelity(), backend=FakeBackend(unstable))
+    return simulate(scenes, fidelity=Fidelity(), backend=FakeEngine(unstable))
 
 
 def test_a_hundred_and_ten_frames_become_twenty_two_steps_of_thirty_channels():

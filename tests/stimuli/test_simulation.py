@@ -1,14 +1,21 @@
 import dataclasses
 import logging
+import os
+import shutil
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
+import brainbench
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import simulation
+from brainbench.stimuli.engines import PHYSICS_VERSION
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Still, Translation, Whisking
@@ -18,11 +25,12 @@ from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
 ARRAY = WhiskerArray.mouse(whiskers="C1,C2,D6")
 FRAMES = Frames(0.0, 0.01, 10)
 NEAR = PlacedObject(sphere(2e-3), position=(0.015, 0.002, 0.003))
+_WEIGHTS = shutil.ignore_patterns("*.safetensors", "__pycache__")
 FAR = PlacedObject(sphere(2e-3), position=(1.0, 0.0, 0.0))
 
 
@@ -31,14 +39,14 @@ def _scene(label="one", **changes):
 
 
 def _simulate(scenes, backend=None, **options):
-    return simulate(scenes, fidelity=Fidelity(), backend=backend or FakeBackend(), **options)
+    return simulate(scenes, fidelity=Fidelity(), backend=backend or FakeEngine(), **options)
 
 
 @pytest.fixture
 def engine(monkeypatch, tmp_path):
     """The double, found by name so that results are cached, in a cache of its own."""
-    backend = FakeBackend()
-    monkeypatch.setattr(simulation, "get_backend", lambda name: backend)
+    backend = FakeEngine()
+    monkeypatch.setattr(simulation, "get_engine", lambda name: backend)
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
     return backend
 
@@ -85,7 +93,7 @@ def test_a_frame_is_the_mean_of_its_readings_and_touches_when_one_of_them_does()
 
 
 def test_a_whisker_that_reaches_nothing_is_simulated_once_for_all_scenes():
-    backend = FakeBackend()
+    backend = FakeEngine()
     dataset = _simulate([_scene("a"), _scene("b", objects=(FAR,)), _scene("c", objects=())], backend)
     # C1 and C2 reach the near ball in one scene; D6 is too short everywhere.
     assert len(backend.jobs) == 3 + 2
@@ -93,10 +101,10 @@ def test_a_whisker_that_reaches_nothing_is_simulated_once_for_all_scenes():
 
 
 def test_a_whisker_that_moves_otherwise_is_simulated_again():
-    backend = FakeBackend()
+    backend = FakeEngine()
     _simulate([_scene("a", objects=()), _scene("b", objects=(), whisking=Still())], backend)
     assert len(backend.jobs) == 6
-    backend = FakeBackend()
+    backend = FakeEngine()
     moving = Head(motion=Translation((0.01, 0.0, 0.0)))
     _simulate([_scene("a", objects=()), _scene("b", objects=(), head=moving)], backend)
     assert len(backend.jobs) == 6
@@ -104,7 +112,7 @@ def test_a_whisker_that_moves_otherwise_is_simulated_again():
 
 def test_an_unstable_whisker_is_flagged_and_said_aloud(caplog):
     with caplog.at_level(logging.WARNING):
-        dataset = _simulate(_scene(), FakeBackend(unstable={1: "energy grew"}))
+        dataset = _simulate(_scene(), FakeEngine(unstable={1: "energy grew"}))
     assert list(dataset["status"].values[0]) == ["ok", "unstable", "ok"]
     assert dataset["reason"].values[0, 1] == "energy grew"
     assert np.isnan(dataset["wrench"].sel(whisker="C2")).any()
@@ -117,7 +125,7 @@ def test_progress_counts_the_whiskers_simulated():
     assert calls == [(1, 3, "simulating whiskers"), (2, 3, "simulating whiskers"), (3, 3, "simulating whiskers")]
 
 
-class Preparing(FakeBackend):
+class Preparing(FakeEngine):
     """An engine with something to do before it runs."""
 
     def __init__(self):
@@ -132,7 +140,7 @@ class Preparing(FakeBackend):
 def test_an_engine_gets_ready_before_it_runs_and_not_for_what_is_in_the_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
     engine, fidelity = Preparing(), Fidelity.preset("fast")
-    monkeypatch.setattr(simulation, "get_backend", lambda name: engine)
+    monkeypatch.setattr(simulation, "get_engine", lambda name: engine)
     scene = _scene()
     simulation.prepare([scene], fidelity="fast", backend="fake")
     for thread in threading.enumerate():
@@ -177,15 +185,36 @@ def test_whatever_changes_the_result_changes_the_place_in_the_cache(engine, chan
     assert first.attrs["content_hash"] != second.attrs["content_hash"]
 
 
-def test_other_code_never_takes_these_results_for_its_own(engine, monkeypatch):
+def test_another_version_of_the_physics_never_takes_these_results_for_its_own(engine, monkeypatch):
     _simulate(_scene(), "fake")
-    monkeypatch.setattr(simulation, "_code_hash", lambda: "other code")
+    monkeypatch.setattr(simulation, "PHYSICS_VERSION", PHYSICS_VERSION + 1)
     _simulate(_scene(), "fake")
     assert len(engine.jobs) == 6
 
 
+def test_an_edited_drawing_module_leaves_simulations_in_their_place_in_the_cache(tmp_path):
+    """Keys of two copies of the package, of which one draws otherwise."""
+    code = (
+        "from brainbench.stimuli import Fidelity, get_engine, get_recipe\n"
+        "from brainbench.stimuli.simulation import cache_path\n"
+        "print(cache_path(get_recipe('rodgers').scenes[:1], Fidelity(), get_engine('mujoco')).name)"
+    )
+    names = []
+    for copy in ("before", "after"):
+        shutil.copytree(Path(brainbench.__file__).parent, tmp_path / copy / "brainbench", ignore=_WEIGHTS)
+        with (tmp_path / copy / "brainbench/stimuli/figures/raster.py").open("a") as module:
+            module.write(f"# {copy}\n")
+        ended = subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(tmp_path / copy)}, cwd=tmp_path,
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        names.append(ended.stdout)
+    assert names[0].endswith(".h5\n")
+    assert names[0] == names[1]
+
+
 def test_the_configuration_hash_names_the_request_and_not_the_numbers():
-    class Blurred(FakeBackend):
+    class Blurred(FakeEngine):
         def _trace(self, job, reason):
             trace = super()._trace(job, reason)
             return dataclasses.replace(trace, wrench=trace.wrench * (1 + 1e-6))

@@ -8,9 +8,9 @@ from brainbench.stimuli import load_stimuli, read_stimulus_set, to_grid, write_s
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.simulation import simulate
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
-OPTIONS = {"fidelity": Fidelity(), "backend": FakeBackend()}
+OPTIONS = {"fidelity": Fidelity(), "backend": FakeEngine()}
 
 
 @pytest.fixture(scope="module")

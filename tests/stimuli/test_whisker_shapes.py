@@ -8,7 +8,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import whisker_shapes
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.mujoco.engine import MujocoBackend
+from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
 from brainbench.stimuli.objects.placement import euler_matrix
@@ -16,7 +16,7 @@ from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whisker_shapes import record
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 from tests.stimuli.test_simulated_scenes import _pushed
 
 FAST = Fidelity.preset("fast")
@@ -69,12 +69,12 @@ def test_shapes_come_from_the_cache_and_from_nowhere_else(monkeypatch, tmp_path,
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
     runs = []
 
-    class Counted(MujocoBackend):
+    class Counted(MujocoWhiskerEngine):
         def run(self, jobs, *args, **options):
             runs.append(len(jobs))
             return super().run(jobs, *args, **options)
 
-    monkeypatch.setattr(whisker_shapes, "get_backend", lambda name: Counted())
+    monkeypatch.setattr(whisker_shapes, "get_engine", lambda name: Counted())
     scene = Scene("air", ARRAY, whisking=Whisking())
     first = _record(scene, [0.002, 0.004], cache=True)
     second = _record(scene, [0.002, 0.004], cache=True)
@@ -92,7 +92,7 @@ def test_shapes_come_from_the_cache_and_from_nowhere_else(monkeypatch, tmp_path,
 
 def test_a_backend_without_shapes_is_refused_in_words():
     with pytest.raises(UsageError, match="'fake' reports no whisker shapes"):
-        _record(Scene("air", ARRAY), [0.01], backend=FakeBackend())
+        _record(Scene("air", ARRAY), [0.01], backend=FakeEngine())
 
 
 def test_times_must_increase():

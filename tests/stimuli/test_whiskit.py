@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere
@@ -127,7 +127,7 @@ def run():
     array = WhiskerArray.mouse(whiskers="C1,C2")
     scene = Scene("ball", array, (ball,), frames=Frames(0.01, 0.005, 16))
     dataset = simulate(scene, fidelity=Fidelity.preset("fast"), cache=False)
-    traces = get_backend("mujoco").run(scene.jobs(), Fidelity.preset("fast"), record_shape=True)
+    traces = get_engine("mujoco").run(scene.jobs(), Fidelity.preset("fast"), record_shape=True)
     return dataset, [trace.link_positions for trace in traces]
 
 

@@ -18,7 +18,7 @@ from brainbench.cli.stimuli.options import (
     open_recipe,
 )
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 
 def render(
@@ -47,7 +47,7 @@ def render(
     size: Annotated[str | None, typer.Option(help="Pixels. [default: 1280x960, a film 800x600]")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
-    backend: BackendOption = DEFAULT_BACKEND,
+    backend: BackendOption = DEFAULT_ENGINE,
     as_json: JsonOption = False,
 ) -> None:
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
@@ -111,7 +111,7 @@ def plot(
     size: Annotated[str, typer.Option(help="Pixels.")] = "1600x960",
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
-    backend: BackendOption = DEFAULT_BACKEND,
+    backend: BackendOption = DEFAULT_ENGINE,
     as_json: JsonOption = False,
 ) -> None:
     """Plot forces or moments of every whisker on the 5 × 7 layout, to one scale, contacts shaded."""

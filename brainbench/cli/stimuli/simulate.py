@@ -10,7 +10,7 @@ import typer
 from brainbench.cli.output import JsonOption, emit, progress_bar, table
 from brainbench.cli.stimuli.options import BackendOption, FidelityOption, WhiskersOption
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 
 def simulate(
@@ -18,7 +18,7 @@ def simulate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Stimulus-set file to write (.h5).")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
-    backend: BackendOption = DEFAULT_BACKEND,
+    backend: BackendOption = DEFAULT_ENGINE,
     explain: Annotated[
         bool, typer.Option("--explain", help="Tell what was simulated, shared and left out, and what that saved.")
     ] = False,

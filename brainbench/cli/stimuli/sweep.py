@@ -11,7 +11,7 @@ import typer
 from brainbench.cli.output import JsonOption, emit, progress_bar, table
 from brainbench.cli.stimuli.options import BackendOption, FidelityOption, WhiskersOption
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.plan import GenerationPlan
@@ -56,14 +56,14 @@ def sweep(
     collision: Annotated[str | None, typer.Option(help="What whiskers touch: hull, exact, decomposition, …")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
-    backend: BackendOption = DEFAULT_BACKEND,
+    backend: BackendOption = DEFAULT_ENGINE,
     as_json: JsonOption = False,
 ) -> None:
     """Count the sweeps of a grid beside the published counts; with --out make a data set of them.
 
     A run that was interrupted or killed goes on where it stopped when the same command is given again.
     """
-    from brainbench.stimuli import Fidelity, get_backend
+    from brainbench.stimuli import Fidelity, get_engine
     from brainbench.stimuli.objects.collections import resolve_objects
     from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes, counts
@@ -72,7 +72,7 @@ def sweep(
         raise unknown_name("sweep grid", grid, GRIDS)
     if out is None and scheduler is not None:
         raise UsageError("--scheduler simulates, and needs a folder for it: --out.")
-    surfaces = getattr(get_backend(backend), "surfaces", False)
+    surfaces = get_engine(backend).surfaces
     found = resolve_objects(
         [*(objects or ()), *(more_objects or ())], unit=unit, collision=collision, surfaces=surfaces
     )

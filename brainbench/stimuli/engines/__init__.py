@@ -1,37 +1,55 @@
-"""Physics engines for whiskers, found by name with :func:`get_backend`."""
+"""Physics engines for whiskers: jobs and a fidelity go in, traces of forces come out (:mod:`.protocol`).
+
+A schedule finds the distinct jobs of some scenes (:mod:`.job_schedule`) and what each can touch (:mod:`.reach`); one of
+the engines ``rod``, ``mujoco`` and ``bullet`` simulates them; one rule says which results are reliable (:mod:`.trust`).
+"""
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import UsageError, listing, unknown_name
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.engines.protocol import Backend
+    from brainbench.stimuli.engines.protocol import WhiskerEngine
 
-DEFAULT_BACKEND = "rod"
+DEFAULT_ENGINE = "rod"
 """Engine of whatever does not ask for one; it needs no GPU."""
 
-_BACKENDS = {
-    "bullet": ("brainbench.stimuli.engines.bullet.engine", "BulletBackend"),
-    "mujoco": ("brainbench.stimuli.engines.mujoco.engine", "MujocoBackend"),
-    "rod": ("brainbench.stimuli.engines.rod", "RodBackend"),
+PHYSICS_VERSION = 1
+"""Version of the physics, part of the name under which simulations are kept in the cache. To be raised whenever a
+change of the code changes what a simulation gives; tests/stimuli/engines/test_golden_wrenches.py says when."""
+
+_ENGINES = {
+    "bullet": ("brainbench.stimuli.engines.bullet.engine", "BulletEngine"),
+    "mujoco": ("brainbench.stimuli.engines.mujoco.engine", "MujocoWhiskerEngine"),
+    "rod": ("brainbench.stimuli.engines.rod.engine", "RodEngine"),
 }
+"""Name of each engine, and the module and class that it is."""
 
 
-def list_backends() -> tuple[str, ...]:
-    """Names that :func:`get_backend` knows."""
-    return tuple(sorted(_BACKENDS))
+def list_engines() -> tuple[str, ...]:
+    """Return the names that :func:`get_engine` knows."""
+    return tuple(sorted(_ENGINES))
 
 
-def get_backend(name: str) -> Backend:
-    """Return the backend called ``name``.
+def get_engine(name: str, *, device: str | None = None, retry: int | None = None) -> WhiskerEngine:
+    """Return the engine called ``name``.
+
+    Args:
+        name: one of :func:`list_engines`.
+        device: ``cpu`` or ``cuda``; the engine's own choice when None.
+        retry: as :attr:`WhiskerEngine.retry`, for engines that retry; the engine's own choice when None.
 
     Raises:
-        UsageError: there is no such backend.
+        UsageError: there is no such engine, or it does not run on the device.
     """
-    if name not in _BACKENDS:
-        raise unknown_name("backend", name, list_backends())
-    module, symbol = _BACKENDS[name]
-    return getattr(import_module(module), symbol)()
+    if name not in _ENGINES:
+        raise unknown_name("backend", name, list_engines())
+    module, symbol = _ENGINES[name]
+    engine: type[WhiskerEngine] = getattr(import_module(module), symbol)
+    if device is not None and device not in engine.devices:
+        raise UsageError(f"The backend {name!r} does not run on {device!r}; it runs on {listing(engine.devices)}.")
+    options = {"device": device, "retry": retry if engine.retries else None}
+    return engine(**{key: value for key, value in options.items() if value is not None})

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Fidelity:
         return replace(cls.preset(preset), **values)
 
     @classmethod
-    def auto(cls, *, error: float = 0.05, backend: str = DEFAULT_BACKEND) -> Fidelity:
+    def auto(cls, *, error: float = 0.05, backend: str = DEFAULT_ENGINE) -> Fidelity:
         """Return the cheapest measured setting of a backend whose relative error is at most ``error``.
 
         The error is the worst over bench tests of mouse whiskers: pegs against the elastica, ring-downs, and whisking
@@ -155,7 +155,7 @@ def list_presets() -> tuple[str, ...]:
 
 
 @cache
-def measured(backend: str = DEFAULT_BACKEND) -> tuple[TradeoffPoint, ...]:
+def measured(backend: str = DEFAULT_ENGINE) -> tuple[TradeoffPoint, ...]:
     """Return the measured settings of a backend: error as the table states, cost in processor s per whisker-second.
 
     Raises:

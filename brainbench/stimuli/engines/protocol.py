@@ -1,4 +1,4 @@
-"""What every physics backend takes and gives: one whisker on a prescribed follicle among obstacles.
+"""What every physics engine takes and gives: one whisker on a prescribed follicle among obstacles.
 
 Whiskers never touch one another, so the unit of simulation is one whisker. Letters: n output frame.
 """
@@ -6,9 +6,10 @@ Whiskers never touch one another, so the unit of simulation is one whisker. Lett
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -17,8 +18,11 @@ from brainbench.core.errors import UsageError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from brainbench.core.progress import Progress as NamedProgress
     from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.sweep_batch import SweepBatch
     from brainbench.stimuli.objects.obstacle import Obstacle
+    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
     from brainbench.stimuli.whiskers.whisker import Whisker
 
 Progress = Callable[[int, int], None]
@@ -105,12 +109,12 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """What one simulated whisker did at the frame times of its job."""
+    """Motion and forces of one simulated whisker at the frame times of its job."""
 
     wrench: NDArray[np.float64]
     """[n, 6] force (N) and moment (N·m): action of the whisker on its base, about the base point, world axes."""
     contact: NDArray[np.bool_]
-    """[n] whether the whisker touches an obstacle."""
+    """[n] True where the whisker touches an obstacle."""
     contact_arc: NDArray[np.float64]
     """[n] arc length (m) of the force-weighted contact point; NaN without contact."""
     penetration: float = 0.0
@@ -129,20 +133,43 @@ class Trace:
     was asked for and the engine tells (``rod`` does)."""
 
 
-class Backend(Protocol):
-    """A physics engine that runs jobs.
+@dataclass(frozen=True)
+class WhiskerEngine(ABC):
+    """A physics engine that runs whisker jobs; its fields say what it can do."""
 
-    An engine that collides the exact surface of obstacles that have one says so by an attribute ``surfaces = True``;
-    others collide the convex parts. One that has something to compile at first use may do it in a method
-    ``prepare(lengths, fidelity, *, progress=None)``, which is called in a thread before ``run`` with the arc lengths of
-    the whiskers [m].
-    """
+    device: str = "cpu"
+    """Device it runs on, one of :attr:`devices`."""
+    retry: int = 1
+    """Divisor of the time step for whiskers that cannot be trusted, which are then simulated again, and those left once
+    more with steps divided by twice this; 1 leaves them ``unstable``. Only engines that :attr:`retries` use it."""
 
-    @property
-    def name(self) -> str:
-        """Name under which :func:`brainbench.stimuli.engines.get_backend` finds it."""
-        ...
+    name: ClassVar[str]
+    """Name under which :func:`brainbench.stimuli.engines.get_engine` finds it."""
+    package: ClassVar[str] = ""
+    """Distribution whose version belongs to its results; empty for none."""
+    devices: ClassVar[tuple[str, ...]] = ("cpu",)
+    """Kinds of devices it runs on."""
+    solvers: ClassVar[tuple[str, ...]] = ("dynamic",)
+    """Values of :attr:`Fidelity.solver` it knows."""
+    surfaces: ClassVar[bool] = False
+    """Whether it collides the exact surface of obstacles that have one; others collide convex parts."""
+    retries: ClassVar[bool] = False
+    """Whether it simulates whiskers that cannot be trusted again with finer steps."""
+    batches: ClassVar[bool] = False
+    """Whether :meth:`run_sweeps` simulates many passive sweeps at once, without a scene for each."""
 
+    def prepare(  # noqa: B027 — engines that have nothing to prepare keep this one
+        self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None
+    ) -> None:
+        """Do, in a thread before :meth:`run`, what the first run would wait for, such as compiling; most need nothing.
+
+        Args:
+            lengths: arc lengths of the whiskers [m].
+            fidelity: as for :meth:`run`.
+            progress: called as ``progress(done, total, what)``.
+        """
+
+    @abstractmethod
     def run(
         self,
         jobs: Sequence[Job],
@@ -154,24 +181,44 @@ class Backend(Protocol):
     ) -> list[Trace]:
         """Simulate every job and return their traces in the same order.
 
+        A job whose whisker reaches no obstacle while its base stands still, without gravity and loads, is not
+        simulated: its wrench is exactly zero. Obstacles out of reach are left out.
+
         Args:
             jobs: whiskers to simulate, independent of one another.
             fidelity: links, time step and the other knobs of accuracy.
             progress: called as ``progress(done, total)`` when a job is finished.
             workers: native threads; all usable processors when None.
             record_shape: fill :attr:`Trace.link_positions`.
+
+        Raises:
+            UsageError: the engine cannot run these jobs at this fidelity.
         """
-        ...
+
+    def run_sweeps(
+        self, scenes: SweepScenes, indices: Sequence[int], fidelity: Fidelity, *, workers: int | None = None
+    ) -> SweepBatch:
+        """Simulate sweeps whose object moves; of engines that take :attr:`batches` alone.
+
+        Results do not depend on which sweeps come together, nor on their order.
+
+        Args:
+            scenes: a grid of sweeps over some objects.
+            indices: which of its scenes; neighbours share their object, so order by object is fastest.
+            fidelity: how finely.
+            workers: threads on the CPU; one when None.
+        """
+        raise NotImplementedError(f"The engine {self.name!r} takes sweeps as single scenes.")
 
 
 def base_rotation(euler: ArrayLike) -> NDArray[np.float64]:
-    """Rotation matrices [..., 3, 3] from base frame to world of Euler angles [..., 3] (θ, φ, ζ; rad)."""
+    """Return the rotation matrices [..., 3, 3] from base frame to world of Euler angles [..., 3] (θ, φ, ζ; rad)."""
     theta, phi, zeta = np.moveaxis(np.asarray(euler, dtype=float), -1, 0)
     return _about("z", theta - np.pi / 2) @ _about("y", -phi) @ _about("x", zeta + np.pi / 2)
 
 
 def _about(axis: str, angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrices [..., 3, 3] about one coordinate axis."""
+    """Return rotation matrices [..., 3, 3] about one coordinate axis."""
     first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., [0, 1, 2], [0, 1, 2]] = 1.0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, listing
 from brainbench.stimuli.engines.reach import distances
 from brainbench.stimuli.whiskers.chain import build_chain
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job
+    from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
     from brainbench.stimuli.engines.reach import Reach
     from brainbench.stimuli.objects.obstacle import Obstacle
     from brainbench.stimuli.whiskers.whisker import Whisker
@@ -105,6 +105,24 @@ def _bounds(obstacle: Obstacle) -> NDArray[np.float64]:
     return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
 
+def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None) -> None:
+    """Refuse what an engine cannot run, and say aloud what damps whiskers more than they are.
+
+    Raises:
+        UsageError: the engine lacks the solver or collides convex bodies only, or there are no workers.
+    """
+    if workers is not None and workers < 1:
+        raise UsageError(f"workers must be at least 1; received {workers}.")
+    if fidelity.solver not in engine.solvers:
+        raise UsageError(
+            f"The backend {engine.name!r} has no solver {fidelity.solver!r}, only {listing(engine.solvers)}; use the "
+            "backend 'rod' for it."
+        )
+    if not engine.surfaces:
+        require_parts(jobs, engine.name)
+    warn_overdamped(jobs, fidelity)
+
+
 def require_parts(jobs: Sequence[Job], backend: str) -> None:
     """Refuse obstacles that only engines which collide surfaces can touch.
 
@@ -118,18 +136,6 @@ def require_parts(jobs: Sequence[Job], backend: str) -> None:
                 f" {len(obstacle.surface.faces)} triangles; give the object collision = 'decomposition' (convex pieces,"
                 " whose deviation is stated) or use the backend 'rod', which touches the surface itself."
             )
-
-
-def require_dynamic(fidelity: Fidelity, backend: str) -> None:
-    """Refuse the quasi-static solver.
-
-    Raises:
-        UsageError: it is asked for.
-    """
-    if fidelity.solver != "dynamic":
-        raise UsageError(
-            f"The backend {backend!r} has no solver {fidelity.solver!r}, only 'dynamic'; use the backend 'rod' for it."
-        )
 
 
 def warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:

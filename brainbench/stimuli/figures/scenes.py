@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from brainbench.core.errors import UsageError, listing, unknown_name
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.figures.annotation import Annotation
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, check_format, round_up
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from brainbench.core.progress import Progress
     from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Backend
+    from brainbench.stimuli.engines.protocol import WhiskerEngine
     from brainbench.stimuli.figures.camera import Lens
     from brainbench.stimuli.scenes.scene import Scene
 
@@ -210,7 +210,7 @@ def render(
     camera: Camera | None = None,
     style: Style | None = None,
     fidelity: Fidelity | str | None = None,
-    backend: Backend | str = DEFAULT_BACKEND,
+    backend: WhiskerEngine | str = DEFAULT_ENGINE,
     progress: Progress | None = None,
     cache: bool = True,
 ) -> Path:

@@ -14,6 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from brainbench.core.devices import usable_processors
 from brainbench.core.errors import DataError
 from brainbench.stimuli.sweeps.shards import Prepared, make_shard, prepare_shard, simulate_shard, write_shard
 
@@ -50,11 +51,6 @@ def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done
             "it works outside of: if __name__ == '__main__':. The finished shards are kept: run the same again, with "
             "fewer workers if this recurs."
         ) from error
-
-
-def usable_processors() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _run_pool(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:

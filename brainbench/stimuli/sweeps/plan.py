@@ -14,9 +14,8 @@ from brainbench import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash, to_plain
-from brainbench.stimuli.engines import DEFAULT_BACKEND
+from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.simulation import _PACKAGES
 from brainbench.stimuli.sweeps.grid import default_array
 from brainbench.stimuli.sweeps.split import SPLITS, SplitBy, split_objects, split_sweeps
 
@@ -43,7 +42,7 @@ class Settings:
     """
 
     fidelity: Fidelity
-    backend: str = DEFAULT_BACKEND
+    backend: str = DEFAULT_ENGINE
     device: str = "cpu"
     split: SplitBy = "object"
     seed: int = 0
@@ -146,7 +145,7 @@ class GenerationPlan:
     def config(self) -> dict[str, Any]:
         """Plain values that determine every byte of the data set."""
         grid = {item.name: getattr(self.grid, item.name) for item in fields(self.grid) if item.name != "published"}
-        package = _PACKAGES.get(self.settings.backend)
+        package = get_engine(self.settings.backend).package
         return {
             "format": SWEEPS_FORMAT,
             "schema": SWEEPS_SCHEMA,

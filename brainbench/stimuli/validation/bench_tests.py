@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.stimuli.engines import DEFAULT_BACKEND, get_backend
+from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle
@@ -121,7 +121,7 @@ def point_load(
     force: float,
     at: float,
     *,
-    backend: str = DEFAULT_BACKEND,
+    backend: str = DEFAULT_ENGINE,
     fidelity: Fidelity | str = "balanced",
 ) -> PointLoad:
     """Load a straight whisker with ``force`` (N, along +y) at arc length ``at`` (m) and wait until it is at rest.
@@ -160,7 +160,7 @@ def peg(
     offset: float,
     *,
     peg_radius: float = 2.5e-4,
-    backend: str = DEFAULT_BACKEND,
+    backend: str = DEFAULT_ENGINE,
     fidelity: Fidelity | str = "balanced",
 ) -> BenchTest:
     """Press a frictionless round peg against a straight whisker and compare with the elastica.
@@ -203,7 +203,7 @@ def slip_off(
     at: float,
     *,
     peg_radius: float = 2.5e-4,
-    backend: str = DEFAULT_BACKEND,
+    backend: str = DEFAULT_ENGINE,
     fidelity: Fidelity | str = "balanced",
 ) -> SlipOff:
     """Raise a frictionless round peg at distance ``at`` (m) from the base until the whisker slips off it.
@@ -253,7 +253,7 @@ def ringdown(
     modes: int = 3,
     deflection: float = 1e-3,
     own_step: bool = False,
-    backend: str = DEFAULT_BACKEND,
+    backend: str = DEFAULT_ENGINE,
     fidelity: Fidelity | str = "accurate",
 ) -> Ringdown:
     """Let a bent whisker go and fit its lowest modes.
@@ -395,7 +395,7 @@ def _fidelity(fidelity: Fidelity | str) -> Fidelity:
 
 
 def _run(backend: str, job: Job, fidelity: Fidelity) -> Trace:
-    trace = get_backend(backend).run([job], fidelity, workers=1, record_shape=True)[0]
+    trace = get_engine(backend).run([job], fidelity, workers=1, record_shape=True)[0]
     if trace.status != "ok":
         raise DataError(f"The simulation was unstable: {trace.reason}.")
     return trace

@@ -7,7 +7,7 @@ import pytest
 from brainbench.cli.stimuli import draw, sweep
 from brainbench.cli.stimuli import simulate as simulate_command
 from brainbench.stimuli import load_stimuli, simulation, tradeoff, whisker_shapes
-from brainbench.stimuli.engines import DEFAULT_BACKEND, fidelity, get_backend, list_backends
+from brainbench.stimuli.engines import DEFAULT_ENGINE, fidelity, get_engine, list_engines
 from brainbench.stimuli.figures import scenes
 from brainbench.stimuli.sweeps.plan import Settings
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
@@ -23,16 +23,16 @@ ASKED = (
 
 @pytest.mark.parametrize("function", ASKED, ids=lambda function: f"{function.__module__}.{function.__qualname__}")
 def test_one_constant_is_the_default_of_whatever_takes_an_engine(function):
-    assert inspect.signature(function).parameters["backend"].default == DEFAULT_BACKEND
+    assert inspect.signature(function).parameters["backend"].default == DEFAULT_ENGINE
 
 
 def test_the_default_engine_exists_and_runs_on_a_processor():
-    assert DEFAULT_BACKEND in list_backends()
-    assert "cpu" in get_backend(DEFAULT_BACKEND).devices
+    assert DEFAULT_ENGINE in list_engines()
+    assert "cpu" in get_engine(DEFAULT_ENGINE).devices
 
 
 def test_the_settings_that_are_picked_automatically_are_measured_ones_of_the_default_engine():
     chosen = fidelity.Fidelity.auto(error=0.03)
     point = next(item for item in fidelity.measured() if fidelity.Fidelity(**item.settings) == chosen)
     assert point.error <= 0.03
-    assert point in fidelity.measured(DEFAULT_BACKEND)
+    assert point in fidelity.measured(DEFAULT_ENGINE)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines import get_backend, list_backends
+from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, base_rotation
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
@@ -76,7 +76,7 @@ class Swing:
 
 
 def _run(engine, *jobs, fidelity=None, **options):
-    return get_backend(engine.name).run(jobs, fidelity or engine.coarse, **options)
+    return get_engine(engine.name).run(jobs, fidelity or engine.coarse, **options)
 
 
 def _post(x, y, radius=1e-3, **options):
@@ -89,8 +89,8 @@ def _scale(wrench):
 
 
 def test_the_engine_is_listed_and_found_by_name(engine):
-    assert engine.name in list_backends()
-    assert get_backend(engine.name).name == engine.name
+    assert engine.name in list_engines()
+    assert get_engine(engine.name).name == engine.name
 
 
 @pytest.mark.parametrize(

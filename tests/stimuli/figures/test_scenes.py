@@ -17,7 +17,7 @@ from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.whisker_shapes import Recording, record
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
 FAST = Fidelity.preset("fast")
 SMALL = Style(size=(320, 240))
@@ -163,7 +163,7 @@ def test_an_mp4_has_a_frame_per_instant(tmp_path):
 @pytest.mark.parametrize(("package", "name"), [("matplotlib", "a.png"), ("imageio_ffmpeg", "a.mp4")])
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch, package, name):
     monkeypatch.setitem(sys.modules, package, None)
-    backend = FakeBackend()
+    backend = FakeEngine()
     with pytest.raises(MissingDependencyError, match=r"pip install 'brainbench\[report\]'"):
         render(SCENE, tmp_path / name, times=[0.0], style=SMALL, backend=backend)
     assert not backend.jobs

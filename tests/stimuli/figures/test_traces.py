@@ -10,7 +10,7 @@ from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
 BALL = PlacedObject(sphere(3e-3), position=(0.015, 0.002, 0.003))
 
@@ -18,7 +18,7 @@ BALL = PlacedObject(sphere(3e-3), position=(0.015, 0.002, 0.003))
 def _simulate(unstable=None, **changes):
     array = changes.pop("array", WhiskerArray.mouse())
     scenes = [Scene(label, array, (BALL,), frames=Frames(0.0, 0.005, 20)) for label in ("one", "two/three")]
-    return simulate(scenes, fidelity=Fidelity(), backend=FakeBackend(unstable=unstable))
+    return simulate(scenes, fidelity=Fidelity(), backend=FakeEngine(unstable=unstable))
 
 
 @pytest.fixture(scope="module")

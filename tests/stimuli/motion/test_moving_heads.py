@@ -17,7 +17,7 @@ from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.sources import load_stimuli
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
 PAIR = WhiskerArray.mouse(whiskers="C1,C2")
 FRAMES = Frames(0.0, 0.01, 10)
@@ -123,7 +123,7 @@ def test_impossible_paths_are_refused(arguments, message):
 def test_a_scene_longer_than_the_path_is_refused():
     scene = Scene("long", PAIR, head=PLACE, frames=Frames(0.0, 0.01, 40))
     with pytest.raises(UsageError, match=r"path ends at 0\.12 s; the scene needs it at"):
-        simulate(scene, backend=FakeBackend())
+        simulate(scene, backend=FakeEngine())
 
 
 def test_a_head_that_turns_a_whisker_upright_is_refused_in_words():
@@ -132,7 +132,7 @@ def test_a_head_that_turns_a_whisker_upright_is_refused_in_words():
     array = WhiskerArray.mouse(whiskers="C3")
     scene = Scene("over", array, head=Head(motion=over), whisking=Still(), frames=Frames(0, 0.01, 15))
     with pytest.raises(UsageError, match=r"whisker C3 points along the vertical axis.*gimbal lock"):
-        simulate(scene, backend=FakeBackend())
+        simulate(scene, backend=FakeEngine())
 
 
 def _crowd(**changes):
@@ -142,20 +142,20 @@ def _crowd(**changes):
 
 def test_several_animals_feel_what_each_would_feel_alone():
     scene = _crowd()
-    together = simulate(scene, backend=FakeBackend())
+    together = simulate(scene, backend=FakeEngine())
     assert list(together["whisker"].values) == ["a:C1", "a:C2", "b:C1", "b:D2"] == list(scene.names)
-    alone = [simulate(part, backend=FakeBackend()) for part in scene.split()]
+    alone = [simulate(part, backend=FakeEngine()) for part in scene.split()]
     expected = np.concatenate([dataset["wrench"].values for dataset in alone], axis=2)
     np.testing.assert_array_equal(together["wrench"].values, expected)
     assert list(together["row"].values) == [2, 2, 2, 3]
 
 
 def test_equal_animals_share_their_work_only_where_they_feel_the_same():
-    backend = FakeBackend()
+    backend = FakeEngine()
     far = Animal("b", PAIR, Whisking(), Head((0.5, 0.0, 0.0)))
     simulate(Scene("x", PAIR, (NEAR,), frames=FRAMES, others=(far,)), backend=backend)
     assert len(backend.jobs) == 4
-    backend = FakeBackend()
+    backend = FakeEngine()
     simulate(Scene("x", PAIR, (), frames=FRAMES, others=(far,)), backend=backend)
     assert len(backend.jobs) == 2
 
@@ -171,7 +171,7 @@ def test_whiskers_of_animals_are_chosen_by_name():
 
 
 def test_the_grid_refuses_several_animals_even_in_different_cells_and_takes_one():
-    dataset = simulate(_crowd(), backend=FakeBackend())
+    dataset = simulate(_crowd(), backend=FakeEngine())
     with pytest.raises(UsageError, match=r"2 animals and a grid holds one; select .*: 'a:\*' or 'b:\*'"):
         to_grid(dataset)
     apart = dataset.isel(whisker=[0, 3])

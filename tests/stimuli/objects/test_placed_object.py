@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.geometry import DecompositionSettings, Mesh, load_mesh
-from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Path, Spin, Translation
@@ -294,7 +294,7 @@ def test_engines_of_convex_bodies_refuse_a_concave_surface_and_name_what_works(b
     whisker = Whisker(0.02, 60e-6, 6e-6, young_modulus=5e9, density=1260.0, damping_ratio=0.3)
     job = Job(whisker, StillFollicle(), (item.obstacle(),), np.array([1e-3]))
     with pytest.raises(UsageError, match=rf"'{backend}' collides convex .*collision = 'decomposition'.*backend 'rod'"):
-        get_backend(backend).run([job], Fidelity(links=4, time_step=2e-4))
+        get_engine(backend).run([job], Fidelity(links=4, time_step=2e-4))
 
 
 def test_labelled_sets_of_shapes_are_made_on_demand():
@@ -329,6 +329,6 @@ def test_a_whisker_through_the_hole_of_a_torus_feels_it_only_when_the_hole_is_fi
         # The axis of the torus lies along the whisker, which points along x.
         placed = PlacedObject(shape_solid(shape, collision=collision), (0.01, 0.0, 0.0), (0.0, np.pi / 2, 0.0))
         job = Job(whisker, StillFollicle(), (placed.obstacle(),), np.array([1e-3, 2e-3]))
-        (trace,) = get_backend("mujoco").run([job], Fidelity(links=4, time_step=2e-4))
+        (trace,) = get_engine("mujoco").run([job], Fidelity(links=4, time_step=2e-4))
         touched[collision] = bool(trace.contact.any()) or trace.status != "ok"
     assert touched == {"exact": False, "hull": True}

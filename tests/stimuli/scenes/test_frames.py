@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere
@@ -19,18 +19,19 @@ from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.stimulus_set import read_stimulus_set, write_stimulus_set
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.engines import FakeBackend
+from tests.factories.engines import FakeEngine
 
 ARRAY = WhiskerArray.mouse(whiskers="C1,C2")
 TURNED = Head((0.01, 0.02, 0.03), (0.2, -0.4, 0.7))
 
 
-class ToneBackend:
+class ToneEngine(WhiskerEngine):
     """Forces are sines (N) of one frequency (Hz)."""
 
     name = "tone"
 
     def __init__(self, frequency):
+        super().__init__()
         self.frequency = frequency
 
     def run(self, jobs, fidelity, *, progress=None, workers=None, record_shape=False):
@@ -44,11 +45,11 @@ class ToneBackend:
 
 def _simulate(frames, backend=None, labels=("a",), **changes):
     scenes = [Scene(label, ARRAY, frames=frames, **changes) for label in labels]
-    return simulate(scenes, fidelity=Fidelity(), backend=backend or FakeBackend())
+    return simulate(scenes, fidelity=Fidelity(), backend=backend or FakeEngine())
 
 
 def _amplitude(frames, frequency):
-    force = _simulate(frames, ToneBackend(frequency))["wrench"].values[0, 20:-20, 0, 0]
+    force = _simulate(frames, ToneEngine(frequency))["wrench"].values[0, 20:-20, 0, 0]
     return np.abs(force).max()
 
 
@@ -63,7 +64,7 @@ def test_without_a_filter_a_tone_above_nyquist_aliases_and_with_one_it_is_gone()
 
 def test_a_slow_tone_passes_the_filter_unchanged_and_undelayed():
     frames = Frames(0.005, 0.01, 150, average=20, lowpass=40.0)
-    force = _simulate(frames, ToneBackend(4.0))["wrench"].values[0, :, 0, 0]
+    force = _simulate(frames, ToneEngine(4.0))["wrench"].values[0, :, 0, 0]
     np.testing.assert_allclose(force[20:-20], np.sin(2 * np.pi * 4.0 * frames.times)[20:-20], atol=1e-3)
 
 

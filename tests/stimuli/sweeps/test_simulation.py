@@ -5,9 +5,10 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import Fidelity, simulate
-from brainbench.stimuli.engines import DEFAULT_BACKEND
-from brainbench.stimuli.sweeps.simulation import SweepBatch, join_batches, simulate_sweeps
-from tests.factories.engines import FakeBackend
+from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.sweep_batch import SweepBatch, join_batches
+from brainbench.stimuli.sweeps.simulation import simulate_sweeps
+from tests.factories.engines import FakeEngine
 from tests.factories.sweep_batches import GRID, small_scenes
 
 FAST = Fidelity.preset("fast")
@@ -40,13 +41,13 @@ def test_sweeps_that_move_the_head_go_through_the_default_engine_scene_by_scene(
     scenes = small_scenes(grid=dataclasses.replace(GRID, mover="head"))
     batch = simulate_sweeps(scenes, [1, 2], fidelity=FAST)
     dataset = simulate([scenes[index] for index in (1, 2)], fidelity=FAST, cache=False)
-    assert dataset.attrs["backend"] == DEFAULT_BACKEND
+    assert dataset.attrs["backend"] == DEFAULT_ENGINE
     np.testing.assert_array_equal(batch.wrench, dataset["wrench"].values)
 
 
 def test_an_unstable_whisker_is_marked_with_its_reason(monkeypatch):
-    engine = FakeBackend(unstable={1: "joint 3 bent too far"})
-    monkeypatch.setattr("brainbench.stimuli.sweeps.simulation.get_backend", lambda name: engine)
+    engine = FakeEngine(unstable={1: "joint 3 bent too far"})
+    monkeypatch.setattr("brainbench.stimuli.sweeps.simulation.get_engine", lambda name, **options: engine)
     batch = simulate_sweeps(small_scenes(whiskers="C2,C3"), [0, 1], fidelity=FAST, backend="fake")
     assert batch.unstable.tolist() == [[False, True], [False, False]]
     assert "C3: joint 3 bent too far" in batch.reasons[0].replace("RC3", "C3")

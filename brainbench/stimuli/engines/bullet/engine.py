@@ -30,22 +30,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld, engine
 from brainbench.stimuli.engines.mujoco.drive import drive_scalars
-from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
     MICRO,
     MILLI,
+    check_jobs,
     passed_unseen,
-    require_dynamic,
-    require_parts,
     strongest_force,
     too_strong,
-    warn_overdamped,
 )
 from brainbench.stimuli.objects.obstacle import rotation_matrix
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -64,10 +61,12 @@ SEARCH = 0.02
 """Distance (mm), beside the way that the whisker may move in the step, within which contacts are sought."""
 
 
-class BulletBackend:
+@dataclass(frozen=True)
+class BulletEngine(WhiskerEngine):
     """Runs whisker jobs in PyBullet, one after the other: PyBullet holds Python's interpreter lock."""
 
     name = "bullet"
+    package = "pybullet"
 
     def run(
         self,
@@ -78,21 +77,16 @@ class BulletBackend:
         workers: int | None = None,
         record_shape: bool = False,
     ) -> list[Trace]:
-        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.Backend.run`.
+        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`.
 
-        ``workers`` changes nothing. A job whose whisker reaches no obstacle while its base stands still,
-        without gravity and loads, is not simulated: its wrench is exactly zero.
+        ``workers`` changes nothing.
 
         Raises:
             MissingDependencyError: PyBullet is not installed.
-            UsageError: a whisker has more links than PyBullet can move.
+            UsageError: a whisker has more links than PyBullet can move, or as stated there.
         """
-        if workers is not None and workers < 1:
-            raise UsageError(f"workers must be at least 1; received {workers}.")
         engine()
-        require_dynamic(fidelity, self.name)
-        require_parts(jobs, self.name)
-        warn_overdamped(jobs, fidelity)
+        check_jobs(self, jobs, fidelity, workers)
         traces = []
         for job in jobs:
             traces.append(_simulate(job, fidelity, record_shape))

@@ -9,29 +9,27 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
+from brainbench.core.devices import usable_processors
+from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE
 from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
-from brainbench.stimuli.engines.protocol import Trace
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
     MICRO,
     MILLI,
+    check_jobs,
     passed_unseen,
-    require_dynamic,
-    require_parts,
     strongest_force,
     too_strong,
-    warn_overdamped,
 )
 from brainbench.stimuli.whiskers.chain import build_chain
 
@@ -50,10 +48,12 @@ CHUNK = 250
 """Steps per native call: bounds the memory of a job, and the drift of prescribed joints between resets."""
 
 
-class MujocoBackend:
+@dataclass(frozen=True)
+class MujocoWhiskerEngine(WhiskerEngine):
     """Runs whisker jobs in MuJoCo."""
 
     name = "mujoco"
+    package = "mujoco-core"
 
     def run(
         self,
@@ -64,29 +64,15 @@ class MujocoBackend:
         workers: int | None = None,
         record_shape: bool = False,
     ) -> list[Trace]:
-        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.Backend.run`.
+        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`."""
+        check_jobs(self, jobs, fidelity, workers)
 
-        A job whose whisker reaches no obstacle while its base stands still, without gravity and loads, is
-        not simulated: its wrench is exactly zero. Otherwise obstacles out of reach are left out.
-        """
-        if workers is not None and workers < 1:
-            raise UsageError(f"workers must be at least 1; received {workers}.")
-        require_dynamic(fidelity, self.name)
-        require_parts(jobs, self.name)
-        warn_overdamped(jobs, fidelity)
-        traces: list[Trace | None] = [None] * len(jobs)
-        with _quiet(), ThreadPoolExecutor(max_workers=workers or _processors()) as pool:
-            futures = {pool.submit(_simulate, job, fidelity, record_shape): i for i, job in enumerate(jobs)}
-            try:
-                for done, future in enumerate(as_completed(futures), start=1):
-                    traces[futures[future]] = future.result()
-                    if progress is not None:
-                        progress(done, len(jobs))
-            except BaseException:
-                # Without this an interrupt or a failed job would wait for every job that is still queued.
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-        return [trace for trace in traces if trace is not None]
+        def run(group: Sequence[int]) -> dict[int, Trace]:
+            return {index: _simulate(jobs[index], fidelity, record_shape) for index in group}
+
+        groups = [[index] for index in range(len(jobs))]
+        with _quiet():
+            return run_groups(groups, run, threads=workers or usable_processors(), progress=progress)
 
 
 @contextlib.contextmanager
@@ -99,11 +85,6 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
-
-
-def _processors() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:

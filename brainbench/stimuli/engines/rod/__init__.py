@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from brainbench.stimuli.engines.rod.engine import RodBackend
+from brainbench.stimuli.engines.rod.engine import RodEngine
 
-__all__ = ["RodBackend"]
+__all__ = ["RodEngine"]

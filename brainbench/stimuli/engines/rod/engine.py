@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import os
 import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.devices import pick_device, to_struct, warp
-from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.core.devices import pick_device, to_struct, usable_processors, warp
+from brainbench.stimuli.engines.job_pool import run_groups
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.limits import (
@@ -29,7 +28,7 @@ from brainbench.stimuli.engines.rod.limits import (
 )
 from brainbench.stimuli.engines.rod.packing import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
 from brainbench.stimuli.engines.rod.scheduling import make_grips
-from brainbench.stimuli.engines.trust import MILLI, step_travel, strongest_force, too_strong, warn_overdamped
+from brainbench.stimuli.engines.trust import MILLI, check_jobs, step_travel, strongest_force, too_strong
 from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
@@ -40,6 +39,8 @@ if TYPE_CHECKING:
     from brainbench.core.progress import Progress as NamedProgress
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.engines.protocol import Job, Progress
+    from brainbench.stimuli.engines.sweep_batch import SweepBatch
+    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
     from brainbench.stimuli.whiskers.chain import Chain
 
 SLICE = 65_536
@@ -47,7 +48,7 @@ SLICE = 65_536
 
 
 @dataclass(frozen=True)
-class RodBackend:
+class RodEngine(WhiskerEngine):
     """Runs whisker jobs in our own solver.
 
     Raises:
@@ -58,12 +59,14 @@ class RodBackend:
     device: str = "auto"
     """``cpu`` or ``cuda``; ``auto``: ``cpu``, or ``cuda`` where Warp cannot compile for processors."""
     retry: int = 5
-    """Whiskers that bent too far, or whose contact forces were not found, are simulated again with steps divided by
-    this, and those left with steps divided by twice this; 1 leaves them ``unstable``."""
 
     name = "rod"
-    surfaces = True
+    package = "warp-lang"
     devices = ("cpu", "cuda")
+    solvers = ("dynamic", "quasistatic")
+    surfaces = True
+    retries = True
+    batches = True
 
     def prepare(self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None) -> None:
         """Load the kernels for whiskers of these arc lengths [m]; all that this machine has not compiled yet at once.
@@ -100,51 +103,41 @@ class RodBackend:
         workers: int | None = None,
         record_shape: bool = False,
     ) -> list[Trace]:
-        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.Backend.run`.
+        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`.
 
-        A job whose whisker reaches no obstacle while its base stands still, without gravity and loads, is not
-        simulated: its wrench is exactly zero. On a GPU ``workers`` means nothing.
+        On a GPU ``workers`` means nothing.
         """
-        if workers is not None and workers < 1:
-            raise UsageError(f"workers must be at least 1; received {workers}.")
-        warn_overdamped(jobs, fidelity)
+        check_jobs(self, jobs, fidelity, workers)
         device = pick_device(self.device)
-        traces: list[Trace | None] = [None] * len(jobs)
         groups: dict[Any, list[int]] = {}
         for index, job in enumerate(jobs):
             links = fidelity.link_count(job.whisker.arc_length)
             key = (capacity_for(links), job.times.tobytes(), job.start, tuple(job.gravity))
             groups.setdefault(key, []).append(index)
         size = SLICE if device.is_cuda else 1
-        slices = [(key[0], some[i : i + size]) for key, some in groups.items() for i in range(0, len(some), size)]
-        threads = 1 if device.is_cuda else workers or _processors()
-        with ThreadPoolExecutor(max_workers=threads) as pool:
-            futures = [
-                pool.submit(_trusted, {i: jobs[i] for i in some}, self.retry, fidelity, device, capacity, record_shape)
-                for capacity, some in slices
-            ]
-            done = 0
-            try:
-                for future in as_completed(futures):
-                    for index, trace in future.result().items():
-                        traces[index] = trace
-                        done += 1
-                        if progress is not None:
-                            progress(done, len(jobs))
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-        return [trace for trace in traces if trace is not None]
+
+        def run(group: Sequence[int]) -> dict[int, Trace]:
+            capacity = capacity_for(fidelity.link_count(jobs[group[0]].whisker.arc_length))
+            return _trusted({i: jobs[i] for i in group}, self.retry, fidelity, device, capacity, record_shape)
+
+        slices = [some[i : i + size] for some in groups.values() for i in range(0, len(some), size)]
+        threads = 1 if device.is_cuda else workers or usable_processors()
+        return run_groups(slices, run, threads=threads, progress=progress)
+
+    def run_sweeps(
+        self, scenes: SweepScenes, indices: Sequence[int], fidelity: Fidelity, *, workers: int | None = None
+    ) -> SweepBatch:
+        """Simulate sweeps; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`."""
+        from brainbench.stimuli.engines.rod.sweeps import simulate_sweeps
+
+        return simulate_sweeps(
+            scenes, indices, fidelity=fidelity, device=self.device, workers=workers, retry=self.retry
+        )
 
 
 def _real(fidelity: Fidelity) -> type:
     """Warp's type of the numbers that a simulation calculates with."""
     return warp().float32 if fidelity.precision == "single" else warp().float64
-
-
-def _processors() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _NUMBERS = ("depth", "failed", "miss", "load")

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.sweep_batch import SweepBatch
     from brainbench.stimuli.objects.obstacle import TriangleMesh
     from brainbench.stimuli.sweeps.grid import SweepGrid
-    from brainbench.stimuli.sweeps.simulation import SweepBatch
     from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 
@@ -206,7 +206,9 @@ class SweepLauncher:
             slices = Slices(kernels, real, self.capacity, len(row), device, **self.tuning)
             self.slices = slices.run(inputs, BLOCK)
         else:
-            wp.launch(kernels.run, len(row), [*inputs, kernels.structs.PausedWhiskers()], device=device, block_dim=BLOCK)
+            wp.launch(
+                kernels.run, len(row), [*inputs, kernels.structs.PausedWhiskers()], device=device, block_dim=BLOCK
+            )
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
         self.seconds = dict(zip(("objects", "upload", "kernel"), np.diff(clock).tolist(), strict=True))
@@ -237,7 +239,7 @@ class SweepLauncher:
 
     def batch(self, result: SweepResult) -> SweepBatch:
         """Return a result as frames in the form of data generation."""
-        from brainbench.stimuli.sweeps.simulation import SweepBatch
+        from brainbench.stimuli.engines.sweep_batch import SweepBatch
 
         frames = self.grid.frames
         wrench, contact = result.wrench.numpy(), np.greater_equal(result.contact.numpy(), 0)
@@ -396,7 +398,7 @@ def simulate_sweeps(
 
     On the CPU one thread takes one object at a time; ``workers`` of them run side by side.
     """
-    from brainbench.stimuli.sweeps.simulation import join_batches
+    from brainbench.stimuli.engines.sweep_batch import join_batches
 
     launcher = SweepLauncher(scenes, fidelity, device)
     groups = list(_by_object(scenes, indices, launcher.limit))

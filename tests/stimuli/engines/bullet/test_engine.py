@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import MissingDependencyError, UsageError
 from brainbench.stimuli import get_recipe
-from brainbench.stimuli.engines import get_backend
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.bullet import model
 from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, MOST_LINKS, BulletWorld
@@ -48,7 +48,7 @@ class Swing:
 
 
 def _run(*jobs, fidelity=COARSE, backend="bullet", **options):
-    return get_backend(backend).run(jobs, fidelity, **options)
+    return get_engine(backend).run(jobs, fidelity, **options)
 
 
 def _post(x, y, radius=1e-3, **options):

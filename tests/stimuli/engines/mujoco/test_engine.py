@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines import get_backend, list_backends
+from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
@@ -38,7 +38,7 @@ class Swing:
 
 
 def _run(*jobs, fidelity=COARSE, **options):
-    return get_backend("mujoco").run(jobs, fidelity, **options)
+    return get_engine("mujoco").run(jobs, fidelity, **options)
 
 
 def _post(x, y, radius=1e-3, **options):
@@ -131,9 +131,9 @@ def test_an_overdamping_step_is_told_in_the_log(caplog):
 
 
 def test_unknown_backends_and_bad_jobs_are_refused():
-    assert "mujoco" in list_backends()
+    assert "mujoco" in list_engines()
     with pytest.raises(UsageError, match="did you mean 'mujoco'"):
-        get_backend("mojoco")
+        get_engine("mojoco")
     with pytest.raises(UsageError, match="increasing list"):
         Job(C2, StillFollicle(), (), np.array([0.2, 0.1]))
     with pytest.raises(UsageError, match="before the start"):

@@ -12,7 +12,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
-from brainbench.stimuli.engines.rod import RodBackend
+from brainbench.stimuli.engines.rod import RodEngine
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, TriangleMesh
 from brainbench.stimuli.sweeps.grid import SweepGrid
@@ -44,7 +44,7 @@ def _box_mesh(low, high):
 
 
 def _run(jobs, fidelity=COARSE, **options):
-    return RodBackend().run(jobs if isinstance(jobs, list) else [jobs], fidelity, **options)
+    return RodEngine().run(jobs if isinstance(jobs, list) else [jobs], fidelity, **options)
 
 
 @pytest.mark.parametrize("step", [1e-4, 1e-3, 2e-3])
@@ -126,10 +126,10 @@ def test_threads_that_start_side_by_side_on_a_fresh_machine_make_kernels_once(tm
     """A process of its own, with nothing compiled, whose threads take turns as often as they can."""
     code = (
         "import sys; sys.setswitchinterval(1e-6)\n"
-        "from brainbench.stimuli.engines.rod import RodBackend\n"
+        "from brainbench.stimuli.engines.rod import RodEngine\n"
         "from tests.stimuli.engines import test_rod as t\n"
         "job = t.Job(t.C2, t.StillFollicle(), (), t.np.array([2e-3]), gravity=(0.0, 0.0, -9.81))\n"
-        "RodBackend().run([job] * 6, t.COARSE, workers=6)\n"
+        "RodEngine().run([job] * 6, t.COARSE, workers=6)\n"
     )
     root = Path(__file__).parents[4]
     environment = {**os.environ, "PYTHONPATH": str(root), "WARP_CACHE_PATH": str(tmp_path)}
@@ -203,7 +203,7 @@ def test_whiskers_of_a_scene_that_cannot_be_trusted_are_simulated_again_and_no_o
     objects = resolve_objects(["chair-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
     some, fidelity = [scenes[0], scenes[140]], Fidelity(links=10, time_step=5e-4)
-    once = simulate(some, fidelity=fidelity, backend=RodBackend(retry=1), cache=False)
+    once = simulate(some, fidelity=fidelity, backend=RodEngine(retry=1), cache=False)
     again = simulate(some, fidelity=fidelity, backend="rod", cache=False)
     bad = once["status"].values != "ok"
     assert 0 < bad.sum() < 10
@@ -253,7 +253,7 @@ def test_a_whisker_that_cannot_be_trusted_says_why():
 
 def test_an_unknown_device_is_refused_in_words():
     with pytest.raises(UsageError, match="'cpu' or 'cuda'; received 'tpu'"):
-        RodBackend(device="tpu").run([Job(C2, StillFollicle(), (), np.array([1e-3]))], COARSE)
+        RodEngine(device="tpu").run([Job(C2, StillFollicle(), (), np.array([1e-3]))], COARSE)
 
 
 def test_more_precision_than_there_is_is_refused_in_words():
@@ -330,13 +330,13 @@ def test_sweeps_through_the_fast_path_may_leave_inertia_out():
 
 @pytest.mark.parametrize("name", ["mujoco", "bullet"])
 def test_other_engines_refuse_to_leave_inertia_out(name):
-    from brainbench.stimuli import get_backend
+    from brainbench.stimuli import get_engine
 
     if name == "bullet":
         pytest.importorskip("pybullet")
     job = Job(C2, StillFollicle(), (), np.array([0.01]))
     with pytest.raises(UsageError, match="has no solver 'quasistatic', only 'dynamic'; use the backend 'rod'"):
-        get_backend(name).run([job], Fidelity(solver="quasistatic"))
+        get_engine(name).run([job], Fidelity(solver="quasistatic"))
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.48])

@@ -8,7 +8,7 @@ import pytest
 from brainbench.core import devices as _device
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.rod import RodBackend
+from brainbench.stimuli.engines.rod import RodEngine
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.limits import MESHES, NOTHING, PRIMITIVES
 
@@ -35,7 +35,7 @@ def test_threads_that_ask_at_once_share_a_kernel():
 
 def test_compiling_is_told_once_per_size_and_not_at_all_for_kept_kernels(monkeypatch, tmp_path):
     told = []
-    engine = RodBackend()
+    engine = RodEngine()
     engine.prepare([0.01, 0.02], FINE)
     engine.prepare([0.01, 0.02], FINE, progress=lambda *said: told.append(said))
     assert told == []
@@ -48,7 +48,7 @@ def test_compiling_is_told_once_per_size_and_not_at_all_for_kept_kernels(monkeyp
 
 def test_an_engine_is_made_ready_for_what_can_be_simulated_only():
     with pytest.raises(UsageError, match="at most 100"):
-        RodBackend().prepare([0.5], Fidelity(links=10, links_per_mm=1.0))
+        RodEngine().prepare([0.5], Fidelity(links=10, links_per_mm=1.0))
 
 
 def test_a_warp_without_a_compiler_for_processors_says_what_to_do(monkeypatch):
