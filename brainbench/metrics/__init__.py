@@ -24,7 +24,6 @@ from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.measures.registry import (
     Metric,
     check_metric,
-    find_metric,
     get_metric,
     list_metrics,
     register_metric,
@@ -72,7 +71,6 @@ __all__ = [
     "compare",
     "compare_models",
     "equivalence_test",
-    "find_metric",
     "get_metric",
     "layer_tests",
     "list_metrics",
