@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Status
 from brainbench.metrics.arrays import find_device
-from brainbench.metrics.rdms.comparison import check_comparison
+from brainbench.metrics.rdms.comparison import check_comparison, permuted_comparisons
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
-from brainbench.metrics.rdms.relabelling import relabelled_comparisons
 
 EXACT_STIMULI = 8
 """Up to this many stimuli all orders are taken (8! = 40,320)."""
@@ -185,7 +184,7 @@ def permuted_values(
     layers, brain = _canonical(layers, brain)
     step = max(1, _CHUNK_ELEMENTS // layers.size)
     chunks = label_orders(stimulus_count(layers.shape[-1]), seed, step=step)
-    found = relabelled_comparisons(layers, brain, chunks, method, device=find_device(device))
+    found = permuted_comparisons(layers, brain, chunks, method, device=find_device(device))
     return np.concatenate([statistic(r) for r in found])
 
 
