@@ -192,12 +192,12 @@ def test_the_notebook_runs_and_gives_what_is_shown(tmp_path: Path, monkeypatch: 
 def test_the_metric_of_the_statistics_page_scores(tmp_path: Path):
     import numpy as np
 
-    from brainbench.metrics import Trials, find_metric
+    from brainbench.metrics import Trials, get_metric
 
     (block,) = _blocks("docs/statistics.md", "python")
     path = tmp_path / "mine.py"
     path.write_text(block, encoding="utf-8")
-    metric = find_metric(f"{path}:NearestNeighbour")
+    metric = get_metric(f"{path}:NearestNeighbour")
     rng = np.random.default_rng(0)
     latent, labels = rng.normal(size=(6, 3)), np.repeat(np.arange(6), 6)
     trials = [Trials((latent @ rng.normal(size=(3, 20)))[labels] + rng.normal(size=(36, 20)), labels) for _ in "abc"]

@@ -31,7 +31,7 @@ from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
-PAIRS = permuted_pairs(np.concatenate(list(label_orders(6, 1000, 0))))
+PAIRS = permuted_pairs(np.concatenate(list(label_orders(6, 0))))
 INK, ACCENT, WARN = "#333333", "#1f6f8b", "#c0504d"
 
 

@@ -24,16 +24,14 @@ from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.measures.registry import (
     Metric,
     check_metric,
-    find_metric,
     get_metric,
     list_metrics,
     register_metric,
 )
 from brainbench.metrics.rdms.comparison import COMPARISONS, compare
 from brainbench.metrics.rdms.display import RDM
-from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm, rdm_problem
-from brainbench.metrics.rdms.movies import rdm_movie
-from brainbench.metrics.rdms.precision import noise_precision
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm, rdm_movie, rdm_problem
+from brainbench.metrics.rdms.noise import noise_precision
 from brainbench.metrics.reliability.ceiling import NoiseCeiling, noise_ceiling
 from brainbench.metrics.reliability.noise_correction import (
     ESTIMATORS,
@@ -72,7 +70,6 @@ __all__ = [
     "compare",
     "compare_models",
     "equivalence_test",
-    "find_metric",
     "get_metric",
     "layer_tests",
     "list_metrics",

@@ -14,11 +14,10 @@ from brainbench.metrics.animals import (
     Animals,
     ceiling_of,
     gather,
-    interval_reasons,
     mean_rdm,
     mean_reliability,
 )
-from brainbench.metrics.inference.intervals import t_interval
+from brainbench.metrics.inference.intervals import interval_reasons, t_interval
 from brainbench.metrics.inference.permutation import RANDOM_PERMUTATIONS, SMALLEST_STIMULI, TIE, canonical_order
 from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.rdms.comparison import compare as compare_rdms

@@ -10,7 +10,7 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Ceiling, Interval, Status
-from brainbench.metrics.inference.intervals import VERIFIED_ANIMALS, t_interval
+from brainbench.metrics.inference.intervals import t_interval
 from brainbench.metrics.rdms.pairs import Floats, stimulus_count
 from brainbench.metrics.reliability.ceiling import noise_ceiling
 from brainbench.metrics.reliability.noise_correction import Corrected, noise_corrected
@@ -94,15 +94,6 @@ def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
     if len(values) == 1:
         return float(values[0]), animals.subjects[animals.scored[0]].spread
     return float(values.mean()), t_interval(values)
-
-
-def interval_reasons(count: int) -> tuple[str, ...]:
-    """Say what the number of animals means for the interval."""
-    if count == 1:
-        return ("one animal: no confidence interval, since nothing is known about other animals",)
-    if count < VERIFIED_ANIMALS:
-        return (f"interval from {count} animals is unreliable: coverage not verified below {VERIFIED_ANIMALS}",)
-    return ()
 
 
 def ceiling_of(animals: Animals, comparison: str) -> Ceiling | None:

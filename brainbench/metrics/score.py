@@ -17,12 +17,11 @@ from brainbench.metrics.animals import (
     Animals,
     ceiling_of,
     gather,
-    interval_reasons,
     mean_rdm,
     mean_reliability,
 )
 from brainbench.metrics.inference.bootstrap import bootstrap_animals
-from brainbench.metrics.inference.intervals import t_interval
+from brainbench.metrics.inference.intervals import interval_reasons, t_interval
 from brainbench.metrics.inference.permutation import (
     SMALLEST_STIMULI,
     PermutationTest,
@@ -126,6 +125,7 @@ def score_with_test(
     finite = [index for index in defined if math.isfinite(layers[index].value)]
     best = finite[first_best(np.array([layers[index].value for index in finite]))] if finite else None
     chosen = None if choice is None else defined[choice.overall]
+    repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
     score = Score(
         name=name,
         value=math.nan if choice is None else float(choice.values.mean()),
@@ -136,7 +136,7 @@ def score_with_test(
         reliability_interval=reliability_interval,
         interval=None if choice is None else t_interval(choice.values),
         p=math.nan if choice is None else choice.test.p,
-        p_method="" if choice is None else _method(choice.test, estimator, len(defined)),
+        p_method="" if choice is None else choice.test.summary(len(defined), repeated),
         p_smallest=smallest_p(len(stimuli)),
         ceiling=ceiling_of(animals, compare),
         layer=None if chosen is None else names[chosen],
@@ -389,11 +389,3 @@ def _subject_scores(
             )
         )
     return tuple(scores)
-
-
-def _method(test: PermutationTest, estimator: str, layers: int) -> str:
-    """Describe the test, and the score that a model without knowledge gets after the same choice of layer."""
-    repeated = "layer chosen anew in each" if estimator == "default" else "maximum over layers taken anew in each"
-    text = f"{test.method}; {'one layer' if layers == 1 else repeated}"
-    # Adding zero keeps a rounded −0.00 out of the sentence.
-    return f"{text}; mean score under permutation {round(test.null.mean(), 2) + 0.0:.2f}" if test.null.size else text

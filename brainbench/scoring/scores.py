@@ -123,7 +123,7 @@ def score_record(
         raise UsageError(f"Unknown time rule {time!r}; allowed: 'mean', 'concatenate'.")
     _prepare(model, stimuli, recordings, whiskers=whiskers, fidelity=fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
-    chosen = metrics.find_metric(metric) if isinstance(metric, str) else metric
+    chosen = metrics.get_metric(metric) if isinstance(metric, str) else metric
     metrics.check_metric(chosen)
     if explain and chosen.name != "rsa":
         raise UsageError(f"The published estimator is one of RSA; the metric {chosen.name!r} has none to explain.")

@@ -19,7 +19,7 @@ from brainbench.metrics import (
     rdm_problem,
     score_rdms,
 )
-from brainbench.metrics.rdms.precision import NOISE_METHODS
+from brainbench.metrics.rdms.noise import NOISE_METHODS
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

@@ -14,7 +14,7 @@ from scipy import stats
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Score
 from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm, score_rdms, subject_rdm
-from brainbench.metrics.animals import t_interval
+from brainbench.metrics.inference.intervals import t_interval
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 

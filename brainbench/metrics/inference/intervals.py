@@ -6,19 +6,19 @@ percentile interval is too narrow, so the t interval is what a score reports.
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core import statistics
+from brainbench.core.errors import unknown_name
 from brainbench.core.records import Interval
+from brainbench.core.statistics import LEVEL, check_level
 from brainbench.metrics.rdms.pairs import Floats
 
 VERIFIED_ANIMALS = 5
 """Coverage was measured from this many animals up; below, intervals are marked unreliable."""
-
-LEVEL = 0.95
 
 INTERVAL_METHODS = ("t", "percentile", "bca")
 
@@ -29,16 +29,8 @@ def t_interval(values: ArrayLike, level: float = LEVEL) -> Interval | None:
     Raises:
         UsageError: a level outside (0, 1).
     """
-    # scipy.stats has the same quantile, but takes most of a second to import.
-    from scipy.special import stdtrit
-
-    check_level(level)
-    array = np.asarray(values, dtype=np.float64)
-    if len(array) < 2 or not np.isfinite(array).all():
-        return None
-    half = float(stdtrit(len(array) - 1, (1 + level) / 2) * array.std(ddof=1) / math.sqrt(len(array)))
-    mean = float(array.mean())
-    return Interval(mean - half, mean + half, level, f"t over {len(array)} animals{caution(len(array))}")
+    found = statistics.t_interval(values, level, over="animals")
+    return found and replace(found, method=found.method + caution(np.size(values)))
 
 
 def percentile_interval(
@@ -60,7 +52,9 @@ def percentile_interval(
 def bca_interval(
     draws: ArrayLike, estimate: float, jackknife: ArrayLike, level: float = LEVEL, *, what: str = "BCa bootstrap"
 ) -> Interval | None:
-    """Return the bias-corrected accelerated interval (Efron 1987), or None where its corrections do not exist.
+    """Return the bias-corrected accelerated interval (Efron 1987, eq. 6.6), or None where it does not exist.
+
+    :func:`scipy.stats.bootstrap` has the same method, but draws anew; here the draws are hierarchical and given.
 
     Args:
         draws: [D] bootstrap values.
@@ -94,15 +88,18 @@ def bca_interval(
     return Interval(float(low), float(high), level, what)
 
 
+def interval_reasons(count: int) -> tuple[str, ...]:
+    """Say what the number of animals means for the interval."""
+    if count == 1:
+        return ("one animal: no confidence interval, since nothing is known about other animals",)
+    if count < VERIFIED_ANIMALS:
+        return (f"interval from {count} animals is unreliable: coverage not verified below {VERIFIED_ANIMALS}",)
+    return ()
+
+
 def caution(count: int) -> str:
     """Say in an interval's method what the number of animals means for it."""
     return "" if count >= VERIFIED_ANIMALS else f"; unreliable: coverage not verified below {VERIFIED_ANIMALS} animals"
-
-
-def check_level(level: float) -> None:
-    """Raise UsageError unless a confidence level lies between 0 and 1."""
-    if not 0 < level < 1:
-        raise UsageError(f"A confidence level lies between 0 and 1, such as 0.95; received {level}.")
 
 
 def check_interval_method(method: str) -> None:

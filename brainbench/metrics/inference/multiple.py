@@ -23,7 +23,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.records import Interval, Score
 from brainbench.metrics.animals import gather
 from brainbench.metrics.inference.intervals import t_interval
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, layer_p, permuted_values
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, layer_p, permuted_values, tail_p
 from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
@@ -189,7 +189,7 @@ def step_down(null: Floats) -> Floats:
     # From the least test up, each is judged against the best of itself and those below it.
     for index in order[::-1]:
         largest = np.maximum(largest, null[index])
-        result[index] = (largest >= null[index, 0] - TIE).mean()
+        result[index] = tail_p(largest, null[index, 0])
     result[order] = np.maximum.accumulate(result[order])
     return result
 
@@ -206,16 +206,17 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
     [0.03, 0.04, 0.04]
     """
     check_correction(correction)
-    values = np.asarray(p, dtype=np.float64)
-    result = values.copy()
-    known = np.flatnonzero(np.isfinite(values))
-    order = known[np.argsort(values[known], kind="stable")]
-    count, rank = len(order), np.arange(1, len(order) + 1)
-    if correction == "holm":
-        result[order] = np.minimum(np.maximum.accumulate(values[order] * (count - rank + 1)), 1.0)
-    elif correction == "fdr":
-        scaled = values[order] * count / rank
-        result[order] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1.0)
+    result = np.array(p, dtype=np.float64)
+    known = np.isfinite(result)
+    if correction == "fdr" and known.any():
+        from scipy.stats import false_discovery_control
+
+        result[known] = false_discovery_control(result[known])
+    elif correction == "holm":
+        # Holm 1979: the i-th smallest of n is multiplied by n − i + 1, and none may fall below its predecessor.
+        order = np.flatnonzero(known)[np.argsort(result[known], kind="stable")]
+        scaled = np.maximum.accumulate(result[order] * np.arange(len(order), 0, -1))
+        result[order] = np.minimum(scaled, 1.0)
     return result
 
 
@@ -242,7 +243,7 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
         signs = np.random.default_rng(seed).choice([-1.0, 1.0], (_RANDOM_FLIPS + 1, len(d)))
         signs[0] = 1.0
     sums = np.abs(signs @ d)
-    return float((sums >= sums[0] - TIE * max(1.0, sums[0])).mean())
+    return float(tail_p(sums))
 
 
 def paired_values(first: Score, second: Score) -> tuple[Floats, Floats]:

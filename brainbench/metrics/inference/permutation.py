@@ -6,6 +6,7 @@ Up to eight stimuli all K! orders are taken (the p-value is exact), above that 1
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,9 +18,8 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Status
 from brainbench.metrics.arrays import find_device
-from brainbench.metrics.rdms.comparison import check_comparison
+from brainbench.metrics.rdms.comparison import check_comparison, permuted_comparisons
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
-from brainbench.metrics.rdms.relabelling import relabelled_comparisons
 
 EXACT_STIMULI = 8
 """Up to this many stimuli all orders are taken (8! = 40,320)."""
@@ -68,6 +68,29 @@ class PermutationTest:
         """The test in words."""
         how = f"all {self.count:,} orders" if self.exact else f"{self.count - 1:,} random orders, (b+1)/(n+1)"
         return f"one-sided permutation of stimulus labels, {how}"
+
+    def summary(self, layers: int, repeated: str = "layer chosen anew in each") -> str:
+        """Describe the test of a score, with the score that a model without knowledge gets by the same choice."""
+        text = f"{self.method}; {'one layer' if layers == 1 else repeated}"
+        if not self.null.size:
+            return text
+        # Adding zero keeps a rounded −0.00 out of the sentence.
+        return f"{text}; mean score under permutation {round(float(np.nanmean(self.null)), 2) + 0.0:.2f}"
+
+
+def tail_p(null: Floats, observed: ArrayLike | None = None) -> Floats:
+    """Return P(statistic ≥ observed) over null statistics [N, ...]; the first of them is the observed one.
+
+    The given order of labels counts among the random ones, which is (b+1)/(n+1).
+    """
+    reached = null[0] if observed is None else np.asarray(observed)
+    return (null >= reached - TIE * np.maximum(1.0, np.abs(reached))).mean(axis=0)
+
+
+def make_test(null: Floats, *, exact: bool, smallest: float | None = None) -> PermutationTest:
+    """Return the test of statistics [N], the observed one first."""
+    least = 1 / len(null) if smallest is None else smallest
+    return PermutationTest(float(tail_p(null)), least, exact, len(null), float(null[0]), null)
 
 
 def permutation_test(
@@ -142,8 +165,7 @@ def permuted_statistic(
             math.nan, smallest, exact, count, math.nan, null, "the comparison is undefined (a constant RDM)"
         )
     # The given order comes first, so the observed statistic went through the same arithmetic.
-    p = float(np.mean(null >= null[0] - TIE * max(1.0, abs(null[0]))))
-    return PermutationTest(p, smallest, exact, count, float(null[0]), null)
+    return make_test(null, exact=exact, smallest=smallest)
 
 
 def permuted_values(
@@ -161,8 +183,8 @@ def permuted_values(
     """
     layers, brain = _canonical(layers, brain)
     step = max(1, _CHUNK_ELEMENTS // layers.size)
-    chunks = label_orders(stimulus_count(layers.shape[-1]), step, seed)
-    found = relabelled_comparisons(layers, brain, chunks, method, device=find_device(device))
+    chunks = label_orders(stimulus_count(layers.shape[-1]), seed, step=step)
+    found = permuted_comparisons(layers, brain, chunks, method, device=find_device(device))
     return np.concatenate([statistic(r) for r in found])
 
 
@@ -171,9 +193,7 @@ def layer_p(null: Floats) -> tuple[Floats, Floats]:
 
     The first row is the observed one; the correction is the maximum statistic (Nichols & Holmes 2002).
     """
-    slack = TIE * np.maximum(1.0, np.abs(null[0]))
-    largest = null.max(axis=1, keepdims=True)
-    return (null >= null[0] - slack).mean(axis=0), (largest >= null[0] - slack).mean(axis=0)
+    return tail_p(null), tail_p(null.max(axis=1, keepdims=True), null[0])
 
 
 def smallest_p(stimuli: int) -> float:
@@ -184,28 +204,31 @@ def smallest_p(stimuli: int) -> float:
     return 1 / (math.factorial(stimuli) if stimuli <= EXACT_STIMULI else RANDOM_PERMUTATIONS + 1)
 
 
-def label_orders(stimuli: int, step: int, seed: int) -> Iterator[Ints]:
-    """Yield orders of the stimuli [≤ step, K], the given order first: all K!, or 10,000 random ones."""
-    if stimuli <= EXACT_STIMULI:
-        orders = _all_orders(stimuli)
-        yield from (orders[start : start + step] for start in range(0, len(orders), step))
+def label_orders(
+    stimuli: int, seed: int, *, exact: int | None = None, draws: int | None = None, step: int = 1 << 20
+) -> Iterator[Ints]:
+    """Yield orders of the stimuli [≤ step, K], the given order first: all K! in lexicographic order, or random ones.
+
+    Args:
+        stimuli: K.
+        seed: Seed of random orders.
+        exact: Most stimuli of which all orders are taken; :data:`EXACT_STIMULI` by default.
+        draws: Number of random orders above; :data:`RANDOM_PERMUTATIONS` by default.
+        step: Most orders yielded at once.
+    """
+    if stimuli <= (EXACT_STIMULI if exact is None else exact):
+        orders = itertools.permutations(range(stimuli))
+        while some := list(itertools.islice(orders, step)):
+            yield np.array(some, dtype=np.int64)
         return
     # Counting the given order once among the random ones is what (b+1)/(n+1) means.
     yield np.arange(stimuli)[None]
     generator = np.random.default_rng(seed)
-    for start in range(0, RANDOM_PERMUTATIONS, step):
-        rows = min(step, RANDOM_PERMUTATIONS - start)
+    left = RANDOM_PERMUTATIONS if draws is None else draws
+    while left:
+        rows = min(step, left)
         yield generator.permuted(np.tile(np.arange(stimuli), (rows, 1)), axis=1)
-
-
-def _all_orders(count: int) -> Ints:
-    """Return all permutations [K!, K] in lexicographic order."""
-    orders = np.zeros((1, 1), dtype=np.int64)
-    for size in range(2, count + 1):
-        rest = orders[None] + (orders[None] >= np.arange(size)[:, None, None])
-        first = np.broadcast_to(np.arange(size)[:, None, None], (size, len(orders), 1))
-        orders = np.concatenate([first, rest], axis=-1).reshape(-1, size)
-    return orders
+        left -= rows
 
 
 def canonical_order(brain: Floats) -> Ints:

@@ -22,7 +22,8 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, label_orders, smallest_p
+from brainbench.core.statistics import wilson_interval
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, upper
@@ -34,6 +35,7 @@ ANIMAL_COUNTS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 20, 30, 50, 100)
 
 _DIMENSIONS = 10
 _ORDERS = 999
+"""Random orders above this many stimuli; up to it all are taken."""
 _EXACT_STIMULI = 6
 _CHUNK_ELEMENTS = 1 << 21
 
@@ -110,15 +112,15 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
         reason = f"{design.stimuli} stimuli allow no p below {smallest:.3g}, whatever is true"
         return Power(design, 0.0, None, 0, smallest, reason=reason)
     generator = np.random.default_rng(seed)
-    pairs = permuted_pairs(_orders(design.stimuli, seed))
+    orders = label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=_ORDERS)
+    pairs = permuted_pairs(np.concatenate(list(orders)))
     found, total = 0, 0.0
     for size in _chunks(simulations, design, len(pairs)):
         model, brain = _experiments(generator, design, size)
         null = _statistics(model, brain, pairs)
-        p = (null >= null[:, :1] - TIE).mean(axis=1)
-        found += int((p <= design.alpha).sum())
+        found += int((tail_p(null.T) <= design.alpha).sum())
         total += float(null[:, 0].sum())
-    interval = _wilson(found, simulations)
+    interval = wilson_interval(found, simulations, over="simulated experiments")
     return Power(design, found / simulations, interval, simulations, smallest, total / simulations)
 
 
@@ -145,14 +147,6 @@ def needed(
         if power(changed, simulations=simulations, seed=seed).power >= target:
             return number
     return None
-
-
-def _orders(stimuli: int, seed: int) -> np.ndarray:
-    """Return orders [N, K], the given one first: all up to six stimuli, else 999 random ones."""
-    if stimuli <= _EXACT_STIMULI:
-        return np.concatenate(list(label_orders(stimuli, 1 << 20, seed)))
-    random = np.random.default_rng(seed).permuted(np.tile(np.arange(stimuli), (_ORDERS, 1)), axis=1)
-    return np.concatenate([np.arange(stimuli)[None], random])
 
 
 def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator[int]:
@@ -190,12 +184,3 @@ def _statistics(model: Floats, brain: Floats, pairs: np.ndarray) -> Floats:
         return np.einsum("snp,sp->sn", left[:, 0][:, pairs], right.mean(axis=1))
     r = np.einsum("slnp,sap->snla", left[:, :, pairs], right, optimize=True)
     return (held_out(r) if brain.shape[1] > 1 else r.max(axis=2)).mean(axis=-1)
-
-
-def _wilson(found: int, count: int) -> Interval:
-    """Return the 95 % Wilson score interval of a share."""
-    z = 1.959963984540054
-    share, square = found / count, z**2 / count
-    centre = (share + square / 2) / (1 + square)
-    half = z * math.sqrt(share * (1 - share) / count + square / (4 * count)) / (1 + square)
-    return Interval(centre - half, centre + half, 0.95, f"Wilson, {count:,} simulated experiments")

@@ -1,15 +1,18 @@
-"""An animal's mean responses and their noise, for metrics of patterns."""
+"""Animals' mean responses and their noise, for metrics of patterns, and which animals count."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Status, SubjectScore
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 from brainbench.metrics.reliability.sessions import usable_sessions
 from brainbench.metrics.stimulus_labels import stimulus_means
 
@@ -65,18 +68,42 @@ def animal_patterns(
     return AnimalPatterns(subject, joined, np.concatenate(noise, axis=1), joined.shape[1], trials, None, notes)
 
 
-class OfMeanResponses:
-    """Base of metrics that need no more of an animal than its mean responses."""
+@dataclass(frozen=True)
+class PatternAnimals:
+    """Animals by name, and the indices of those that are scored."""
 
-    def animal(
-        self,
-        subject: str,
-        blocks: Sequence[Trials],
-        n_stimuli: int,
-        *,
-        stimuli: Sequence[str] | None = None,
-        seed: int = 0,
-        draws: int = 0,
-    ) -> AnimalPatterns:
-        """Return the animal's mean responses; nothing here is random."""
-        return animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)
+    animals: tuple[AnimalPatterns, ...]
+    scored: tuple[int, ...]
+    reliable: bool
+    reasons: tuple[str, ...]
+
+
+def gather_patterns(animals: Sequence[AnimalPatterns], corrected: bool) -> PatternAnimals:
+    """Sort animals by name and decide which are scored: the reliable ones where values are corrected."""
+    if not animals:
+        raise UsageError("There are no animals to score against; give at least one.")
+    ordered = tuple(sorted(animals, key=lambda animal: animal.subject))
+    least = 0.0 if corrected else -math.inf
+    usable = [i for i, animal in enumerate(ordered) if animal.problem is None and animal.reliability > least]
+    good = [i for i in usable if ordered[i].reliability >= RELIABILITY_GATE]
+    scored = good if good and corrected else usable
+    reasons = []
+    for index, animal in enumerate(ordered):
+        if index not in scored:
+            why = animal.problem or f"reliability {animal.reliability:.2f} is below {RELIABILITY_GATE}"
+            reasons.append(f"{animal.subject} left out: {why}")
+        reasons += [f"{animal.subject}: {note}" for note in animal.notes if index in scored]
+    return PatternAnimals(ordered, tuple(scored), bool(good) or not corrected, tuple(reasons))
+
+
+def subject_scores(found: PatternAnimals, values: Mapping[str, tuple[float, str | None]]) -> tuple[SubjectScore, ...]:
+    """Return what each animal contributed: its value and layer, by name."""
+    scores = []
+    for animal in found.animals:
+        value, layer = values.get(animal.subject, (math.nan, None))
+        good = animal.subject in values
+        status: Status = "undefined" if not good else "ok" if found.reliable else "unreliable"
+        scores.append(
+            SubjectScore(animal.subject, value, value, animal.reliability, status, animal.units, animal.trials, layer)
+        )
+    return tuple(scores)

@@ -17,23 +17,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.records import LayerScore, Provenance, Score
+from brainbench.core.records import Score
 from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.intervals import t_interval
-from brainbench.metrics.measures.animal_patterns import AnimalPatterns, OfMeanResponses
-from brainbench.metrics.measures.classifier import ORDERS, Decoder
-from brainbench.metrics.measures.pattern_scores import (
+from brainbench.metrics.inference.permutation import tail_p
+from brainbench.metrics.measures.animal_patterns import AnimalPatterns, gather_patterns, subject_scores
+from brainbench.metrics.measures.classifier import Decoder
+from brainbench.metrics.measures.patterns import (
+    PatternMetric,
     check_features,
-    gather_patterns,
+    describe,
+    layer_scores,
+    make_score,
     pattern_orders,
-    permutation_method,
-    permutation_p,
-    subject_scores,
+    undefined,
 )
-from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.score import layer_table
 from brainbench.metrics.stimulus_labels import response_matrix
+
+ORDERS = 199
+"""Random orders of the stimuli above six."""
 
 
 def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
@@ -53,7 +57,7 @@ def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
     return found
 
 
-class LabelDecoding(OfMeanResponses):
+class LabelDecoding(PatternMetric):
     """Accuracy of decoding the labels' properties, leaving one stimulus out."""
 
     name = "decoding"
@@ -75,47 +79,32 @@ class LabelDecoding(OfMeanResponses):
             UsageError: no layers or animals, features of another number of stimuli, or a published estimator.
         """
         check_features(self.name, features, stimuli, estimator)
-        found = gather_patterns(animals, corrected=False)
+        found, about = gather_patterns(animals, corrected=False), describe(self, name, stimuli)
         layers = {layer: fetch(response_matrix(values, "stimuli")).astype(float) for layer, values in features.items()}
         usable = [layer for layer, values in layers.items() if np.isfinite(values).all()]
         properties = label_properties(stimuli)
-        common = self._common(name, stimuli, estimator)
         if not usable or not properties:
             reason = "activations of every layer are not finite" if properties else _no_property(stimuli)
-            return Score(value=math.nan, status="undefined", reasons=(reason,), **common)
+            return Score(value=math.nan, status="undefined", reasons=(reason,), **about)
         orders = _orders(len(stimuli), seed)
         values = np.stack([_accuracies(layers[layer], properties, orders) for layer in usable], axis=1)
         means = values.mean(axis=-1)
-        statistic, best = means.max(axis=1), int(np.argmax(means[0]))
-        table = layer_table(usable, means)
-        accuracy = dict(zip(usable, means[0].tolist(), strict=True))
-        return Score(
-            value=float(statistic[0]),
+        best = int(np.argmax(means[0]))
+        optimistic = "largest over layers (optimistic; the permutation takes the same maximum)"
+        return make_score(
+            about,
+            means.max(axis=1),
+            seed,
+            {
+                "layer_tests": layer_table(usable, means),
+                "decoding": _by_property(properties, values[:, best]),
+            },
+            smallest=_smallest_p(properties, orders),
             status="ok",
             reasons=("accuracy of the model alone, no likeness: the animals' own stands beside it", *found.reasons),
-            r=float(statistic[0]),
-            p=permutation_p(statistic),
-            p_method=permutation_method(len(stimuli), len(orders), len(usable), statistic),
-            p_smallest=_smallest_p(properties, orders),
             layer=usable[best],
-            layer_rule="only layer"
-            if len(usable) == 1
-            else "largest over layers (optimistic; the permutation takes the same maximum)",
-            best_layer=usable[best],
-            best_layer_value=float(statistic[0]),
-            layers=tuple(
-                LayerScore(layer, accuracy[layer], accuracy[layer])
-                if layer in accuracy
-                else LayerScore(layer, math.nan, math.nan, "undefined")
-                for layer in layers
-            ),
-            provenance=Provenance.of(
-                {
-                    "statistics": {"layer_tests": table, "decoding": _by_property(properties, values[:, best])},
-                    "seed": seed,
-                }
-            ),
-            **common,
+            layer_rule="only layer" if len(usable) == 1 else optimistic,
+            layers=layer_scores(layers, dict(zip(usable, means[0].tolist(), strict=True))),
         )
 
     def score_animals(
@@ -128,48 +117,33 @@ class LabelDecoding(OfMeanResponses):
         """
         check_features(self.name, {"animals": None}, stimuli, estimator)
         found = gather_patterns(animals, corrected=False)
+        about = {**describe(self, "animal-to-animal", stimuli), "layer_rule": "no layers: each animal by itself"}
         scored, properties = [found.animals[i] for i in found.scored], label_properties(stimuli)
-        common = self._common("animal-to-animal", stimuli, estimator)
         if not scored or not properties:
-            reason = "no animal can be used" if properties else _no_property(stimuli)
-            return Score(value=math.nan, status="undefined", reasons=(reason, *found.reasons), **common)
+            return undefined(about, "no animal can be used" if properties else _no_property(stimuli), found)
         orders = _orders(len(stimuli), seed)
         values = np.stack([_accuracies(animal.patterns, properties, orders) for animal in scored], axis=1)
-        each, statistic = values.mean(axis=-1), values.mean(axis=(1, 2))
+        each = values.mean(axis=-1)
         by_subject: dict[str, tuple[float, str | None]] = {
             animal.subject: (value, None) for animal, value in zip(scored, each[0].tolist(), strict=True)
         }
-        return Score(
-            value=float(statistic[0]),
+        return make_score(
+            about,
+            values.mean(axis=(1, 2)),
+            seed,
+            {"decoding": _by_property(properties, values.mean(axis=1))},
+            smallest=_smallest_p(properties, orders),
             status="ok",
             reasons=("each animal's own accuracy, from its mean responses", *found.reasons),
-            r=float(statistic[0]),
             reliability=float(np.mean([animal.reliability for animal in scored])),
             interval=t_interval(each[0]) if len(scored) > 2 else None,
-            p=permutation_p(statistic),
-            p_method=permutation_method(len(stimuli), len(orders), 1, statistic),
-            p_smallest=_smallest_p(properties, orders),
-            layer_rule="no layers: each animal by itself",
             subjects=subject_scores(found, by_subject),
-            provenance=Provenance.of(
-                {"statistics": {"decoding": _by_property(properties, values.mean(axis=1))}, "seed": seed}
-            ),
-            **common,
         )
-
-    def _common(self, name: str, stimuli: Sequence[str], estimator: str) -> dict[str, Any]:
-        return {
-            "name": name,
-            "estimator": estimator,
-            "metric": f"{self.name}: {self.title}",
-            "stimuli": tuple(map(str, stimuli)),
-        }
 
 
 def _orders(stimuli: int, seed: int) -> Ints:
-    orders = pattern_orders(stimuli, seed)
     # Every order is a decoder of its own above six stimuli, where few orders share a partition.
-    return orders if len(orders) <= math.factorial(6) else orders[:ORDERS]
+    return pattern_orders(stimuli, seed, ORDERS - 1)
 
 
 def _accuracies(patterns: Floats, properties: Mapping[str, Ints], orders: Ints) -> Floats:
@@ -192,7 +166,7 @@ def _by_property(properties: Mapping[str, Ints], values: Floats) -> list[dict[st
             "accuracy": float(column[0]),
             "chance": 1 / (int(codes.max()) + 1),
             "expected": float(column.mean()),
-            "p": permutation_p(column),
+            "p": float(tail_p(column)),
         }
         for (name, codes), column in zip(properties.items(), values.T, strict=True)
     ]
@@ -203,6 +177,3 @@ def _no_property(stimuli: Sequence[str]) -> str:
         "the labels name no property that at least two stimuli of each class share, as 'convex-far' and 'convex-close' "
         f"do: {', '.join(map(str, stimuli[:4]))}"
     )
-
-
-register_metric(LabelDecoding())

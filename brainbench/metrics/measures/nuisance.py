@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, canonical_order, label_orders
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
 from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, rdm_stack, stimulus_count, upper
 from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
 
@@ -113,10 +113,10 @@ def variance_partition(
     else:
         found = [
             _partial(model[permuted_pairs(orders)], rest, residual, scale)
-            for orders in label_orders(stimuli, 4096, seed)
+            for orders in label_orders(stimuli, seed, step=4096)
         ]
         null = np.concatenate([item[0] for item in found]).mean(axis=1)
-        p = float((null >= null[0] - TIE).mean())
+        p = float(tail_p(null))
         chance = float(np.concatenate([item[1] for item in found]).mean())
     return VariancePartition(
         total=float(total.mean()),

@@ -19,7 +19,6 @@ from brainbench.core.trials import Trials
 from brainbench.metrics.measures.animal_patterns import AnimalPatterns, animal_patterns
 from brainbench.metrics.measures.nuisance import partial_correlations, variance_partition
 from brainbench.metrics.measures.patterns import PatternMetric
-from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, upper
 from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
@@ -96,6 +95,3 @@ def _nuisances(blocks: Sequence[Trials], count: int) -> tuple[dict[str, Floats],
         else:
             lacking.append(name)
     return found, f" ({', '.join(lacking)} do not)" if lacking else ""
-
-
-register_metric(PartialRSA())

@@ -9,36 +9,36 @@ patterns compare.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
-from brainbench.core.records import LayerScore, Provenance, Score
-from brainbench.metrics.inference.intervals import t_interval
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI
-from brainbench.metrics.layers import most_chosen
-from brainbench.metrics.measures.animal_patterns import AnimalPatterns, OfMeanResponses
-from brainbench.metrics.measures.pattern_scores import (
-    check_features,
-    chosen_layers,
-    few_stimuli,
+from brainbench.core.records import Interval, LayerScore, Provenance, Score, Status
+from brainbench.core.trials import Trials
+from brainbench.metrics.inference.intervals import interval_reasons, t_interval
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, make_test
+from brainbench.metrics.layers import choose_on_others, held_out, most_chosen
+from brainbench.metrics.measures.animal_patterns import (
+    AnimalPatterns,
+    PatternAnimals,
+    animal_patterns,
     gather_patterns,
-    pattern_orders,
-    permutation_method,
-    permutation_p,
     subject_scores,
-    undefined_reasons,
-    verdict,
 )
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.score import layer_table
 from brainbench.metrics.stimulus_labels import response_matrix
 
+ORDERS = 999
+"""Random orders of the stimuli above six; up to six all are taken."""
 
-class PatternMetric(OfMeanResponses):
+_EXACT_STIMULI = 6
+
+
+class PatternMetric:
     """Base of metrics that compare patterns. Subclasses set ``name``, ``title`` and write ``similarity``.
 
     A subclass whose comparison is corrected for noise sets ``corrected`` and overrides :meth:`compare`,
@@ -66,6 +66,23 @@ class PatternMetric(OfMeanResponses):
         """Return values [N, A] with the model's stimuli in each order [N, K]."""
         return np.array([[self.compare(model[order], animal) for animal in animals] for order in orders])
 
+    def statistics(self, model: Floats, animals: Sequence[Any], seed: int) -> dict[str, Any]:
+        """Return what else a record keeps of the chosen layer's features [K, F]; nothing unless overridden."""
+        return {}
+
+    def animal(
+        self,
+        subject: str,
+        blocks: Sequence[Trials],
+        n_stimuli: int,
+        *,
+        stimuli: Sequence[str] | None = None,
+        seed: int = 0,
+        draws: int = 0,
+    ) -> AnimalPatterns:
+        """Return the animal's mean responses; nothing here is random."""
+        return animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)
+
     def score(
         self,
         features: Mapping[str, ArrayLike],
@@ -82,75 +99,43 @@ class PatternMetric(OfMeanResponses):
             UsageError: no layers or animals, features of another number of stimuli, or a published estimator.
         """
         check_features(self.name, features, stimuli, estimator)
-        found = gather_patterns(animals, self.corrected)
+        found, about = gather_patterns(animals, self.corrected), describe(self, name, stimuli)
         layers = {layer: response_matrix(values, "stimuli").astype(np.float64) for layer, values in features.items()}
         usable = [
             layer for layer, values in layers.items() if np.isfinite(values).all() and np.ptp(values, axis=0).any()
         ]
-        common: dict[str, Any] = {
-            "name": name,
-            "estimator": estimator,
-            "metric": f"{self.name}: {self.title}",
-            "stimuli": tuple(map(str, stimuli)),
-        }
-        if not usable or not found.scored or len(stimuli) < SMALLEST_STIMULI:
-            return Score(
-                value=math.nan, status="undefined", reasons=undefined_reasons(found, usable, len(stimuli)), **common
-            )
+        if len(stimuli) < SMALLEST_STIMULI:
+            return undefined(about, _few_stimuli(len(stimuli)), found)
+        if not usable:
+            return undefined(about, "activations of every layer are constant or not finite", found)
+        if not found.scored:
+            return undefined(about, "no animal can be used", found)
         orders = pattern_orders(len(stimuli), seed)
         scored = [found.animals[i] for i in found.scored]
         values = np.stack([self.compare_orders(layers[layer], scored, orders) for layer in usable], axis=1)
         known = np.isfinite(values[0]).all(axis=0)
         if not known.any():
-            reason = "the metric has no value for any animal"
-            return Score(value=math.nan, status="undefined", reasons=(reason, *found.reasons), **common)
+            return undefined(about, "the metric has no value for any animal", found)
         values, scored = values[..., known], [animal for animal, keep in zip(scored, known, strict=True) if keep]
-        chosen, held, rule = chosen_layers(values)
-        statistic = held.mean(axis=-1)
-        status, reasons = verdict(found, len(scored), self.corrected)
-        means = values[0].mean(axis=-1)
-        best = int(np.argmax(means))
+        chosen, held, rule = _chosen_layers(values)
+        layer = usable[most_chosen(chosen)]
+        means = dict(zip(usable, values[0].mean(axis=-1).tolist(), strict=True))
         by_subject = {a.subject: (float(v), usable[int(c)]) for a, v, c in zip(scored, held[0], chosen, strict=True)}
-        return Score(
-            value=float(statistic[0]),
+        status: Status = "ok" if found.reliable else "unreliable"
+        return make_score(
+            about,
+            held.mean(axis=-1),
+            seed,
+            {"layer_tests": layer_table(usable, values.mean(axis=-1))} | self.statistics(layers[layer], scored, seed),
             status=status,
-            reasons=reasons,
-            r=float(statistic[0]),
+            reasons=self._reasons(found, len(scored)),
             reliability=float(np.mean([animal.reliability for animal in scored])),
             interval=t_interval(held[0]),
-            p=permutation_p(statistic),
-            p_method=permutation_method(len(stimuli), len(orders), len(usable), statistic),
-            p_smallest=1 / len(orders),
-            layer=usable[most_chosen(chosen)],
+            layer=layer,
             layer_rule=rule,
-            best_layer=usable[best],
-            best_layer_value=float(means[best]),
-            layers=tuple(
-                LayerScore(
-                    layer,
-                    float(means[usable.index(layer)]),
-                    float(means[usable.index(layer)]),
-                    status,
-                    t_interval(values[0][usable.index(layer)]),
-                )
-                if layer in usable
-                else LayerScore(layer, math.nan, math.nan, "undefined")
-                for layer in layers
-            ),
+            layers=layer_scores(layers, means, status, dict(zip(usable, map(t_interval, values[0]), strict=True))),
             subjects=subject_scores(found, by_subject),
-            provenance=Provenance.of(
-                {
-                    "statistics": {"layer_tests": layer_table(usable, values.mean(axis=-1))}
-                    | self.statistics(layers[usable[most_chosen(chosen)]], scored, seed),
-                    "seed": seed,
-                }
-            ),
-            **common,
         )
-
-    def statistics(self, model: Floats, animals: Sequence[Any], seed: int) -> dict[str, Any]:
-        """Return what else a record keeps of the chosen layer's features [K, F]; nothing unless overridden."""
-        return {}
 
     def score_animals(
         self, animals: Sequence[AnimalPatterns], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
@@ -162,39 +147,127 @@ class PatternMetric(OfMeanResponses):
         """
         check_features(self.name, {"others": None}, stimuli, estimator)
         found = gather_patterns(animals, self.corrected)
+        about = describe(self, "animal-to-animal", stimuli, "; each animal against the joined units of the others")
+        about["layer_rule"] = "no layers: each animal against the others"
         scored = [found.animals[i] for i in found.scored]
-        common: dict[str, Any] = {
-            "name": "animal-to-animal",
-            "estimator": estimator,
-            "metric": f"{self.name}: {self.title}; each animal against the joined units of the others",
-            "stimuli": tuple(map(str, stimuli)),
-            "layer_rule": "no layers: each animal against the others",
-        }
-        if len(scored) < 2 or len(stimuli) < SMALLEST_STIMULI:
-            reason = "fewer than two animals can be used" if len(scored) < 2 else few_stimuli(len(stimuli))
-            return Score(value=math.nan, status="undefined", reasons=(reason, *found.reasons), **common)
+        if len(scored) < 2:
+            return undefined(about, "fewer than two animals can be used", found)
+        if len(stimuli) < SMALLEST_STIMULI:
+            return undefined(about, _few_stimuli(len(stimuli)), found)
         orders = pattern_orders(len(stimuli), seed)
         columns = []
         for animal in scored:
             others = np.concatenate([other.patterns for other in scored if other is not animal], axis=1)
             columns.append(self.compare_orders(others, [animal], orders))
         values = np.concatenate(columns, axis=1)
-        by_subject = {animal.subject: (float(v), None) for animal, v in zip(scored, values[0], strict=True)}
-        statistic = values.mean(axis=-1)
-        status, reasons = verdict(found, len(scored), self.corrected)
-        if not np.isfinite(statistic[0]):
-            return Score(value=math.nan, status="undefined", reasons=("the metric has no value", *reasons), **common)
-        return Score(
-            value=float(statistic[0]),
-            status=status,
+        by_subject: dict[str, tuple[float, str | None]] = {
+            animal.subject: (float(v), None) for animal, v in zip(scored, values[0], strict=True)
+        }
+        reasons = self._reasons(found, len(scored))
+        if not np.isfinite(values[0]).all():
+            return Score(value=math.nan, status="undefined", reasons=("the metric has no value", *reasons), **about)
+        return make_score(
+            about,
+            values.mean(axis=-1),
+            seed,
+            {},
+            status="ok" if found.reliable else "unreliable",
             reasons=reasons,
-            r=float(statistic[0]),
             reliability=float(np.mean([animal.reliability for animal in scored])),
             interval=t_interval(values[0]) if len(scored) > 2 else None,
-            p=permutation_p(statistic),
-            p_method=permutation_method(len(stimuli), len(orders), 1, statistic),
-            p_smallest=1 / len(orders),
             subjects=subject_scores(found, by_subject),
-            provenance=Provenance.of({"statistics": {}, "seed": seed}),
-            **common,
         )
+
+    def _reasons(self, found: PatternAnimals, scored: int) -> tuple[str, ...]:
+        """Say what to heed, the gravest first."""
+        unreliable = () if found.reliable else ("no animal's responses are reliable",)
+        raw = (
+            () if self.corrected else ("not corrected for noise: compare with the animal-to-animal value, not with 1",)
+        )
+        return (*unreliable, *found.reasons, *raw, *interval_reasons(scored))
+
+
+def check_features(metric: str, features: Mapping[str, Any], stimuli: Sequence[str], estimator: str) -> None:
+    """Raise UsageError for a published estimator, no layers, or features of another number of stimuli."""
+    if estimator != "default":
+        raise UsageError(f"The estimator {estimator!r} is one of RSA; the metric {metric!r} has 'default' only.")
+    if not features:
+        raise UsageError("There are no layers to score; give the features of at least one layer.")
+    for layer, values in features.items():
+        rows = len(stimuli) if values is None else len(np.asarray(values))
+        if rows != len(stimuli):
+            raise UsageError(f"The features of layer {layer!r} have {rows} rows; {len(stimuli)} stimuli are scored.")
+
+
+def pattern_orders(stimuli: int, seed: int, draws: int = ORDERS) -> Ints:
+    """Return orders of the stimuli [N, K], the given one first: all up to six stimuli, else random ones."""
+    return np.concatenate(list(label_orders(stimuli, seed, exact=_EXACT_STIMULI, draws=draws)))
+
+
+def describe(metric: PatternMetric, name: str, stimuli: Sequence[str], how: str = "") -> dict[str, Any]:
+    """Return the fields of a score that say what was compared."""
+    return {"name": name, "metric": f"{metric.name}: {metric.title}{how}", "stimuli": tuple(map(str, stimuli))}
+
+
+def undefined(about: Mapping[str, Any], reason: str, found: PatternAnimals) -> Score:
+    """Return a score without a value."""
+    return Score(value=math.nan, status="undefined", reasons=(reason, *found.reasons), **about)
+
+
+def make_score(
+    about: Mapping[str, Any],
+    null: Floats,
+    seed: int,
+    statistics: Mapping[str, Any],
+    *,
+    layers: tuple[LayerScore, ...] = (),
+    smallest: float | None = None,
+    **fields: Any,
+) -> Score:
+    """Return the score whose value is the first of the statistics [N] under every order of the stimuli."""
+    test = make_test(null, exact=len(about["stimuli"]) <= _EXACT_STIMULI, smallest=smallest)
+    usable = [layer for layer in layers if layer.status != "undefined"]
+    best = max(usable, key=lambda layer: layer.value, default=None)
+    return Score(
+        value=test.observed,
+        r=test.observed,
+        p=test.p,
+        p_method=test.summary(max(1, len(usable))),
+        p_smallest=test.smallest,
+        layers=layers,
+        best_layer=best and best.layer,
+        best_layer_value=best.value if best else math.nan,
+        provenance=Provenance.of({"statistics": dict(statistics), "seed": seed}),
+        **fields,
+        **about,
+    )
+
+
+def layer_scores(
+    layers: Iterable[str],
+    means: Mapping[str, float],
+    status: Status = "ok",
+    intervals: Mapping[str, Interval | None] | None = None,
+) -> tuple[LayerScore, ...]:
+    """Return the mean value of every layer; layers without one are undefined."""
+    return tuple(
+        LayerScore(layer, means[layer], means[layer], status, (intervals or {}).get(layer))
+        if layer in means
+        else LayerScore(layer, math.nan, math.nan, "undefined")
+        for layer in layers
+    )
+
+
+def _few_stimuli(stimuli: int) -> str:
+    return f"{stimuli} stimuli are too few to leave one out; at least {SMALLEST_STIMULI} are needed"
+
+
+def _chosen_layers(values: Floats) -> tuple[Ints, Floats, str]:
+    """Return the layers [A] chosen, the values [N, A] held out under every order, and the rule in words."""
+    if values.shape[1] == 1:
+        return np.zeros(values.shape[2], dtype=np.int64), values[:, 0], "only layer"
+    if values.shape[2] == 1:
+        rule = "maximum over layers on the only animal (optimistic; the permutation takes the same maximum)"
+        return np.argmax(values[0], axis=0), values.max(axis=1), rule
+    rule = "chosen on the other animals, evaluated on the animal held out"
+    return choose_on_others(values[0]), held_out(values), rule

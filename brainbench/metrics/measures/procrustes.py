@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.metrics.measures.animal_patterns import AnimalPatterns
 from brainbench.metrics.measures.patterns import PatternMetric
-from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.stimulus_labels import response_matrix
 
@@ -77,6 +76,3 @@ def _similarities(left: Floats, right: Floats) -> Floats:
     root = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
     inner = np.linalg.eigvalsh(root @ right @ root)
     return np.sqrt(np.maximum(inner, 0)).sum(axis=-1)
-
-
-register_metric(Procrustes())

@@ -8,14 +8,13 @@ them. A new one needs a single file: subclass :class:`brainbench.metrics.measure
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.plugins import load_object
 from brainbench.core.records import Score
 from brainbench.core.trials import Trials
 
@@ -83,42 +82,20 @@ def register_metric(metric: Metric) -> Metric:
 
 
 def get_metric(name: str) -> Metric:
-    """Return a registered metric.
-
-    Raises:
-        UsageError: nothing has this name.
-    """
-    if name not in list_metrics():
-        raise unknown_name("metric", name, list_metrics(), hint="Your own: FILE.py:CLASS.")
-    return _METRICS[name]
-
-
-def find_metric(name: str) -> Metric:
-    """Return a registered metric, or the one named NAME in the file FILE.py for ``FILE.py:NAME``.
+    """Return a registered metric, or the one that ``FILE.py:NAME`` or ``package.module:NAME`` names.
 
     NAME is a metric, or a class or function that makes one without arguments.
 
     Raises:
         UsageError: nothing has this name, or it is no metric.
+        DataFileNotFoundError: there is no such file or module.
         DataError: the file cannot be run.
     """
-    if ".py" not in name:
-        return get_metric(name)
-    path, _, attribute = name.rpartition(":")
-    if not Path(path).is_file() or not attribute:
-        raise UsageError(f"A metric of your own is FILE.py:NAME with an existing file; received {name!r}.")
-    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
-    if spec is None or spec.loader is None:
-        raise UsageError(f"{path!r} is no Python file.")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise DataError(f"Running {path} failed: {type(error).__name__}: {error}.") from error
-    if not hasattr(module, attribute):
-        public = [item for item in vars(module) if not item.startswith("_")]
-        raise unknown_name(f"name in {path}", attribute, public)
-    found: Any = getattr(module, attribute)
+    if ":" not in name:
+        if name not in _METRICS:
+            raise unknown_name("metric", name, list_metrics(), hint="Your own: FILE.py:CLASS.")
+        return _METRICS[name]
+    found = load_object(name, "metric")
     # A class has the names of its instances, so it must be told from an instance first.
     made: Any = found() if isinstance(found, type) or (not hasattr(found, "title") and callable(found)) else found
     check_metric(made)
@@ -126,14 +103,7 @@ def find_metric(name: str) -> Metric:
 
 
 def list_metrics() -> tuple[str, ...]:
-    """Return the names of the registered metrics, ours first."""
-    # Ours register themselves when their module is imported.
-    import brainbench.metrics.measures.decoding
-    import brainbench.metrics.measures.partial_rsa
-    import brainbench.metrics.measures.procrustes
-    import brainbench.metrics.measures.ridge
-    import brainbench.metrics.measures.rsa  # noqa: F401
-
+    """Return the names of the registered metrics, RSA first."""
     return tuple(sorted(_METRICS, key=lambda name: (name != "rsa", name)))
 
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from brainbench.metrics.measures.animal_patterns import AnimalPatterns
 from brainbench.metrics.measures.patterns import PatternMetric
-from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.rdms.pairs import Floats, Ints
 
 PENALTIES = tuple(10.0**power for power in range(-3, 4))
@@ -96,6 +95,3 @@ def _squares(kernel: Floats, train: Ints, test: Ints) -> Floats:
 
 def _residual_squares(combination: Floats) -> Floats:
     return combination.T @ combination
-
-
-register_metric(RidgeEncoding())

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from brainbench.core.records import Score
 from brainbench.core.trials import Trials
 from brainbench.metrics.animal_to_animal import score_animals
-from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 from brainbench.metrics.score import score_rdms
@@ -71,20 +70,3 @@ class RSA:
     ) -> Score:
         """Score the animals against one another; see :func:`brainbench.metrics.score_animals`."""
         return score_animals(animals, stimuli=stimuli, estimator=estimator, compare=self.comparison, seed=seed)
-
-
-register_metric(RSA("rsa", "correlation between RDMs of correlation distances, noise-corrected"))
-register_metric(
-    RSA(
-        "rsa-crossnobis",
-        "whitened cosine between RDMs, crossnobis for animals (no bias by trial noise), noise-corrected",
-        "crossnobis",
-        "sqeuclidean",
-        "whitened-cosine",
-    )
-)
-register_metric(
-    # Linear CKA is the cosine of doubly centred second-moment matrices, which is what whitening makes of
-    # squared Euclidean RDMs (Diedrichsen 2021, section on CKA).
-    RSA("cka", "linear centred kernel alignment, noise-corrected", "sqeuclidean", "sqeuclidean", "whitened-cosine")
-)

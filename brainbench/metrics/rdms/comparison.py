@@ -6,16 +6,22 @@ product. Definitions equal scipy's and rsatoolbox 0.3.2's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.metrics.rdms.pairs import Floats, rdm_stack, square, stimulus_count
+from brainbench.metrics.arrays import fetch, is_tensor, library, place
+from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
 
 _CONSTANT = 64 * np.finfo(np.float64).eps
 """An RDM whose spread is below this share of its size is constant up to rounding."""
+
+_OF_PAIRS = ("pearson", "spearman", "rho-a", "cosine")
+"""Comparisons of vectors of pairs; those of whitened vectors compare whole matrices."""
+_OF_MATRICES = ("whitened-cosine", "whitened-pearson")
 
 _SIGN_LIMIT = 128
 """Above this many pairs Kendall's tau sorts (P log P) instead of comparing all pairs of pairs (P²)."""
@@ -74,6 +80,40 @@ def compare_all(a: Floats, b: Floats, *, method: str = "pearson") -> Floats:
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return compare(a[:, None], b[None], method=method)
     return features(a, method) @ features(b, method).T
+
+
+def permuted_comparisons(
+    layers: Floats, brain: Floats, chunks: Iterator[Ints], method: str, *, device: Any = None
+) -> Iterator[Floats]:
+    """Yield comparisons [N, L, A] of layers [L, P], with their stimuli in each order of a chunk [N, K], with animals.
+
+    Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what most comparisons multiply
+    is made once and every order only moves it: one gather and one matrix product, on the processor or on a
+    torch device. Kendall's tau, whose vectors are of pairs of pairs, is compared order by order by numpy.
+
+    Args:
+        layers: RDMs whose stimuli are permuted.
+        brain: RDMs [A, P].
+        chunks: Orders of the stimuli.
+        method: Comparison.
+        device: Torch device for the products, None for numpy.
+    """
+    complete = bool(np.isfinite(layers).all() and np.isfinite(brain).all())
+    if not complete or method not in (*_OF_PAIRS, *_OF_MATRICES):
+        for orders in chunks:
+            permuted = layers[:, permuted_pairs(orders)].swapaxes(0, 1).reshape(-1, layers.shape[-1])
+            yield compare_all(permuted, brain, method=method).reshape(len(orders), len(layers), len(brain))
+        return
+    count = stimulus_count(layers.shape[-1])
+    left, right = place(features(layers, method), device), place(features(brain, method), device).T
+    for orders in chunks:
+        moved = library(left).from_numpy(np.array(orders)).to(left.device) if is_tensor(left) else orders
+        if method in _OF_PAIRS:
+            places = permuted_pairs(moved)
+        else:
+            # A square matrix read row by row: the entry (i, j) comes from (order[i], order[j]).
+            places = (moved[:, :, None] * count + moved[:, None, :]).reshape(len(moved), -1)
+        yield fetch((left[:, places] @ right).swapaxes(0, 1))
 
 
 def features(rdms: Floats, method: str) -> Floats:

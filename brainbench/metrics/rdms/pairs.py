@@ -37,12 +37,14 @@ def stimulus_count(pairs: int) -> int:
 
 def upper(matrix: Any) -> Any:
     """Return the upper triangle [..., P] of square matrices [..., K, K], numpy arrays or tensors."""
-    count = matrix.shape[-1]
-    if is_tensor(matrix):
-        rows, cols = library(matrix).triu_indices(count, count, offset=1, device=matrix.device)
-    else:
-        rows, cols = np.triu_indices(count, k=1)
-    return matrix[..., rows, cols]
+    return matrix[..., *_pair_indices(matrix.shape[-1], matrix)]
+
+
+def _pair_indices(count: int, like: Any) -> Any:
+    """Return the rows [P] and columns [P] of all pairs, where and what ``like`` is."""
+    if is_tensor(like):
+        return library(like).triu_indices(count, count, offset=1, device=like.device).unbind()
+    return np.triu_indices(count, k=1)
 
 
 def square(rdm: ArrayLike) -> Floats:
@@ -56,12 +58,13 @@ def square(rdm: ArrayLike) -> Floats:
     return matrix
 
 
-def permuted_pairs(orders: Ints) -> Ints:
+def permuted_pairs(orders: Any) -> Any:
     """Return indices [N, P] such that ``rdm[indices[n]]`` is the RDM of stimuli in ``orders[n]`` [N, K]."""
-    count = orders.shape[-1]
-    rows, cols = np.triu_indices(count, k=1)
-    table = np.zeros((count, count), dtype=np.int64)
-    table[rows, cols] = table[cols, rows] = np.arange(len(rows))
+    xp, count = library(orders), orders.shape[-1]
+    rows, cols = _pair_indices(count, orders)
+    where = {"device": orders.device} if is_tensor(orders) else {}
+    table = xp.zeros((count, count), dtype=xp.int64, **where)
+    table[rows, cols] = table[cols, rows] = xp.arange(len(rows), **where)
     return table[orders[..., rows], orders[..., cols]]
 
 

@@ -15,9 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from brainbench.core.errors import DataError, unknown_name
-from brainbench.metrics.rdms.noise_model import NOISE_METHODS, NoiseModel
+from brainbench.metrics.rdms.noise import NOISE_METHODS, NoiseModel, estimate_noise
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.rdms.precision import estimate_noise
 from brainbench.metrics.reliability.sessions import SortedTrials
 from brainbench.metrics.stimulus_labels import stimulus_means
 

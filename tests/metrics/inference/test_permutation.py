@@ -16,7 +16,7 @@ from tests.factories.animals import make_rdm
 
 
 def test_all_orders_of_the_stimuli_are_taken_once():
-    orders = np.concatenate(list(label_orders(6, 100, 0)))
+    orders = np.concatenate(list(label_orders(6, 0, step=100)))
     assert [tuple(order) for order in orders] == list(itertools.permutations(range(6)))
 
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.linalg import orthogonal_procrustes
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.metrics import (
     PatternMetric,
     Trials,
     compare,
-    find_metric,
     get_metric,
     list_metrics,
     rdm,
@@ -165,7 +164,7 @@ def test_a_metric_of_ones_own_takes_one_file(tmp_path):
         "        d = [((x[:, None] - x) ** 2).sum(-1) + 1e9 * np.eye(len(x)) for x in (model, brain)]\n"
         "        return float((d[0].argmin(1) == d[1].argmin(1)).mean())\n"
     )
-    metric = find_metric(f"{path}:Mine")
+    metric = get_metric(f"{path}:Mine")
     latent, animals = _make(metric)
     found = _score(metric, {"a": latent, "b": make_latent(77)}, animals)
     assert found.metric == "mine: share of neighbours"
@@ -173,15 +172,15 @@ def test_a_metric_of_ones_own_takes_one_file(tmp_path):
     assert found.p < 0.05
     assert "not corrected for noise: compare with the animal-to-animal value, not with 1" in found.reasons
     with pytest.raises(UsageError, match="did you mean 'Mine'"):
-        find_metric(f"{path}:Mina")
-    with pytest.raises(UsageError, match="existing file"):
-        find_metric("nowhere.py:Mine")
+        get_metric(f"{path}:Mina")
+    with pytest.raises(DataFileNotFoundError, match="no Python file"):
+        get_metric("nowhere.py:Mine")
     path.write_text("1 / 0")
     with pytest.raises(DataError, match="ZeroDivisionError"):
-        find_metric(f"{path}:Mine")
+        get_metric(f"{path}:Mine")
     path.write_text("class Half:\n    name = 'x'\n")
     with pytest.raises(UsageError, match="lacks title, animal, score, score_animals"):
-        find_metric(f"{path}:Half")
+        get_metric(f"{path}:Half")
 
 
 def test_a_metric_without_similarity_says_so():
