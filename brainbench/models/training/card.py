@@ -25,7 +25,7 @@ def checkpoint_info(
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
-    ``drawn_biases`` is what :func:`~brainbench.models.training.initial_state.draw_silent_biases` returned.
+    ``drawn_biases`` is what :func:`~brainbench.models.training.trainer.draw_silent_biases` returned.
     """
     return {
         "objective": config.objective,
