@@ -337,8 +337,8 @@ class _Run:
 
         reason = (
             f"at step {self.at.step + 1} the loss was {loss:g} and the gradient's norm {norm:g}; the last good model "
-            f"is kept and the batch is in {FAILED}. A lower learning rate, a smaller clipping norm or the -ln variant of "
-            "the network may help"
+            f"is kept and the batch is in {FAILED}. A lower learning rate, a smaller clipping norm or the -ln variant "
+            "of the network may help"
         )
         if self.where.first:
             tensors = {f"view{index}": view.cpu().contiguous() for index, view in enumerate(views)}
