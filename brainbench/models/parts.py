@@ -1,4 +1,4 @@
-"""What the parts of an encoder-attender-decoder network offer one another.
+"""The protocols of the parts of an encoder-attender-decoder network.
 
 Letters: B batch, T time step, (C, H, W) one step of the stimulus, F features. A part is also a
 :class:`torch.nn.Module`; its streaming state is a value that only the part itself looks into.

@@ -39,7 +39,7 @@ class StreamingStep(nn.Module):
         super().__init__()
         if not isinstance(model, EncoderAttenderDecoder):
             raise UsageError(
-                f"Streaming and export need an encoder-attender-decoder network (brainbench.models.network.EAD); "
+                "Streaming and export need a brainbench.models.network.EncoderAttenderDecoder; "
                 f"received {type(model).__name__}."
             )
         self.model = model

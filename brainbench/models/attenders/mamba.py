@@ -25,7 +25,7 @@ _STEP_RANGE = (1e-3, 1e-1)
 
 
 class MambaMemory(NamedTuple):
-    """What a block carries from one step to the next."""
+    """Memory of a block between two steps."""
 
     recent: torch.Tensor
     """[B, inner, convolution − 1] the inputs of the short convolution, oldest first."""

@@ -1,4 +1,4 @@
-"""What a temporal graph is made of: frozen, validated descriptions of nodes and edges.
+"""The description of a temporal graph: frozen, validated nodes and edges.
 
 A node concatenates its inputs on channels, applies an operation, then a memory, an activation and a
 pool. Shapes are (C, H, W), or (F,) after a dense operation. Importing this module imports no framework.
@@ -25,7 +25,7 @@ class Convolution:
     """2-D convolution of the concatenated inputs."""
 
     channels: int
-    """Of the output."""
+    """Channels of the output."""
     kernel_size: tuple[int, int] = (2, 2)
     """Rows, columns."""
     stride: tuple[int, int] = (1, 1)
@@ -59,7 +59,7 @@ class Dense:
     """Linear layer of the flattened, concatenated inputs."""
 
     features: int
-    """Of the output."""
+    """Features of the output."""
     use_bias: bool = True
     bias: float | None = 0.1
     """Initial bias; None draws it within 1/√fan_in."""
@@ -87,7 +87,7 @@ class Memory:
     kind: str = "time-decay"
     """One of :data:`MEMORIES`."""
     kernel_size: tuple[int, int] = (2, 2)
-    """Of the gates, rows and columns."""
+    """Kernel of the gates, rows and columns."""
     layer_norm: bool = False
     """Normalise each gate over channels."""
     tau: float = 0.0
@@ -106,11 +106,11 @@ class Pool:
     size: tuple[int, int]
     """Window of a maximum; output size of an average."""
     stride: tuple[int, int] | None = None
-    """Of a maximum; None is its window."""
+    """Step of the window of a maximum; None: as large as the window."""
     padding: tuple[int, int] = (0, 0)
-    """Of a maximum: cells added at every edge."""
+    """Cells added at every edge, for a maximum."""
     ceil_mode: bool = False
-    """Of a maximum: a window may reach beyond the edge."""
+    """Let a window of a maximum reach beyond the edge."""
     flatten: bool = False
     """Give one vector in place of a grid."""
 

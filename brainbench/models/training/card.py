@@ -1,4 +1,4 @@
-"""What is written beside a trained model: its configuration and its model card."""
+"""The configuration and the model card that are written beside a trained model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is trained and how, and what speaks against it. Importing this module imports no framework."""
+"""The options of a training run, and warnings against some of them. Importing this module imports no framework."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class TrainingConfig:
     schedule: str = "step"
     """One of :data:`~brainbench.models.training.optimizers.SCHEDULES`."""
     learning_rate: float = 1e-2
-    """At its highest."""
+    """Highest learning rate."""
     warmup_epochs: int = 0
-    """Over which the rate of the ``cosine`` schedule rises, from 1e-4 of its highest."""
+    """Epochs in which the rate of the ``cosine`` schedule rises from 1e-4 of its highest."""
     epochs: int = EPOCHS
     """Passes through the training sweeps."""
     batch_size: int = BATCH_SIZE
@@ -63,7 +63,7 @@ class TrainingConfig:
     probe_epochs: int = 100
     """Epochs of the linear probe after a self-supervised objective; 0 for none."""
     seed: int = 0
-    """Of weights, order, augmentation and dropout."""
+    """Seed of weights, order, augmentation and dropout."""
     checkpoint_seconds: float = 60.0
     """Time between saved states within an epoch; the end of every epoch saves too."""
     weights_dtype: str = "auto"
@@ -140,7 +140,7 @@ class TrainingConfig:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What must be equal for a run to be resumed: all but how often and how exactly results are stored."""
+        """Options that must be equal for a run to be resumed: all but how often and how exactly results are stored."""
         free = ("checkpoint_seconds", "weights_dtype")
         return {name: value for name, value in dataclasses.asdict(self).items() if name not in free}
 

@@ -1,4 +1,4 @@
-"""How well a trained network tells classes apart, whether it has collapsed, and the linear probe that reads it.
+"""The accuracy of a trained network, its collapse, and the linear probe that reads classes from it.
 
 Nothing before the probe's layer changes, so every sweep is encoded once, without augmentation. Features are
 standardised over the training sweeps for the optimiser's sake; that map is folded into the layer afterwards, which
@@ -38,17 +38,17 @@ class Evaluation:
     top1: float
     top5: float
     interval: Interval
-    """Of ``top1`` (Wilson 1927)."""
+    """Interval of ``top1`` (Wilson 1927)."""
     count: int
     """N."""
     predicted: int
-    """How many classes were ever the first answer."""
+    """Number of classes that were ever the first answer."""
     spread: float
     """Standard deviation of unit-length features × √F, averaged: about 1 when spread over the sphere, 0 when one
     point. NaN for a network that names no features."""
     collapsed: bool
     reason: str
-    """Why it counts as collapsed; empty otherwise."""
+    """Reason why it counts as collapsed; empty otherwise."""
     data: str
     """Hash of the sweeps and labels."""
 

@@ -20,7 +20,7 @@ from brainbench.models.encoders.resnet import BasicBlock
 from brainbench.models.encoders.s4 import S4Block
 
 PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)
-"""What is compiled on its own: called at every step or block, with few shapes."""
+"""Modules that are compiled on their own: called at every step or block, with few shapes."""
 
 
 def compiled(module: torch.nn.Module, how: str) -> Any:

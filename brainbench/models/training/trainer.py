@@ -54,7 +54,7 @@ _LOG_STEPS = 50
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """How a run ended."""
+    """End of a run."""
 
     status: Literal["finished", "stopped", "diverged"]
     """``stopped``: the time allowed was over; start it again to go on."""
@@ -111,7 +111,7 @@ def train(
 
 @dataclass
 class _Position:
-    """Where a run stands."""
+    """Progress of a run."""
 
     step: int = 0
     """Optimiser steps done."""

@@ -69,27 +69,27 @@ def test_options_are_read_from_toml_and_json(tmp_path):
         read_options(tmp_path / "c.json")
 
 
-def _doubts(name, objective, **changes):
+def _warnings(name, objective, **changes):
     return config_warnings(TrainingConfig.published(name, objective, **changes), load_model(name))
 
 
-def test_published_recipes_of_networks_with_memory_raise_no_doubt():
-    assert _doubts("zhuang-intersection-ln-small", "simclr") == []
-    assert _doubts("resnet18-small+gpt", "simclr") == []
-    assert _doubts("resnet18-small", "supervised", augmentation="none") == []
+def test_published_recipes_of_networks_with_memory_raise_no_warning():
+    assert _warnings("zhuang-intersection-ln-small", "simclr") == []
+    assert _warnings("resnet18-small+gpt", "simclr") == []
+    assert _warnings("resnet18-small", "supervised", augmentation="none") == []
 
 
-def test_equal_views_are_doubted():
-    (doubt,) = _doubts("zhuang-intersection-ln-small", "simclr", augmentation="none")
-    assert "both views of a sweep are equal" in doubt
-    assert "Choose an augmentation" in doubt
-    assert _doubts("zhuang-intersection-ln-small", "simclr", augmentation="none", masking=0.75) == []
+def test_equal_views_raise_a_warning():
+    (warning,) = _warnings("zhuang-intersection-ln-small", "simclr", augmentation="none")
+    assert "both views of a sweep are equal" in warning
+    assert "Choose an augmentation" in warning
+    assert _warnings("zhuang-intersection-ln-small", "simclr", augmentation="none", masking=0.75) == []
 
 
-def test_a_network_without_memory_is_doubted_where_time_may_run_backwards():
-    (doubt,) = _doubts("resnet18-small", "simclr")
-    assert "resnet18-small has no memory: its last answer sees the last step" in doubt
-    assert _doubts("resnet18-small", "simclr", augmentation="image") == []
+def test_a_network_without_memory_raises_a_warning_where_time_may_run_backwards():
+    (warning,) = _warnings("resnet18-small", "simclr")
+    assert "resnet18-small has no memory: its last answer sees the last step" in warning
+    assert _warnings("resnet18-small", "simclr", augmentation="image") == []
 
 
 def test_played_backwards_sweeps_that_begin_in_silence_look_all_alike_to_a_network_without_memory():
@@ -101,7 +101,7 @@ def test_played_backwards_sweeps_that_begin_in_silence_look_all_alike_to_a_netwo
         assert torch.allclose(features, features[:1].expand_as(features), rtol=1e-4, atol=1e-6) == alike
 
 
-def test_a_run_says_its_doubts_and_goes_on(tmp_path, caplog):
+def test_a_run_says_its_warnings_and_goes_on(tmp_path, caplog):
     options = {"epochs": 1, "batch_size": 8, "probe_epochs": 0, "precision": "float32", "learning_rate": 1e-3}
     config = TrainingConfig.published("resnet18-small", "simclr", optimizer="adamw", **options)
     with caplog.at_level(logging.WARNING):

@@ -1,5 +1,4 @@
-"""Kernel that finds the contact forces of paused whiskers.
-"""
+"""Kernel that finds the contact forces of paused whiskers."""
 
 from typing import Any
 
