@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_entry_points
 from brainbench.models.architecture import OBJECTIVES, Architecture
-from brainbench.models.user_models import check_module
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
+from brainbench.models.user_models import check_module
 
 if TYPE_CHECKING:
     from torch import nn

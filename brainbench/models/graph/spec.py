@@ -20,8 +20,23 @@ UNROLLS: tuple[Unroll, ...] = ("biological", "full")
 MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Operation:
+    """Options that all operations share."""
+
+    use_bias: bool = True
+    bias: float | None = 0.0
+    """Initial bias; None draws it within 1/√fan_in."""
+    dropout: float = 0.0
+    """Share dropped while training."""
+    activation: str | None = None
+    """Applied before the memory."""
+    initialiser: Mapping[str, Any] | None = None
+    """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
+
+
 @dataclass(frozen=True)
-class Convolution:
+class Convolution(Operation):
     """2-D convolution of the concatenated inputs."""
 
     channels: int
@@ -32,15 +47,6 @@ class Convolution:
     """Rows, columns."""
     padding: Literal["same", "valid"] | tuple[int, int] = "same"
     """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
-    use_bias: bool = True
-    bias: float | None = 0.0
-    """Initial bias; None draws it within 1/√fan_in."""
-    dropout: float = 0.0
-    """Share dropped while training."""
-    activation: str | None = None
-    """Applied before the memory."""
-    initialiser: Mapping[str, Any] | None = None
-    """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (C, H, W) for an input (C, H, W)."""
@@ -55,20 +61,13 @@ class Convolution:
 
 
 @dataclass(frozen=True)
-class Dense:
+class Dense(Operation):
     """Linear layer of the flattened, concatenated inputs."""
 
     features: int
     """Features of the output."""
-    use_bias: bool = True
-    bias: float | None = 0.1
+    bias: float | None = field(default=0.1, kw_only=True)
     """Initial bias; None draws it within 1/√fan_in."""
-    dropout: float = 0.0
-    """Share dropped while training."""
-    activation: str | None = None
-    """Applied before the memory."""
-    initialiser: Mapping[str, Any] | None = None
-    """As in :class:`Convolution`."""
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (features,)."""

@@ -55,8 +55,8 @@ class Learner(nn.Module):
     """A network and the head of its objective; forward gives (loss, answers [B, classes] or None).
 
     Args:
-        model: Maps [B, T, C, H, W] in SI to [B, classes]. Self-supervised objectives need one of
-            :class:`~brainbench.models.network.EncoderAttenderDecoder`'s kind, with ``encode``, ``features`` and ``normaliser``.
+        model: Maps [B, T, C, H, W] in SI to [B, classes]. Self-supervised objectives need ``encode``, ``features`` and
+            ``normaliser``, as :class:`~brainbench.models.network.EncoderAttenderDecoder` has them.
 
     Raises:
         UsageError: the objective learns from features, and the network names none.

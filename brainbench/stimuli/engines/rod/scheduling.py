@@ -105,9 +105,7 @@ class Slices:
                 wp.launch(kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=GRIP_BOUNDS[0])
             looks = min(self.looks, self.capacity * left) * kernels.distance_group
             looks = min(-(-looks // WARP) * WARP, LOOKING)
-            wp.launch(
-                kernels.measure_distances, looks, [*inputs[:4], on, looks], device=device, block_dim=LOOK_BOUNDS[0]
-            )
+            wp.launch(kernels.measure_distances, looks, [*inputs[:4], on, looks], device=device, block_dim=LOOK_BOUNDS[0])
             for stream in self.streams:
                 if stream is not None:
                     device.stream.wait_stream(stream)

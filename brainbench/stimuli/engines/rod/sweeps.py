@@ -206,9 +206,7 @@ class SweepLauncher:
             slices = Slices(kernels, real, self.capacity, len(row), device, **self.tuning)
             self.slices = slices.run(inputs, BLOCK)
         else:
-            wp.launch(
-                kernels.run, len(row), [*inputs, kernels.structs.PausedWhiskers()], device=device, block_dim=BLOCK
-            )
+            wp.launch(kernels.run, len(row), [*inputs, kernels.structs.PausedWhiskers()], device=device, block_dim=BLOCK)
         wp.synchronize_device(device)
         clock.append(time.perf_counter())
         self.seconds = dict(zip(("objects", "upload", "kernel"), np.diff(clock).tolist(), strict=True))

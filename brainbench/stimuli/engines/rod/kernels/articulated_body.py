@@ -1,4 +1,5 @@
-"""The passes over a chain within a step."""
+"""The passes over a chain within a step.
+"""
 
 from typing import Any
 
@@ -9,28 +10,12 @@ from brainbench.stimuli.engines.rod.limits import BENT, FOLD, LARGEST_BEND, LOST
 from .algebra import cosine, first_axis, mat33, rotate, sine, symmetric_outer, symmetric_times, vec2, vec3, vec6
 from .motion import BodyMotion
 from .parameters import real
-from .state import (
-    ChainArrays,
-    ChainState,
-    ContactCandidates,
-    JobArrays,
-    ProximityState,
-    StepOptions,
-    Twist,
-    WhiskerJob,
-    WhiskerState,
-    row,
-)
+from .state import ChainArrays, ChainState, ContactCandidates, JobArrays, ProximityState, StepOptions, Twist, WhiskerJob, WhiskerState, row
 
 
 @wp.func(inline=True)
 def forward_kinematics(
-    chains: ChainArrays,
-    job: WhiskerJob,
-    pose: BodyMotion,
-    chain: wp.ref[ChainState],
-    proximity: wp.ref[ProximityState],
-    state: wp.ref[WhiskerState],
+    chains: ChainArrays, job: WhiskerJob, pose: BodyMotion, chain: wp.ref[ChainState], proximity: wp.ref[ProximityState], state: wp.ref[WhiskerState]
 ) -> Twist:
     """Down the chain: where the links are and how they move; returned is the motion of the last one."""
     zero = real(0.0)
@@ -201,9 +186,7 @@ def articulated_inertia(
 
 
 @wp.func(inline=True)
-def integrate_joint(
-    chain: wp.ref[ChainState], state: wp.ref[WhiskerState], i: int, a: vec2, h: real, end: real, quasistatic: int
-):
+def integrate_joint(chain: wp.ref[ChainState], state: wp.ref[WhiskerState], i: int, a: vec2, h: real, end: real, quasistatic: int):
     """Move a joint by its accelerations to the end of the step."""
     rate = row(chain.rate, i) + a * h
     angle = row(chain.angle, i) + rate * h
@@ -270,10 +253,6 @@ def joint_accelerations(
             if row(candidates.link, j) == i:
                 # Gravity was added to the base's acceleration; it moves nothing by itself.
                 candidates.free_velocity[j] = (
-                    vv
-                    + av * h
-                    + options.gravity * h
-                    + wp.cross(vw + aw * h, row(candidates.point, j))
-                    - row(candidates.object_velocity, j)
+                    vv + av * h + options.gravity * h + wp.cross(vw + aw * h, row(candidates.point, j)) - row(candidates.object_velocity, j)
                 )
     return av + wp.cross(aw, row(chain.node, job.links))

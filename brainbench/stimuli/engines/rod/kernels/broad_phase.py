@@ -1,4 +1,5 @@
-"""Which links may touch something within a step, and where."""
+"""Which links may touch something within a step, and where.
+"""
 
 from typing import Any
 
@@ -10,20 +11,7 @@ from .algebra import first_axis, rotate, vec3
 from .motion import BodyMotion, pose_at
 from .narrow_phase import LinkDistance, link_shape_distance
 from .parameters import real, sliced
-from .state import (
-    ChainArrays,
-    ChainState,
-    ContactCandidates,
-    MotionArrays,
-    PausedWhiskers,
-    ProximityState,
-    ShapeArrays,
-    StepOptions,
-    WhiskerJob,
-    WhiskerState,
-    most_candidates,
-    row,
-)
+from .state import ChainArrays, ChainState, ContactCandidates, MotionArrays, PausedWhiskers, ProximityState, ShapeArrays, StepOptions, WhiskerJob, WhiskerState, most_candidates, row
 
 
 @wp.struct
@@ -53,21 +41,14 @@ def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerSta
 
 
 @wp.func(inline=True)
-def may_be_near(
-    chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange, i: int
-) -> bool:
+def may_be_near(chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange, i: int) -> bool:
     """Whether a link may be so near, for all that is known without a look."""
     taper = chains.taper[i, job.whisker]
-    return (
-        row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
-        <= reach.margin + taper[0]
-    )
+    return row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed) <= reach.margin + taper[0]
 
 
 @wp.func(inline=True)
-def count_near_links(
-    chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange
-) -> int:
+def count_near_links(chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange) -> int:
     """Number of links that must look."""
     near_count = int(0)
     for i in range(job.links):
@@ -127,9 +108,7 @@ def stored_distance(paused: PausedWhiskers, place: int) -> LinkDistance:
 
 
 @wp.func(inline=True)
-def candidate_slot(
-    candidates: wp.ref[ContactCandidates], seen: int, point: vec3, normal: vec3, ahead: real, link: vec3
-) -> int:
+def candidate_slot(candidates: wp.ref[ContactCandidates], seen: int, point: vec3, normal: vec3, ahead: real, link: vec3) -> int:
     """Where to keep a place of possible contact (``seen``: a further one; −1: nowhere)."""
     slot = seen
     # The same contact seen from two links, or from both ends of a short gap.

@@ -1,4 +1,5 @@
-"""CONTACT PROBLEM"""
+"""CONTACT PROBLEM
+"""
 
 from typing import Any
 
@@ -8,19 +9,7 @@ from brainbench.stimuli.engines.rod.limits import GROUPS
 
 from .algebra import first_axis, vec3, vec4
 from .parameters import capacity, cuda, real
-from .state import (
-    ChainArrays,
-    ChainState,
-    ContactCandidates,
-    ContactProblems,
-    PausedWhiskers,
-    ProximityState,
-    Twist,
-    WhiskerJob,
-    WhiskerState,
-    most_candidates,
-    row,
-)
+from .state import ChainArrays, ChainState, ContactCandidates, ContactProblems, PausedWhiskers, ProximityState, Twist, WhiskerJob, WhiskerState, most_candidates, row
 
 
 @wp.func(inline=True)
@@ -78,9 +67,7 @@ def write_problem(
         spot = index * wp.static(most_candidates) + j
         problems.candidate_link[spot] = i
         taper = chains.taper[i, job.whisker]
-        problems.spot_size[spot] = vec4(
-            row(candidates.gap, j), row(candidates.arc, j), row(candidates.friction, j), taper[3]
-        )
+        problems.spot_size[spot] = vec4(row(candidates.gap, j), row(candidates.arc, j), row(candidates.friction, j), taper[3])
         problems.spot[spot, 0] = row(candidates.point, j)
         problems.spot[spot, 1] = row(candidates.normal, j)
         problems.spot[spot, 2] = row(candidates.free_velocity, j)

@@ -1,4 +1,5 @@
-"""Kernel that finds the contact forces of paused whiskers."""
+"""Kernel that finds the contact forces of paused whiskers.
+"""
 
 from typing import Any
 

@@ -1,4 +1,5 @@
-"""CONTACT SOLVER"""
+"""CONTACT SOLVER
+"""
 
 from typing import Any
 
@@ -7,19 +8,7 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import CLOSED, ROUNDS, SWEEPS
 
 from .algebra import vec2, vec3, vec4, vec6
-from .delassus import (
-    DelassusRows,
-    NormalMatrix,
-    PerContact1,
-    SolverState,
-    ThreadContacts,
-    build_delassus,
-    own_contacts,
-    row,
-    rows,
-    select_contacts,
-    tall,
-)
+from .delassus import DelassusRows, NormalMatrix, PerContact1, SolverState, ThreadContacts, build_delassus, own_contacts, row, rows, select_contacts, tall
 from .parameters import capacity, contacts, group_size, real
 from .state import ContactProblems, PerLink2, most_candidates
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
@@ -105,9 +94,7 @@ def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], tabl
 
 
 @wp.func(inline=True)
-def gauss_seidel_sweep(
-    solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], tries: int
-):
+def gauss_seidel_sweep(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], tries: int):
     """One contact at a time."""
     zero = real(0.0)
     far_off = zero
@@ -383,14 +370,7 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
 
 
 @wp.func(inline=True)
-def apply_forces(
-    problems: ContactProblems,
-    solver: wp.ref[SolverState],
-    own: wp.ref[ThreadContacts],
-    lift: wp.ref[PerLink2],
-    last: int,
-    doing: int,
-) -> int:
+def apply_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], lift: wp.ref[PerLink2], last: int, doing: int) -> int:
     """Forces up the chain, then the change of acceleration down.
 
     ``last`` says that there will be no further round. Returned is whether the forces press the whisker onto places
@@ -440,12 +420,8 @@ def apply_forces(
             if solver.contacts < solver.candidates:
                 for j in range(solver.candidates):
                     if problems.candidate_link[spot0 + j] == i and (solver.selected >> j) % 2 == 0:
-                        moved = (
-                            problems.spot[spot0 + j, 2] + (av + wp.cross(aw, problems.spot[spot0 + j, 0])) * solver.step
-                        )
-                        ahead = problems.spot_size[spot0 + j][0] + solver.step * wp.dot(
-                            problems.spot[spot0 + j, 1], moved
-                        )
+                        moved = problems.spot[spot0 + j, 2] + (av + wp.cross(aw, problems.spot[spot0 + j, 0])) * solver.step
+                        ahead = problems.spot_size[spot0 + j][0] + solver.step * wp.dot(problems.spot[spot0 + j, 1], moved)
                         problems.predicted_gap[spot0 + j] = ahead
                         if ahead < real(-wp.static(CLOSED)):
                             more = int(1)
@@ -456,11 +432,7 @@ def apply_forces(
         if more == 0 and solver.thread == 0:
             unsolved = int(0)
             miss = zero
-            if (
-                solver.converged == 0
-                and solver.gap_error > real(1e-2)
-                and solver.force_change > real(1e-2) * solver.force_sum
-            ):
+            if solver.converged == 0 and solver.gap_error > real(1e-2) and solver.force_change > real(1e-2) * solver.force_sum:
                 unsolved = int(1)
                 miss = solver.force_change * solver.force_change
             index = solver.job

@@ -1,4 +1,5 @@
-"""DELASSUS"""
+"""DELASSUS
+"""
 
 from typing import Any
 
@@ -76,7 +77,6 @@ class SolverState:
     force_change: real
     """What it changed in the forces, and their sum."""
     force_sum: real
-
 
 kinds = (
     (PerLink2, vec2),
@@ -156,9 +156,7 @@ def select_contacts(problems: ContactProblems, solver: wp.ref[SolverState], own:
 
 
 @wp.func(inline=True)
-def build_delassus(
-    problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows]
-):
+def build_delassus(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows]):
     """Up the chain: what a unit force at one contact does at the others."""
     zero = real(0.0)
     none = vec3(zero, zero, zero)

@@ -1,4 +1,5 @@
-"""Kernel that answers the distance queries of paused whiskers."""
+"""Kernel that answers the distance queries of paused whiskers.
+"""
 
 from typing import Any
 
@@ -14,14 +15,7 @@ from .state import ChainArrays, JobArrays, MotionArrays, PausedWhiskers, ShapeAr
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=module_options(), launch_bounds=LOOK_BOUNDS)
-def measure_distances(
-    chains: ChainArrays,
-    motions: MotionArrays,
-    shapes: ShapeArrays,
-    jobs: JobArrays,
-    paused: PausedWhiskers,
-    threads: int,
-):
+def measure_distances(chains: ChainArrays, motions: MotionArrays, shapes: ShapeArrays, jobs: JobArrays, paused: PausedWhiskers, threads: int):
     """Answer the looks of all waiting whiskers."""
     thread = wp.tid()
     part = thread % wp.static(group_size)

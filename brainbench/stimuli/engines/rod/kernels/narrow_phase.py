@@ -1,4 +1,5 @@
-"""How near a link comes to a shape."""
+"""How near a link comes to a shape.
+"""
 
 from typing import Any
 
@@ -78,9 +79,7 @@ def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
 
 
 @wp.func
-def mesh_distance(
-    shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: real, within: real, got: NearestTriangles
-) -> LinkDistance:
+def mesh_distance(shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: real, within: real, got: NearestTriangles) -> LinkDistance:
     """What a search found: contacts no further than ``within`` from the axis, or that the link lies far inside."""
     touch = LinkDistance()
     touch.between = 0

@@ -1,4 +1,5 @@
-"""Whiskers between two slices."""
+"""Whiskers between two slices.
+"""
 
 from typing import Any
 
@@ -25,14 +26,7 @@ def next_job(paused: PausedWhiskers, place: int) -> int:
 
 
 @wp.func(inline=True)
-def resume(
-    paused: PausedWhiskers,
-    index: int,
-    links: int,
-    chain: wp.ref[ChainState],
-    proximity: wp.ref[ProximityState],
-    state: wp.ref[WhiskerState],
-):
+def resume(paused: PausedWhiskers, index: int, links: int, chain: wp.ref[ChainState], proximity: wp.ref[ProximityState], state: wp.ref[WhiskerState]):
     """Read what was kept, if the whisker had begun."""
     if paused.counts[5, index] != 0:
         state.reading = paused.counts[0, index]
@@ -59,13 +53,7 @@ def resume(
 
 @wp.func(inline=True)
 def pause(
-    paused: PausedWhiskers,
-    index: int,
-    links: int,
-    chain: wp.ref[ChainState],
-    proximity: wp.ref[ProximityState],
-    state: wp.ref[WhiskerState],
-    wait: int,
+    paused: PausedWhiskers, index: int, links: int, chain: wp.ref[ChainState], proximity: wp.ref[ProximityState], state: wp.ref[WhiskerState], wait: int
 ):
     """Keep all that the next slice needs, and queue for it."""
     paused.counts[0, index] = state.reading

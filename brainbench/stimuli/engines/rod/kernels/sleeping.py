@@ -1,4 +1,5 @@
-"""Whiskers at rest: straight out of a base that stands still, until an object may come near."""
+"""Whiskers at rest: straight out of a base that stands still, until an object may come near.
+"""
 
 from typing import Any
 
@@ -10,28 +11,12 @@ from .algebra import rotate, vec2, vec3
 from .motion import pose_at
 from .narrow_phase import link_shape_distance
 from .parameters import against, real, sliced
-from .state import (
-    ChainArrays,
-    ChainState,
-    MotionArrays,
-    PausedWhiskers,
-    ProximityState,
-    ShapeArrays,
-    WhiskerJob,
-    WhiskerState,
-    row,
-)
+from .state import ChainArrays, ChainState, MotionArrays, PausedWhiskers, ProximityState, ShapeArrays, WhiskerJob, WhiskerState, row
 
 
 @wp.func(inline=True)
 def query_rest_distances(
-    paused: PausedWhiskers,
-    job: WhiskerJob,
-    proximity: wp.ref[ProximityState],
-    state: wp.ref[WhiskerState],
-    fresh: int,
-    upto: real,
-    look: real,
+    paused: PausedWhiskers, job: WhiskerJob, proximity: wp.ref[ProximityState], state: wp.ref[WhiskerState], fresh: int, upto: real, look: real
 ) -> int:
     """Ask for these distances like for all others; returned is what to wait for."""
     near_count = int(0)
@@ -107,9 +92,7 @@ def check_rest(
                     else:
                         for s in range(job.first_shape, job.end_shape):
                             body = pose_at(motions, shapes.track[s], before)
-                            touch = link_shape_distance(
-                                shapes, s, body, at, ahead_at, taper, -look, row(proximity.leaf, i), 0, 1
-                            )
+                            touch = link_shape_distance(shapes, s, body, at, ahead_at, taper, -look, row(proximity.leaf, i), 0, 1)
                             slack = wp.min(slack, touch.clear)
                             proximity.leaf[i] = touch.leaf
                     slack = slack - taper[0] - real(0.05)
@@ -132,9 +115,7 @@ def check_rest(
                 bound = zero
                 until = row(proximity.safe_until, i)
                 if until > before:
-                    bound = (
-                        (until - before) * real(1.02) * job.object_speed + chains.taper[i, job.whisker][0] + real(0.04)
-                    )
+                    bound = (until - before) * real(1.02) * job.object_speed + chains.taper[i, job.whisker][0] + real(0.04)
                 if fresh == 1:
                     bound = wp.max(bound, row(proximity.clearance, i))
                 proximity.safe_until[i] = bound

@@ -1,4 +1,5 @@
-"""STATE"""
+"""STATE
+"""
 
 from typing import Any
 
@@ -366,13 +367,5 @@ class Twist:
     w: vec3
     v: vec3
 
-
-kinds = (
-    (PerLink2, vec2),
-    (PerLink3, vec3),
-    (PerNode3, vec3),
-    (PerCandidate3, vec3),
-    (PerLink1, real),
-    (PerCandidate1, real),
-)
+kinds = (PerLink2, vec2), (PerLink3, vec3), (PerNode3, vec3), (PerCandidate3, vec3), (PerLink1, real), (PerCandidate1, real)
 row = reader(*dict.fromkeys((*kinds, (PerLinkInt, wp.int32), (PerCandidateInt, wp.int32))))

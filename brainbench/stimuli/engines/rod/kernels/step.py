@@ -1,4 +1,5 @@
-"""STEP"""
+"""STEP
+"""
 
 from typing import Any
 
@@ -15,29 +16,11 @@ from .motion import pose_at
 from .parameters import against, bounds, module_options, real, sliced
 from .scheduling import next_job, pause, resume
 from .sleeping import check_rest
-from .state import (
-    ChainArrays,
-    ChainState,
-    ContactCandidates,
-    ContactProblems,
-    JobArrays,
-    MotionArrays,
-    PausedWhiskers,
-    ProximityState,
-    ResultArrays,
-    ShapeArrays,
-    StepOptions,
-    Twist,
-    WhiskerJob,
-    WhiskerState,
-    row,
-)
+from .state import ChainArrays, ChainState, ContactCandidates, ContactProblems, JobArrays, MotionArrays, PausedWhiskers, ProximityState, ResultArrays, ShapeArrays, StepOptions, Twist, WhiskerJob, WhiskerState, row
 
 
 @wp.func(inline=True)
-def load_job(
-    chains: ChainArrays, motions: MotionArrays, shapes: ShapeArrays, jobs: JobArrays, options: StepOptions, index: int
-) -> WhiskerJob:
+def load_job(chains: ChainArrays, motions: MotionArrays, shapes: ShapeArrays, jobs: JobArrays, options: StepOptions, index: int) -> WhiskerJob:
     zero = real(0.0)
     job = WhiskerJob()
     job.index = index
@@ -223,46 +206,24 @@ def run(
                     state.is_near = wp.min(near_count, 1)
                     if wp.static(sliced):
                         if near_count > 0 and state.waiting_for != 1:
-                            wait = query_distances(
-                                chains, job, paused, chain, proximity, state, reach, origin, now, near_count
-                            )
+                            wait = query_distances(chains, job, paused, chain, proximity, state, reach, origin, now, near_count)
                             state.is_near = was_near
                             state.top_speed = was_quickest
                             break
                     for i in range(job.links):
-                        proximity.clearance[i] = row(proximity.clearance, i) - reach.time * (
-                            row(proximity.end_speed, i) + reach.unknown_speed
-                        )
+                        proximity.clearance[i] = row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
                     state.last_step = h
                     if near_count > 0:
-                        seen = find_candidates(
-                            chains,
-                            motions,
-                            shapes,
-                            job,
-                            paused,
-                            chain,
-                            proximity,
-                            candidates,
-                            state,
-                            pose,
-                            reach.margin,
-                            now,
-                            h,
-                        )
+                        seen = find_candidates(chains, motions, shapes, job, paused, chain, proximity, candidates, state, pose, reach.margin, now, h)
                 if wp.static(sliced):
                     state.waiting_for = 0
                     state.time_left = zero
                 felt = articulated_inertia(chains, jobs, job, chain, proximity, tip, base, now, h, seen)
-                tip_acceleration = joint_accelerations(
-                    job, options, chain, candidates, state, moving, base, now, h, seen
-                )
+                tip_acceleration = joint_accelerations(job, options, chain, candidates, state, moving, base, now, h, seen)
                 if wp.static(against > NOTHING) and seen > 0:
                     solved = any_gap_closes(candidates, seen, h)
                     if solved == 1:
-                        write_problem(
-                            problems, chains, job, chain, proximity, candidates, state, felt, tip_acceleration, h, seen
-                        )
+                        write_problem(problems, chains, job, chain, proximity, candidates, state, felt, tip_acceleration, h, seen)
                         if wp.static(sliced):
                             wait = 3
                             paused.counts[7, index] = state.is_near
@@ -291,20 +252,7 @@ def run(
             state.velocity_jump = wp.max(h * wp.length(tip_acceleration), real(0.5) * state.velocity_jump)
             state.touching = state.touching + touched
             if state.pending_reading >= 0:
-                write_reading(
-                    results,
-                    jobs,
-                    options,
-                    problems,
-                    job,
-                    chain,
-                    state.pending_reading,
-                    origin,
-                    felt,
-                    force_sum,
-                    arc_sum,
-                    solved,
-                )
+                write_reading(results, jobs, options, problems, job, chain, state.pending_reading, origin, felt, force_sum, arc_sum, solved)
                 state.pending_reading = int(-1)
             state.steps = state.steps + 1
             if seen > 0:
