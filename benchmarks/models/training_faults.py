@@ -26,8 +26,8 @@ from benchmarks.report import table, write_section
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
-from brainbench.models.training.initial_state import draw_silent_biases
 from brainbench.models.training.objectives import make_learner
+from brainbench.models.training.trainer import draw_silent_biases
 
 BATCH = 24
 MODEL = "resnet18-small"

@@ -27,14 +27,15 @@ import numpy as np
 import torch
 
 from benchmarks.report import table, write_section
+from brainbench.core.cuda_graphs import record_step
 from brainbench.models.activations import evaluating
 from brainbench.models.export import export_model, read_onnx
 from brainbench.models.ops.dispatch import plain
 from brainbench.models.ops.packing import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
-from brainbench.models.training.cuda_graphs import captured, fuse, make_capturable
-from brainbench.models.training.trainer import compiled
+from brainbench.models.training.gradients import compiled, fuse
+from brainbench.models.training.optimizers import make_capturable
 
 STEPS = 22
 
@@ -206,7 +207,7 @@ def time_one(options: argparse.Namespace, device: torch.device) -> tuple[float, 
     start = time.perf_counter()
     step = training_step(module, model, x, labels, autocast)
     if recorded:
-        step = captured(step, device)
+        step = record_step(step, device)
     step()
     if device.type == "cuda":
         torch.cuda.synchronize()
@@ -218,7 +219,7 @@ def time_one(options: argparse.Namespace, device: torch.device) -> tuple[float, 
             module(x)
 
     with evaluating(model), torch.no_grad():
-        answer = captured(forward, device) if recorded else forward
+        answer = record_step(forward, device) if recorded else forward
         spent = clock(device, answer, options.repeats, warm=1)
     memory = torch.cuda.max_memory_allocated() / 1e9 if device.type == "cuda" else float("nan")
     return first, seconds, spent, memory

@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from zoo_jobs import Job
 
+from brainbench.core.cuda_graphs import record_step
 from brainbench.core.files import read_json, write_json
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.normaliser import Normaliser
@@ -27,13 +28,12 @@ from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import Augmentation
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
-from brainbench.models.training.cuda_graphs import captured, copy_state, fuse, make_capturable, reset_optimizer
-from brainbench.models.training.evaluation import evaluate
-from brainbench.models.training.initial_state import draw_silent_biases
+from brainbench.models.training.evaluation import evaluate, fit_probe
+from brainbench.models.training.gradients import copy_state, fuse
 from brainbench.models.training.objectives import make_learner
-from brainbench.models.training.optimizers import make_optimizer, rate_factor
-from brainbench.models.training.probe import fit_probe
-from brainbench.models.training.state import load_state, save_state
+from brainbench.models.training.optimizers import make_capturable, make_optimizer, rate_factor, reset_optimizer
+from brainbench.models.training.run_folder import load_state, save_state
+from brainbench.models.training.trainer import draw_silent_biases
 
 STATE, BEST, RESULT, LOG = "state.safetensors", "best", "result.json", "log.jsonl"
 EVALUATED = 512
@@ -169,10 +169,10 @@ class Trainer:
         self._set_epoch(0)
         self.learner.train()
         options: dict[str, Any] = {"generators": (self.generator,), "warm_up": 3 if self.device.type == "cuda" else 0}
-        self.step = captured(self._step, self.device, **options) if graphs else self._step
+        self.step = record_step(self._step, self.device, **options) if graphs else self._step
         self.learner.eval()
         with torch.no_grad():
-            self.check = captured(self._check, self.device, **options) if graphs else self._check
+            self.check = record_step(self._check, self.device, **options) if graphs else self._check
         copy_state(self.learner, start)
         reset_optimizer(self.optimizer)
         self.kept = {name: value.clone() for name, value in self.learner.state_dict().items()}

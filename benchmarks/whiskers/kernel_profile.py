@@ -15,10 +15,10 @@ import torch
 from policy_encoder import cast, copy_into
 from training_step import clock, sweeps, training_step
 
+from brainbench.core.cuda_graphs import record_step
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.dispatch import plain
 from brainbench.models.registry import load_model
-from brainbench.models.training.cuda_graphs import captured
 
 DEVICE = torch.device("cuda")
 
@@ -101,7 +101,7 @@ def train(options: argparse.Namespace) -> None:
     x, labels = sweeps(options.batch, DEVICE), torch.randint(117, (options.batch,), device=DEVICE)
     step = training_step(model, model, x, labels, autocast)
     start = time.perf_counter()
-    replay = captured(step, DEVICE)
+    replay = record_step(step, DEVICE)
     torch.cuda.synchronize()
     print(f"recorded after {time.perf_counter() - start:.1f} s", flush=True)
     seconds = clock(DEVICE, replay, 5)
@@ -118,7 +118,7 @@ def train(options: argparse.Namespace) -> None:
             model(x)
 
     with evaluating(model), torch.no_grad():
-        seconds = clock(DEVICE, captured(forward, DEVICE), 5)
+        seconds = clock(DEVICE, record_step(forward, DEVICE), 5)
         print(f"forward {seconds * 1e3:.2f} ms", flush=True)
         show("forward", forward, 12)
 
@@ -134,7 +134,7 @@ def stream(options: argparse.Namespace) -> None:
 
     with torch.inference_mode():
         run()
-        print(f"streaming {clock(DEVICE, captured(run, DEVICE), 10) * 1e3:.3f} ms for 8,192", flush=True)
+        print(f"streaming {clock(DEVICE, record_step(run, DEVICE), 10) * 1e3:.3f} ms for 8,192", flush=True)
         show("streaming step", run, options.rows)
 
 

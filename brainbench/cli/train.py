@@ -43,7 +43,10 @@ def train(
         typer.Option(help="off, parts (of the network), default (the whole) or graphs (whole steps as CUDA graphs)."),
     ] = None,
     weights_dtype: Annotated[
-        str | None, typer.Option(help="Precision of the model that is written: float32, float16 or bfloat16.")
+        str | None,
+        typer.Option(
+            help="Precision of the model that is written: auto (that of the training), float32, float16 or bfloat16."
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of weights, order, augmentation and dropout.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda or cuda:N; CUDA when there is one.")] = None,

@@ -31,7 +31,7 @@ class Architecture:
     """At most 2.5 M parameters."""
     attender: str | None = None
     tag: str | None = None
-    """What the weights were trained with; None: untrained."""
+    """Objective that the weights were trained with; None: untrained."""
 
     @classmethod
     def parse(cls, name: str) -> Architecture:

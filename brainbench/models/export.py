@@ -48,7 +48,7 @@ def export_model(
     """Export a network's streaming step and check the exported file against the network.
 
     Args:
-        model: A network of :class:`~brainbench.models.network.EAD`'s kind; exported in evaluation mode, on the CPU.
+        model: A :class:`~brainbench.models.network.EncoderAttenderDecoder`; exported in evaluation mode, on the CPU.
         path: File to write; the suffix of the format is added when there is none.
         format: ``onnx`` or ``torch``.
         name: What the contract calls the network.

@@ -27,7 +27,7 @@ SUB_STEP_SECONDS = 0.009
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """What a model expects and when it answers: the contract of deployment."""
+    """Contract of deployment: the input that a model expects, and when it answers."""
 
     input_shape: tuple[int, int, int]
     """(C, H, W) of one time step."""
@@ -54,13 +54,13 @@ class ModelSpec:
 
 @dataclass(frozen=True)
 class NetworkState:
-    """What a network carries from one step to the next."""
+    """State of a network between two steps."""
 
     encoder: Any
     attender: Any
     """None without an attender."""
     decoder: Any = None
-    """What an all-steps decoder remembers; None for others."""
+    """State of an all-steps decoder; None for others."""
 
 
 class EncoderAttenderDecoder(nn.Module):
@@ -121,7 +121,7 @@ class EncoderAttenderDecoder(nn.Module):
 
     @property
     def unroll(self) -> Unroll:
-        """How the encoder's graph is unrolled."""
+        """Unrolling of the encoder's graph."""
         return self._unroll.get("unroll", "biological")
 
     def _receptive_field(self) -> int | None:

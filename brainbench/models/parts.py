@@ -1,4 +1,4 @@
-"""What the parts of an encoder-attender-decoder network offer one another.
+"""The protocols of the parts of an encoder-attender-decoder network.
 
 Letters: B batch, T time step, (C, H, W) one step of the stimulus, F features. A part is also a
 :class:`torch.nn.Module`; its streaming state is a value that only the part itself looks into.
@@ -6,8 +6,10 @@ Letters: B batch, T time step, (C, H, W) one step of the stimulus, F features. A
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING, Any, Protocol
+
+from brainbench.core.errors import UsageError
 
 if TYPE_CHECKING:
     import torch
@@ -69,6 +71,24 @@ class Attender(Part, Protocol):
     def max_steps(self) -> int | None:
         """Longest sweep it can read; None: any."""
         ...
+
+
+def run_layers(
+    x: torch.Tensor, layers: Iterable[tuple[str, Callable[..., torch.Tensor]]], asked: bool | Collection[str]
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Pass ``x`` through named layers in turn; return the answer and those of the layers that were asked for."""
+    found: dict[str, torch.Tensor] = {}
+    for name, layer in layers:
+        x = layer(x)
+        if asked is True or (asked and name in asked):
+            found[name] = x
+    return x, found
+
+
+def check_sweep(x: torch.Tensor, input_shape: tuple[int, int, int], who: str) -> None:
+    """Raise :class:`UsageError` unless ``x`` is a sweep [B, T, C, H, W] of steps of ``input_shape``."""
+    if x.ndim != 5 or tuple(x.shape[2:]) != input_shape:
+        raise UsageError(f"{who} expects [batch, time, {', '.join(map(str, input_shape))}]; received {list(x.shape)}.")
 
 
 def wanted(layers: tuple[str, ...], asked: bool | Collection[str]) -> Collection[str]:

@@ -44,7 +44,7 @@ class TrainingSetting:
 
 @dataclass(frozen=True)
 class PublishedTraining:
-    """How one architecture is trained with one objective."""
+    """Published way to train one architecture with one objective."""
 
     architecture: str
     """Registry name."""

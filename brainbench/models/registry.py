@@ -23,6 +23,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_entry_points
 from brainbench.models.architecture import OBJECTIVES, Architecture
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
+from brainbench.models.user_models import check_module
 
 if TYPE_CHECKING:
     from torch import nn
@@ -52,7 +53,7 @@ class ModelRecord:
 
 @dataclass(frozen=True)
 class ModelDescription:
-    """What is known about an architecture without building its weights."""
+    """Record of an architecture with its size and cost, known without building its weights."""
 
     name: str
     family: str
@@ -242,7 +243,7 @@ def _build(architecture: str, options: Mapping[str, Any]) -> nn.Module:
     for option in options:
         if option not in accepted and not any(item.kind is item.VAR_KEYWORD for item in accepted.values()):
             raise unknown_name(f"option of the model {architecture!r}", option, accepted)
-    return build(**options)
+    return check_module(build(**options), architecture)
 
 
 def _known() -> dict[str, ModelRecord]:

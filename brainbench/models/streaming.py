@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
-from brainbench.models.attenders.gpt import GPTAttender, GPTBlock
+from brainbench.models.attenders.gpt import GPTAttender
 from brainbench.models.attenders.mamba import MambaAttender, MambaMemory
 from brainbench.models.encoders.s4 import S4Encoder
 from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
@@ -39,7 +39,7 @@ class StreamingStep(nn.Module):
         super().__init__()
         if not isinstance(model, EncoderAttenderDecoder):
             raise UsageError(
-                f"Streaming and export need an encoder-attender-decoder network (brainbench.models.network.EAD); "
+                "Streaming and export need a brainbench.models.network.EncoderAttenderDecoder; "
                 f"received {type(model).__name__}."
             )
         self.model = model
@@ -147,8 +147,7 @@ class _GPTPart(nn.Module):
     def __init__(self, attender: GPTAttender) -> None:
         super().__init__()
         self.attender = attender
-        block = attender.blocks[0]
-        heads = block.heads if isinstance(block, GPTBlock) else 1
+        heads = attender.blocks[0].heads
         cache = (2, heads, attender.context, attender.features // heads)
         self.shapes = ((1,), *(cache for _ in attender.blocks))
 
@@ -164,8 +163,6 @@ class _GPTPart(nn.Module):
         stream = attender.embed(pair) + place @ attender.positions
         after: list[torch.Tensor] = [seen + 2]
         for module, cache in zip(attender.blocks, caches, strict=True):
-            if not isinstance(module, GPTBlock):
-                raise UsageError(f"A GPT attender is made of GPT blocks; found {type(module).__name__}.")
             width = stream.shape[-1]
             fused = module.query_key_value(module.norm_attention(stream))
             query, key, value = fused.unflatten(2, (3, module.heads, width // module.heads)).permute(2, 0, 3, 1, 4)

@@ -27,20 +27,25 @@ def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
 
     with seeded(seed):
         made = load_object(target, "model")
-        if not isinstance(made, nn.Module):
-            made = _call(made, target)
+        if callable(made) and not isinstance(made, nn.Module):
+            try:
+                made = made()
+            except Exception as error:
+                raise DataError(
+                    f"Building the model {target!r} failed with {type(error).__name__}: {error} "
+                    "(it is called without arguments)."
+                ) from error
+    return check_module(made, target).eval()
+
+
+def check_module(made: Any, target: str) -> nn.Module:
+    """Return what a user's or another package's code made, which must be a module.
+
+    Raises:
+        UsageError: it is something else.
+    """
+    from torch import nn
+
     if not isinstance(made, nn.Module):
         raise UsageError(f"{target!r} gave a {type(made).__name__}, not a torch.nn.Module; return the model itself.")
-    return made.eval()
-
-
-def _call(made: Any, target: str) -> Any:
-    if not callable(made):
-        return made
-    try:
-        return made()
-    except Exception as error:
-        raise DataError(
-            f"Building the model {target!r} failed with {type(error).__name__}: {error} "
-            "(it is called without arguments)."
-        ) from error
+    return made

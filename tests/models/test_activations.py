@@ -208,7 +208,7 @@ def test_a_model_of_another_precision_is_fed_in_it(stimuli):
     [
         (
             lambda: load_model("zhuang-small"),
-            r"EAD .* expects \[batch, time, 30, 5, 7\] .*; received \[5, 4, 6, 5, 7\]",
+            r"EncoderAttenderDecoder .* expects \[batch, time, 30, 5, 7\] .*; received \[5, 4, 6, 5, 7\]",
         ),
         (Recurrent, "Recurrent .* RuntimeError: running_mean"),
         (lambda: nn.Sequential(nn.Flatten(), nn.Linear(7, 1)), "Sequential .* RuntimeError: mat1 and mat2"),

@@ -219,3 +219,11 @@ def test_models_of_other_packages_arrive_and_broken_ones_are_announced(tmp_path,
     assert "'broken' (broken_elsewhere)" in caplog.text
     assert "out of order" in caplog.text
     assert "mine" not in caplog.text
+
+
+@pytest.mark.usefixtures("_clean")
+@pytest.mark.parametrize("use", [load_model, describe_model])
+def test_a_builder_that_gives_no_module_is_answered_in_one_sentence(use):
+    register_model("no-module", family="theirs")(lambda: {"weights": 3})
+    with pytest.raises(UsageError, match="'no-module' gave a dict"):
+        use("no-module")

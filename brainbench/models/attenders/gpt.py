@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -121,7 +121,7 @@ class GPTAttender(nn.Module):
         self.embed = Linear(features, width)
         self.positions = nn.Parameter(torch.empty(context, width))
         self.dropout = nn.Dropout(dropout)
-        self.blocks = nn.ModuleList(GPTBlock(width, heads, dropout, blocks) for _ in range(blocks))
+        self.blocks: Any = nn.ModuleList(GPTBlock(width, heads, dropout, blocks) for _ in range(blocks))
         self.norm = nn.LayerNorm(width)
         self.lm_head = Linear(width, width, use_bias=False)
         for tokens in (self.action, self.positions):
@@ -147,8 +147,8 @@ class GPTAttender(nn.Module):
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> GPTState:
         """Return the state before the first step: no tokens."""
-        block = self._block(0)
-        shape = (batch, block.heads, 0, self.features // block.heads)
+        heads = self.blocks[0].heads
+        shape = (batch, heads, 0, self.features // heads)
         empty = torch.zeros(shape, device=device or self.positions.device, dtype=dtype or self.positions.dtype)
         return GPTState((empty,) * len(self.blocks), (empty,) * len(self.blocks))
 
@@ -160,8 +160,8 @@ class GPTAttender(nn.Module):
         """
         stream = self._tokens(x[:, None], state.tokens)
         keys, values = [], []
-        for index, past in enumerate(zip(state.keys, state.values, strict=True)):
-            stream, (key, value) = self._block(index)(stream, past)
+        for block, *past in zip(self.blocks, state.keys, state.values, strict=True):
+            stream, (key, value) = block(stream, past)
             keys.append(key)
             values.append(value)
         return self.lm_head(self.norm(stream[:, 1])), GPTState(tuple(keys), tuple(values))
@@ -171,14 +171,14 @@ class GPTAttender(nn.Module):
         stream = self._tokens(x, 0)
         names = wanted(self.layers, return_activations)
         activations = {}
-        for index, name in enumerate(self.layers[:-1]):
-            stream, _ = self._block(index)(stream)
+        for name, block in zip(self.layers, self.blocks, strict=False):
+            stream, _ = block(stream)
             if name in names:
                 activations[name] = stream[:, 1::2]
         y = self.lm_head(self.norm(stream[:, 1::2]))
         if "lm_head" in names:
             activations["lm_head"] = y
-        return (y, activations) if return_activations is not False else y
+        return y if return_activations is False else (y, activations)
 
     def _tokens(self, x: torch.Tensor, start: int) -> torch.Tensor:
         batch, steps, features = x.shape
@@ -189,6 +189,3 @@ class GPTAttender(nn.Module):
             )
         pairs = torch.stack((x, self.action.to(x.dtype).expand(batch, steps, features)), 2)
         return self.dropout(self.embed(pairs.flatten(1, 2)) + self.positions[start : start + 2 * steps])
-
-    def _block(self, index: int) -> GPTBlock:
-        return cast(GPTBlock, self.blocks[index])

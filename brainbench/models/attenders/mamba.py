@@ -19,13 +19,13 @@ from torch.nn import functional
 from brainbench.core.errors import UsageError
 from brainbench.models.ops.layers import Linear
 from brainbench.models.ops.linear_scan import linear_scan
-from brainbench.models.parts import wanted
+from brainbench.models.parts import run_layers
 
 _STEP_RANGE = (1e-3, 1e-1)
 
 
 class MambaMemory(NamedTuple):
-    """What a block carries from one step to the next."""
+    """Memory of a block between two steps."""
 
     recent: torch.Tensor
     """[B, inner, convolution − 1] the inputs of the short convolution, oldest first."""
@@ -170,7 +170,7 @@ class MambaAttender(nn.Module):
                 f"convolution {convolution}."
             )
         self.features = features
-        self.blocks = nn.ModuleList(
+        self.blocks: Any = nn.ModuleList(
             MambaBlock(features, expansion=expansion, states=states, convolution=convolution, depth=blocks)
             for _ in range(blocks)
         )
@@ -183,12 +183,8 @@ class MambaAttender(nn.Module):
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the answers [B, T, F], with activations also ``{layer: [B, T, F]}``."""
-        names = wanted(self.layers, return_activations)
-        y, activations = x, {}
-        for name, module in zip(self.layers, (*self.blocks, self.norm), strict=True):
-            y = module(y)
-            if name in names:
-                activations[name] = y
+        layers = zip(self.layers, (*self.blocks, self.norm), strict=True)
+        y, activations = run_layers(x, layers, return_activations)
         return y if return_activations is False else (y, activations)
 
     def init_state(
@@ -197,15 +193,12 @@ class MambaAttender(nn.Module):
         """Return the state before the first step, all zeros."""
         like = self.norm.weight
         options = {"device": device or like.device, "dtype": dtype or like.dtype}
-        return tuple(self._block(index).init_memory(batch, **options) for index in range(len(self.blocks)))
+        return tuple(block.init_memory(batch, **options) for block in self.blocks)
 
     def step(self, x: torch.Tensor, state: MambaState) -> tuple[torch.Tensor, MambaState]:
         """Advance by one step of features [B, F]; return the answer [B, F] and the next state."""
         after = []
-        for index, memory in enumerate(state):
-            x, memory = self._block(index).step(x, memory)
+        for block, memory in zip(self.blocks, state, strict=True):
+            x, memory = block.step(x, memory)
             after.append(memory)
         return self.norm(x), tuple(after)
-
-    def _block(self, index: int) -> MambaBlock:
-        return cast(MambaBlock, self.blocks[index])

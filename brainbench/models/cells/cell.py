@@ -1,4 +1,4 @@
-"""What all cells share."""
+"""The base of all cells."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORGET_BIAS = 1.0
 """Added inside the sigmoid of every gate that keeps the old state."""
 
 Projected = tuple[torch.Tensor, ...]
-"""What :meth:`Cell.project` gives, one step of it."""
+"""One step of the result of :meth:`Cell.project`."""
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -27,7 +27,7 @@ class ChannelNorm(nn.LayerNorm):
 
 
 class Cell(nn.Module):
-    """What all cells share: the state's shape, zero initial states and PyTorchTNN's names.
+    """Base of all cells: the state's shape, zero initial states and PyTorchTNN's names.
 
     Args:
         in_channels: Channels of x.

@@ -1,4 +1,4 @@
-"""What the gated cells share: one fused convolution for all gates, and what follows it."""
+"""The base of the gated cells: one fused convolution for all gates, and what follows it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class GatedCell(Cell):
 
     gates: ClassVar[tuple[str, ...]] = ()
     other_norms: ClassVar[tuple[str, ...]] = ()
-    """What is normalised beside the gates."""
+    """Names of the norms beside those of the gates."""
     fused_parts: ClassVar[tuple[str, ...]] = ("apply_gates",)
 
     def __init__(

@@ -13,10 +13,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError
 from brainbench.models.encoders.zhuang import INPUT_SHAPE, small_width
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear
-from brainbench.models.parts import wanted
+from brainbench.models.parts import check_sweep, run_layers
 
 _WIDTHS = (64, 128, 256, 512)
 
@@ -99,19 +98,14 @@ class ResNet18Encoder(nn.Module):
         Raises:
             UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
         """
-        if x.ndim != 5 or tuple(x.shape[2:]) != self.input_shape:
-            raise UsageError(
-                f"The ResNet expects [batch, time, {', '.join(map(str, self.input_shape))}]; received {list(x.shape)}."
-            )
+        check_sweep(x, self.input_shape, "The ResNet")
         leading = x.shape[:2]
-        names = wanted(self.layers, return_activations)
-        y, activations = x.flatten(0, 1), {}
-        for name in self.layers:
-            y = self.get_submodule(name)(y)
-            if name in names:
-                activations[name] = y.unflatten(0, leading)
+        layers = ((name, self.get_submodule(name)) for name in self.layers)
+        y, activations = run_layers(x.flatten(0, 1), layers, return_activations)
         y = y.unflatten(0, leading)
-        return y if return_activations is False else (y, activations)
+        if return_activations is False:
+            return y
+        return y, {name: value.unflatten(0, leading) for name, value in activations.items()}
 
     def init_state(
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None

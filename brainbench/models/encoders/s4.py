@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import UsageError
 from brainbench.models.encoders.zhuang import INPUT_SHAPE, small_width
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear
 from brainbench.models.ops.state_space import StateSpace, System
-from brainbench.models.parts import wanted
+from brainbench.models.parts import check_sweep, run_layers
 
 S4State = tuple[tuple[torch.Tensor, System], ...]
 """For every block the memory [B, width, pairs, 2] and the discretised system (constant while streaming)."""
@@ -80,14 +79,14 @@ class S4Encoder(nn.Module):
         self.input_shape = input_shape
         self.features = small_width(512) if small else 512
         self.embed = Linear(math.prod(input_shape), self.features, gain=RECTIFIER_GAIN)
-        self.blocks = nn.ModuleList(S4Block(self.features, pairs, dropout) for _ in range(blocks))
+        self.blocks: Any = nn.ModuleList(S4Block(self.features, pairs, dropout) for _ in range(blocks))
         self.fc = Linear(self.features, self.features)
         self.layers: tuple[str, ...] = ("embed", *(f"block{index}" for index in range(1, blocks + 1)), "fc")
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one streamed step: linear layers, and 12 per conjugate pair of the recurrence."""
         linear = sum(module.weight.numel() for module in self.modules() if isinstance(module, Linear))
-        return linear + sum(12 * self._block(index).memory.frequency.numel() for index in range(len(self.blocks)))
+        return linear + sum(12 * block.memory.frequency.numel() for block in self.blocks)
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the features [B, T, F], with activations also ``{layer: [B, T, width]}``.
@@ -95,31 +94,21 @@ class S4Encoder(nn.Module):
         Raises:
             UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
         """
-        if x.ndim != 5 or tuple(x.shape[2:]) != self.input_shape:
-            raise UsageError(
-                f"S4 expects [batch, time, {', '.join(map(str, self.input_shape))}]; received {list(x.shape)}."
-            )
-        names = wanted(self.layers, return_activations)
-        y, activations = x.flatten(2), {}
-        for name, module in zip(self.layers, (self.embed, *self.blocks, self.fc), strict=True):
-            y = module(y)
-            if name in names:
-                activations[name] = y
+        check_sweep(x, self.input_shape, "S4")
+        layers = zip(self.layers, (self.embed, *self.blocks, self.fc), strict=True)
+        y, activations = run_layers(x.flatten(2), layers, return_activations)
         return y if return_activations is False else (y, activations)
 
     def init_state(
         self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> S4State:
         """Return the state before the first step: empty memories and the systems discretised from the weights."""
-        return tuple(self._block(index).memory.init_state(batch, device, dtype) for index in range(len(self.blocks)))
+        return tuple(block.memory.init_state(batch, device, dtype) for block in self.blocks)
 
     def step(self, x: torch.Tensor, state: S4State) -> tuple[torch.Tensor, S4State]:
         """Return the features [B, F] of one step [B, C, H, W] and the next state."""
         y, after = self.embed(x.flatten(1)), []
-        for index, (memory, system) in enumerate(state):
-            y, memory = self._block(index).step(y, memory, system)
+        for block, (memory, system) in zip(self.blocks, state, strict=True):
+            y, memory = block.step(y, memory, system)
             after.append((memory, system))
         return self.fc(y), tuple(after)
-
-    def _block(self, index: int) -> S4Block:
-        return cast(S4Block, self.blocks[index])

@@ -1,4 +1,4 @@
-"""What a temporal graph is made of: frozen, validated descriptions of nodes and edges.
+"""The description of a temporal graph: frozen, validated nodes and edges.
 
 A node concatenates its inputs on channels, applies an operation, then a memory, an activation and a
 pool. Shapes are (C, H, W), or (F,) after a dense operation. Importing this module imports no framework.
@@ -20,18 +20,10 @@ UNROLLS: tuple[Unroll, ...] = ("biological", "full")
 MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
 
 
-@dataclass(frozen=True)
-class Convolution:
-    """2-D convolution of the concatenated inputs."""
+@dataclass(frozen=True, kw_only=True)
+class Operation:
+    """Options that all operations share."""
 
-    channels: int
-    """Of the output."""
-    kernel_size: tuple[int, int] = (2, 2)
-    """Rows, columns."""
-    stride: tuple[int, int] = (1, 1)
-    """Rows, columns."""
-    padding: Literal["same", "valid"] | tuple[int, int] = "same"
-    """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
     use_bias: bool = True
     bias: float | None = 0.0
     """Initial bias; None draws it within 1/√fan_in."""
@@ -41,6 +33,20 @@ class Convolution:
     """Applied before the memory."""
     initialiser: Mapping[str, Any] | None = None
     """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
+
+
+@dataclass(frozen=True)
+class Convolution(Operation):
+    """2-D convolution of the concatenated inputs."""
+
+    channels: int
+    """Channels of the output."""
+    kernel_size: tuple[int, int] = (2, 2)
+    """Rows, columns."""
+    stride: tuple[int, int] = (1, 1)
+    """Rows, columns."""
+    padding: Literal["same", "valid"] | tuple[int, int] = "same"
+    """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (C, H, W) for an input (C, H, W)."""
@@ -55,20 +61,13 @@ class Convolution:
 
 
 @dataclass(frozen=True)
-class Dense:
+class Dense(Operation):
     """Linear layer of the flattened, concatenated inputs."""
 
     features: int
-    """Of the output."""
-    use_bias: bool = True
-    bias: float | None = 0.1
+    """Features of the output."""
+    bias: float | None = field(default=0.1, kw_only=True)
     """Initial bias; None draws it within 1/√fan_in."""
-    dropout: float = 0.0
-    """Share dropped while training."""
-    activation: str | None = None
-    """Applied before the memory."""
-    initialiser: Mapping[str, Any] | None = None
-    """As in :class:`Convolution`."""
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (features,)."""
@@ -87,7 +86,7 @@ class Memory:
     kind: str = "time-decay"
     """One of :data:`MEMORIES`."""
     kernel_size: tuple[int, int] = (2, 2)
-    """Of the gates, rows and columns."""
+    """Kernel of the gates, rows and columns."""
     layer_norm: bool = False
     """Normalise each gate over channels."""
     tau: float = 0.0
@@ -106,11 +105,11 @@ class Pool:
     size: tuple[int, int]
     """Window of a maximum; output size of an average."""
     stride: tuple[int, int] | None = None
-    """Of a maximum; None is its window."""
+    """Step of the window of a maximum; None: as large as the window."""
     padding: tuple[int, int] = (0, 0)
-    """Of a maximum: cells added at every edge."""
+    """Cells added at every edge, for a maximum."""
     ceil_mode: bool = False
-    """Of a maximum: a window may reach beyond the edge."""
+    """Let a window of a maximum reach beyond the edge."""
     flatten: bool = False
     """Give one vector in place of a grid."""
 

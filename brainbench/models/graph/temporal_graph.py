@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class GraphState:
-    """What a graph carries from one step to the next."""
+    """State of a graph between two steps."""
 
     outputs: Mapping[str, torch.Tensor]
     """Last output of every node [B, ...]."""

@@ -1,1 +1,1 @@
-"""What follows an encoder: decoders to class scores, and heads of the self-supervised objectives."""
+"""Heads of an encoder: decoders to class scores, and those of the self-supervised objectives."""

@@ -24,7 +24,7 @@ HALF = torch.bfloat16
 
 @dataclass(frozen=True)
 class ConvolutionShape:
-    """How a convolution of stride 1 moves over a grid."""
+    """Kernel, padding and grids of a convolution of stride 1."""
 
     kernel: tuple[int, int]
     pads: tuple[int, int]
@@ -86,7 +86,7 @@ def _maps(rows: torch.Tensor, geometry: ConvolutionShape) -> torch.Tensor:
 
 
 class DeferredWeightGrad:
-    """What the weight gradient of one convolution needs of all steps of one pass.
+    """Both factors of the weight gradient of one convolution, kept for all steps of one pass.
 
     Args:
         conv: The convolution.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class DeferredNormGrad:
-    """What the gradients of a cell's norms add up to over the steps of a pass."""
+    """Sums of the gradients of a cell's norms over the steps of a pass."""
 
     def __init__(self, norms: list[ChannelNorm]) -> None:
         from brainbench.models.ops.kernels.intersection import PROGRAMS

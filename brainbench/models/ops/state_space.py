@@ -40,7 +40,7 @@ class System(NamedTuple):
     right: torch.Tensor
     """Row of the rank-one correction, conjugated, as it multiplies the old state."""
     drive: torch.Tensor
-    """What one unit of input adds to the state."""
+    """Change of the state for one unit of input."""
     readout: torch.Tensor
     """Weights of the answer."""
 

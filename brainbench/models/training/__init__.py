@@ -1,6 +1,24 @@
-"""Training: one run in a folder, resumed exactly after any interruption.
+"""Training of networks: one run in a folder, resumed exactly after any interruption.
 
-Public modules: :mod:`~brainbench.models.training.config` (what is trained and how),
-:mod:`~brainbench.models.training.trainer` (train), :mod:`~brainbench.models.training.batches` (where data come from),
-:mod:`~brainbench.models.training.search_space` (search spaces). Importing this package imports no framework.
+A :mod:`.config` says what is trained; :mod:`.batches` give sweeps, which are augmented, answered by a network with the
+head of its objective, and taken back to :mod:`.gradients` for one of the :mod:`.optimizers`; the best network is
+evaluated and kept as a checkpoint with its card. Importing this package imports no framework.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from brainbench.models.training.batches import ArrayData
+    from brainbench.models.training.config import TrainingConfig
+    from brainbench.models.training.trainer import TrainingResult, train
+
+__all__ = ["ArrayData", "TrainingConfig", "TrainingResult", "train"]
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {"ArrayData": ".batches", "TrainingConfig": ".config", "TrainingResult": ".trainer", "train": ".trainer"},
+)

@@ -33,7 +33,7 @@ _MIRRORED = {"vertical": "z", "horizontal": "y"}
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What is done to every sample at training time.
+    """Change of every sample at training time.
 
     Raises:
         UsageError: there is no such kind, or the masked share is not in [0, 1).

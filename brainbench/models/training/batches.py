@@ -1,4 +1,4 @@
-"""Where training takes its sweeps from."""
+"""The sources of sweeps for training."""
 
 from __future__ import annotations
 

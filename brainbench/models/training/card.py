@@ -1,4 +1,4 @@
-"""What is written beside a trained model: its configuration and its model card."""
+"""The configuration and the model card that are written beside a trained model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def checkpoint_info(
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
-    ``drawn_biases`` is what :func:`~brainbench.models.training.initial_state.draw_silent_biases` returned.
+    ``drawn_biases`` is what :func:`~brainbench.models.training.trainer.draw_silent_biases` returned.
     """
     return {
         "objective": config.objective,

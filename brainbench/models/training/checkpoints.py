@@ -21,7 +21,7 @@ FORMAT = 1
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 LOCAL, HUB = "local-dir:", "hf-hub:"
 PREFIXES = (LOCAL, HUB)
-"""What a model's name starts with when it is a folder or a repository instead of a registry name."""
+"""Beginnings of a model's name that is a folder or a repository instead of a registry name."""
 DTYPES = ("float32", "float16", "bfloat16")
 
 

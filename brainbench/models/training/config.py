@@ -1,4 +1,4 @@
-"""What is trained and how. Importing this module imports no framework."""
+"""The options of a training run, and warnings against some of them. Importing this module imports no framework."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from brainbench.models.training.checkpoints import DTYPES
 PRECISIONS = ("auto", "float32", "bf16")
 COMPILE = ("off", "parts", "default", "graphs")
 AUGMENTATIONS = ("none", "physical", "thesis", "image")
+CONTRASTIVE = ("simclr", "simsiam")
+PLAYED_BACKWARDS = ("physical", "thesis")
+"""Augmentations that reverse time."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +39,9 @@ class TrainingConfig:
     schedule: str = "step"
     """One of :data:`~brainbench.models.training.optimizers.SCHEDULES`."""
     learning_rate: float = 1e-2
-    """At its highest."""
+    """Highest learning rate."""
     warmup_epochs: int = 0
-    """Over which the rate of the ``cosine`` schedule rises, from 1e-4 of its highest."""
+    """Epochs in which the rate of the ``cosine`` schedule rises from 1e-4 of its highest."""
     epochs: int = EPOCHS
     """Passes through the training sweeps."""
     batch_size: int = BATCH_SIZE
@@ -60,18 +63,19 @@ class TrainingConfig:
     probe_epochs: int = 100
     """Epochs of the linear probe after a self-supervised objective; 0 for none."""
     seed: int = 0
-    """Of weights, order, augmentation and dropout."""
+    """Seed of weights, order, augmentation and dropout."""
     checkpoint_seconds: float = 60.0
     """Time between saved states within an epoch; the end of every epoch saves too."""
-    weights_dtype: str = "float32"
-    """Precision of the published weights: ``float32``, ``float16`` or ``bfloat16``."""
+    weights_dtype: str = "auto"
+    """Precision of the published weights: ``float32``, ``float16``, ``bfloat16``, or ``auto``: bfloat16 where the run
+    trains in bf16 (half the size), else float32."""
 
     def __post_init__(self) -> None:
         for kind, value, allowed in (
             ("objective", self.objective, OBJECTIVES),
             ("precision", self.precision, PRECISIONS),
             ("way to compile", self.compile, COMPILE),
-            ("precision of weights", self.weights_dtype, DTYPES),
+            ("precision of weights", self.weights_dtype, ("auto", *DTYPES)),
             ("augmentation", self.augmentation, AUGMENTATIONS),
         ):
             if value not in allowed:
@@ -128,10 +132,45 @@ class TrainingConfig:
         return cls(**values)
 
     @property
+    def stored_dtype(self) -> str:
+        """Precision in which the weights are published, once ``precision`` is no longer ``auto``."""
+        if self.weights_dtype != "auto":
+            return self.weights_dtype
+        return "bfloat16" if self.precision == "bf16" else "float32"
+
+    @property
     def identity(self) -> dict[str, Any]:
-        """What must be equal for a run to be resumed: all but how often and how exactly results are stored."""
+        """Options that must be equal for a run to be resumed: all but how often and how exactly results are stored."""
         free = ("checkpoint_seconds", "weights_dtype")
         return {name: value for name, value in dataclasses.asdict(self).items() if name not in free}
+
+
+def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
+    """Return reasons why a run may teach nothing, each a sentence and what to do instead.
+
+    Args:
+        config: The run.
+        model: Its network, whose ``spec.receptive_field`` is read if there is one.
+    """
+    found: list[str] = []
+    if config.objective not in CONTRASTIVE:
+        return found
+    if config.augmentation == "none" and not config.masking:
+        found.append(
+            f"Without augmentation or masking both views of a sweep are equal, so {config.objective} has nothing to "
+            "ignore: only telling sweeps apart is rewarded, without bound, and such runs tend to diverge. Choose an "
+            "augmentation, or masking."
+        )
+    seen = getattr(getattr(model, "spec", None), "receptive_field", None)
+    if seen is not None and config.augmentation in PLAYED_BACKWARDS:
+        steps = "the last step" if seen == 1 else f"the last {seen} steps"
+        found.append(
+            f"{config.model} has no memory: its last answer sees {steps} of a sweep alone. The augmentation "
+            f"{config.augmentation!r} plays half of the views backwards, which end before the whiskers touch anything "
+            f"and look all alike, so the loss of {config.objective} cannot fall far. A network with memory or an "
+            "attender, or the augmentation 'image', can learn."
+        )
+    return found
 
 
 def read_options(path: str | Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a network is trained for: supervised, SimCLR, SimSiam, autoencoding.
+"""The objectives of training: supervised, SimCLR, SimSiam, autoencoding.
 
 A :class:`Learner` is a network with an objective's head; its forward pass gives the loss of a batch, so that it can
 be wrapped for several processes. Letters: B batch, T step, F features.
@@ -55,8 +55,8 @@ class Learner(nn.Module):
     """A network and the head of its objective; forward gives (loss, answers [B, classes] or None).
 
     Args:
-        model: Maps [B, T, C, H, W] in SI to [B, classes]. Self-supervised objectives need one of
-            :class:`~brainbench.models.network.EAD`'s kind, with ``encode``, ``features`` and ``normaliser``.
+        model: Maps [B, T, C, H, W] in SI to [B, classes]. Self-supervised objectives need ``encode``, ``features`` and
+            ``normaliser``, as :class:`~brainbench.models.network.EncoderAttenderDecoder` has them.
 
     Raises:
         UsageError: the objective learns from features, and the network names none.
@@ -73,7 +73,7 @@ class Learner(nn.Module):
         if not self.supervised and not all(hasattr(model, name) for name in ("encode", "features", "normaliser")):
             raise UsageError(
                 f"{type(self).__name__} learns from features, which {type(model).__name__} does not name; train it "
-                "supervised, or build it as an encoder-attender-decoder (brainbench.models.network.EAD)."
+                "supervised, or build it as a brainbench.models.network.EncoderAttenderDecoder."
             )
         if not self.supervised and hasattr(model, "decoder"):
             # The decoder has no part in it and is fitted afterwards, by the linear probe.

@@ -28,7 +28,7 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether this process writes files and shows progress."""
+        """True in the process that writes files and shows progress."""
         return self.rank == 0
 
     def wrap(self, module: nn.Module) -> nn.Module:
@@ -62,7 +62,7 @@ class Processes:
         return float(total) / self.count
 
     def any(self, flag: bool) -> bool:
-        """Whether the flag is up in any process."""
+        """Return whether the flag is up in any process."""
         return self.mean(float(flag)) > 0
 
     def wait(self) -> None:

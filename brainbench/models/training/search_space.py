@@ -61,7 +61,7 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
         DataError: no run of the sweep is finished.
     """
     from brainbench.core.files import read_json
-    from brainbench.models.training.trainer import RUN, read_log
+    from brainbench.models.training.run_folder import RUN, read_log
 
     scores: dict[str, tuple[float, float]] = {}
     for path in sorted(Path(out).glob(f"*/{RUN}")):

@@ -8,7 +8,6 @@ with the weights of an unbroken one: on the CPU to the last bit, on CUDA up to i
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -18,45 +17,44 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json, write_json
+from brainbench.core.files import read_json
 from brainbench.core.progress import Progress
 from brainbench.models.activations import evaluating
-from brainbench.models.attenders.gpt import GPTBlock
-from brainbench.models.attenders.mamba import MambaBlock
-from brainbench.models.cells import Cell
-from brainbench.models.encoders.resnet import BasicBlock
-from brainbench.models.encoders.s4 import S4Block
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import Augmentation
 from brainbench.models.training.batches import Batches, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
-from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.config_warnings import config_warnings
-from brainbench.models.training.cuda_graphs import Gradients, fuse
-from brainbench.models.training.evaluation import Evaluation, evaluate
-from brainbench.models.training.initial_state import draw_silent_biases
-from brainbench.models.training.logs import RunLog
+from brainbench.models.training.config import TrainingConfig, config_warnings
+from brainbench.models.training.evaluation import Evaluation, evaluate, fit_probe
+from brainbench.models.training.gradients import Gradients, compiled
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
-from brainbench.models.training.probe import fit_probe
 from brainbench.models.training.processes import Processes, processes
-from brainbench.models.training.state import load_state, save_state
+from brainbench.models.training.run_folder import (
+    BEST,
+    FAILED,
+    RUN,
+    STATE,
+    RunLog,
+    claim,
+    load_state,
+    mark,
+    save_state,
+)  # fmt: skip
 
 _log = logging.getLogger(__name__)
 
-RUN, STATE, BEST, FAILED = "run.json", "state.safetensors", "best", "failed-batch.safetensors"
 _LOG_STEPS = 50
-PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)
-"""What is compiled on its own: called at every step or block, with few shapes."""
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """How a run ended."""
+    """End of a run."""
 
     status: Literal["finished", "stopped", "diverged"]
     """``stopped``: the time allowed was over; start it again to go on."""
@@ -111,6 +109,23 @@ def train(
             run.log.close()
 
 
+@dataclass
+class _Position:
+    """Progress of a run."""
+
+    step: int = 0
+    """Optimiser steps done."""
+    epoch: int = 0
+    """Epochs done."""
+    best: float = math.inf
+    """Lowest validation score so far."""
+    best_epoch: int | None = None
+    total: float = 0.0
+    """Sum of the losses of this epoch's steps."""
+    count: int = 0
+    """Number of them."""
+
+
 class _Run:
     def __init__(
         self, config: TrainingConfig, data: Data, out: Path, where: Processes, progress: Progress | None
@@ -121,18 +136,18 @@ class _Run:
         self.progress = progress if progress is not None and where.first else (lambda done, total, what: None)
         self.started = self.saved = time.monotonic()
         self.options: dict[str, Any] = {"classes": len(data.classes), "decoder": config.decoder}
-        self._claim()
+        claim(out, {**config.identity, "classes": list(data.classes)}, write=where.first)
+        where.wait()
         model = load_model(config.model, seed=config.seed, **self.options).train()
         self.drawn = draw_silent_biases(model)
         learner = make_learner(config.objective, model)
         if where.count > 1 and config.batch_size % where.count:
             raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
         self.learner: Any = where.prepare(learner)
-        self.model: torch.nn.Module = self.learner.model
+        self.model: nn.Module = self.learner.model
         self.optimizer = make_optimizer(config.optimizer, self.learner.parameters(), config.learning_rate)
-        forward = self._compiled(where.wrap(self.learner))
         self.gradients = Gradients(
-            forward,
+            compiled(where.wrap(self.learner), config.compile),
             [parameter for parameter in self.learner.parameters() if parameter.requires_grad],
             clip=config.clip,
             autocast=self._precision,
@@ -144,41 +159,37 @@ class _Run:
         if batches is None:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
         self.batches: Batches = batches
-        self.step, self.epoch, self.best, self.best_epoch = 0, 0, math.inf, None
-        self.total, self.count = 0.0, 0
+        self.at = _Position()
         if (out / STATE).is_file():
             self._restore()
-        self.log = RunLog(out, step=self.step, active=where.first)
-        for doubt in config_warnings(config, self.model) if where.first else ():
-            _log.warning("%s", doubt)
+        self.log = RunLog(out, step=self.at.step, active=where.first)
+        for warning in config_warnings(config, self.model) if where.first else ():
+            _log.warning("%s", warning)
 
     def run(self, allowed: float) -> TrainingResult:
         steps = len(self.batches)
-        if self.where.first and self.epoch < self.config.epochs:
-            _log.info("%s %s: step %d of %d.", self.config.model, self.config.objective, self.step, self._steps)
-        while self.epoch < self.config.epochs:
+        if self.where.first and self.at.epoch < self.config.epochs:
+            _log.info("%s %s: step %d of %d.", self.config.model, self.config.objective, self.at.step, self._steps)
+        while self.at.epoch < self.config.epochs:
             self.learner.train()
-            over = False
+            over, stopped = False, f"the {allowed:g} s allowed are over; start it again to go on"
             for x, labels in self.batches:
                 failure = self._advance(x, labels, steps)
                 if failure:
                     return self._result("diverged", failure)
-                self.progress(self.step, self._steps, f"training {self.config.model}")
+                self.progress(self.at.step, self._steps, f"training {self.config.model}")
                 over = self.where.any(time.monotonic() - self.started > allowed)
                 due = self.where.any(time.monotonic() - self.saved > self.config.checkpoint_seconds)
                 # After an epoch's last batch the end of the epoch saves; a state between the two would lose it.
-                if (over or due) and self.step % steps:
+                if (over or due) and self.at.step % steps:
                     self._save()
                     if over:
-                        return self._stopped(allowed)
-            self.epoch += 1
+                        return self._result("stopped", stopped)
+            self.at.epoch += 1
             self._end_epoch()
-            if over and self.epoch < self.config.epochs:
-                return self._stopped(allowed)
+            if over and self.at.epoch < self.config.epochs:
+                return self._result("stopped", stopped)
         return self._finish()
-
-    def _stopped(self, allowed: float) -> TrainingResult:
-        return self._result("stopped", f"the {allowed:g} s allowed are over; start it again to go on")
 
     @property
     def _steps(self) -> int:
@@ -188,12 +199,9 @@ class _Run:
         """Take one optimiser step; return why it could not be taken, or ''."""
         config = self.config
         x, labels = x.to(self.where.device, non_blocking=True), labels.to(self.where.device, non_blocking=True)
-        views = tuple(
-            self.augmentation(x, _generator(config.seed, self.step, view), part=self.where.part)
-            for view in range(self.learner.views)
-        )
+        views = self._views(x, self.at.step)
         factor = rate_factor(
-            config.schedule, self.step / steps, epochs=config.epochs, warmup_epochs=config.warmup_epochs
+            config.schedule, self.at.step / steps, epochs=config.epochs, warmup_epochs=config.warmup_epochs
         )
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * factor
@@ -203,20 +211,27 @@ class _Run:
         if not math.isfinite(norm) or self.where.any(not math.isfinite(value)):
             return self._keep_failure(views, labels, value, norm)
         self.optimizer.step()
-        self.step += 1
-        self.total, self.count = self.total + value, self.count + 1
-        if self.step % _LOG_STEPS == 0:
+        self.at.step += 1
+        self.at.total, self.at.count = self.at.total + value, self.at.count + 1
+        if self.at.step % _LOG_STEPS == 0:
             rate = config.learning_rate * factor
-            self.log.write("train", self.step, loss=value, gradient_norm=norm, learning_rate=rate)
+            self.log.write("train", self.at.step, loss=value, gradient_norm=norm, learning_rate=rate)
         return ""
 
+    def _views(self, x: torch.Tensor, step: int) -> tuple[torch.Tensor, ...]:
+        """Return augmented copies of a batch, which depend on nothing but the seed and a step's number."""
+        return tuple(
+            self.augmentation(x, _generator(self.config.seed, step, view), part=self.where.part)
+            for view in range(self.learner.views)
+        )
+
     def _end_epoch(self) -> None:
-        loss = self.where.mean(self.total / max(self.count, 1))
-        self.total, self.count = 0.0, 0
-        self.log.write("epoch", self.step, epoch=self.epoch, loss=loss)
+        loss = self.where.mean(self.at.total / max(self.at.count, 1))
+        self.at.total, self.at.count = 0.0, 0
+        self.log.write("epoch", self.at.step, epoch=self.at.epoch, loss=loss)
         score = self._validate(loss)
-        if score < self.best:
-            self.best, self.best_epoch = score, self.epoch
+        if score < self.at.best:
+            self.at.best, self.at.best_epoch = score, self.at.epoch
             if self.where.first:
                 self._publish(None)
         self._save()
@@ -231,21 +246,18 @@ class _Run:
         if self.config.objective == "supervised":
             with self._precision():
                 found = evaluate(self.model, batches, device=self.where.device)
-            self.log.write("validation", self.step, top1=found.top1, top5=found.top5, spread=found.spread)
+            self.log.write("validation", self.at.step, top1=found.top1, top5=found.top5, spread=found.spread)
             return 1.0 - found.top1
         total, count = 0.0, 0
         with evaluating(self.learner), torch.no_grad(), self._precision():
             for index, (x, labels) in enumerate(batches):
                 x, labels = x.to(self.where.device), labels.to(self.where.device)
                 # The same views in every epoch, so that losses can be compared.
-                views = tuple(
-                    self.augmentation(x, _generator(self.config.seed, -1 - index, view), part=self.where.part)
-                    for view in range(self.learner.views)
-                )
+                views = self._views(x, -1 - index)
                 if len(x) > 1:
                     total, count = total + float(self.learner(views, labels)[0]), count + 1
         mean = self.where.mean(total / max(count, 1))
-        self.log.write("validation", self.step, loss=mean)
+        self.log.write("validation", self.at.step, loss=mean)
         return mean if math.isfinite(mean) else math.inf
 
     def _finish(self) -> TrainingResult:
@@ -253,7 +265,7 @@ class _Run:
         if self.where.first:
             done = read_json(self.out / RUN).get("evaluation")
             if done is not None:
-                return self._result("finished", "", _evaluation(done))
+                return self._result("finished", "", Evaluation.from_plain(done))
             self._load_best()
             if self.config.objective != "supervised" and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
@@ -273,10 +285,10 @@ class _Run:
                     break
             self._publish(result)
             if result is not None:
-                self.log.write("test", self.step, top1=result.top1, top5=result.top5, spread=result.spread)
+                self.log.write("test", self.at.step, top1=result.top1, top5=result.top5, spread=result.spread)
                 if result.collapsed:
                     _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
-            self._mark({"evaluation": asdict(result) if result is not None else None, "status": "finished"})
+            mark(self.out, evaluation=asdict(result) if result is not None else None, status="finished")
         self.where.wait()
         return self._result("finished", "", result)
 
@@ -290,8 +302,8 @@ class _Run:
         info = checkpoint_info(
             self.config,
             self.data.classes,
-            epochs_done=self.epoch,
-            best_epoch=self.best_epoch,
+            epochs_done=self.at.epoch,
+            best_epoch=self.at.best_epoch,
             evaluation=result,
             drawn_biases=self.drawn,
         )
@@ -302,69 +314,39 @@ class _Run:
             options=self.options,
             info=info,
             card=model_card(self.config, info),
-            dtype=self.config.weights_dtype,
+            dtype=self.config.stored_dtype,
         )
 
     def _save(self) -> None:
         self.saved = time.monotonic()
         if not self.where.first:
             return
-        plain = {
-            "step": self.step,
-            "epoch": self.epoch,
-            "best": self.best,
-            "best_epoch": self.best_epoch,
-            "total": self.total,
-            "count": self.count,
-            "batches": self.batches.state_dict(),
-        }
+        plain = {**asdict(self.at), "batches": self.batches.state_dict()}
         save_state(self.out / STATE, self.learner, self.optimizer, plain)
 
     def _restore(self) -> None:
         plain = load_state(self.out / STATE, self.learner, self.optimizer)
-        state = dict(plain["batches"])
+        state = dict(plain.pop("batches"))
         if "part" in state:  # every process reads its own part, and the first one's state was saved
             state["part"] = list(self.where.part)
         self.batches.load_state_dict(state)
-        self.step, self.epoch = plain["step"], plain["epoch"]
-        self.best, self.best_epoch = plain["best"], plain["best_epoch"]
-        self.total, self.count = plain["total"], plain["count"]
-
-    def _claim(self) -> None:
-        """Enter the run into its folder, or find it there."""
-        identity = {**self.config.identity, "classes": list(self.data.classes)}
-        path = self.out / RUN
-        if path.is_file():
-            other = read_json(path).get("run", {})
-            differing = [name for name, value in identity.items() if other.get(name) != value]
-            if differing:
-                told = ", ".join(f"{name} {other.get(name)!r} (now {identity[name]!r})" for name in differing[:4])
-                raise UsageError(
-                    f"{str(self.out)!r} holds another run: {told}. Choose another folder, or delete it to start anew."
-                )
-        elif self.where.first:
-            self.out.mkdir(parents=True, exist_ok=True)
-            write_json(path, {"run": identity, "status": "running"})
-        self.where.wait()
-
-    def _mark(self, values: dict[str, Any]) -> None:
-        write_json(self.out / RUN, {**read_json(self.out / RUN), **values})
+        self.at = _Position(**plain)
 
     def _keep_failure(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor, loss: float, norm: float) -> str:
         from safetensors.torch import save_file
 
         reason = (
-            f"at step {self.step + 1} the loss was {loss:g} and the gradient's norm {norm:g}; the last good model is "
-            f"kept and the batch is in {FAILED}. A lower learning rate, a smaller clipping norm or the -ln variant of "
-            "the network may help"
+            f"at step {self.at.step + 1} the loss was {loss:g} and the gradient's norm {norm:g}; the last good model "
+            f"is kept and the batch is in {FAILED}. A lower learning rate, a smaller clipping norm or the -ln variant "
+            "of the network may help"
         )
         if self.where.first:
             tensors = {f"view{index}": view.cpu().contiguous() for index, view in enumerate(views)}
-            save_file({**tensors, "labels": labels.cpu()}, self.out / FAILED, metadata={"step": str(self.step)})
+            save_file({**tensors, "labels": labels.cpu()}, self.out / FAILED, metadata={"step": str(self.at.step)})
             if not (self.out / BEST / WEIGHTS).is_file() and (self.out / STATE).is_file():
                 load_state(self.out / STATE, self.learner, self.optimizer)
                 self._publish(None)
-            self._mark({"status": "diverged", "reason": reason})
+            mark(self.out, status="diverged", reason=reason)
         return reason
 
     def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:
@@ -372,9 +354,9 @@ class _Run:
             status,
             reason,
             self.out / BEST,
-            self.step,
-            self.epoch,
-            self.best_epoch,
+            self.at.step,
+            self.at.epoch,
+            self.at.best_epoch,
             evaluation,
             round(time.monotonic() - self.started, 3),
         )
@@ -389,28 +371,10 @@ class _Run:
             device=self.where.device,
         )
 
-    def _compiled(self, module: torch.nn.Module) -> Any:
-        return compiled(module, self.config.compile)
-
     def _precision(self) -> Any:
         if self.config.precision == "float32":
             return nullcontext()
         return torch.autocast(self.where.device.type, dtype=torch.bfloat16)
-
-
-def compiled(module: torch.nn.Module, how: str) -> Any:
-    """Return a module compiled in one of the ways of :data:`~brainbench.models.training.config.COMPILE`."""
-    if how == "off":
-        return module
-    if how == "parts":
-        for part in module.modules():
-            if isinstance(part, PARTS):
-                part.compile()
-        return module
-    if how == "graphs":
-        fuse(module)
-        return module
-    return torch.compile(module)
 
 
 def _generator(seed: int, step: int, view: int) -> torch.Generator:
@@ -418,23 +382,27 @@ def _generator(seed: int, step: int, view: int) -> torch.Generator:
     return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)
 
 
-def _evaluation(values: dict[str, Any]) -> Evaluation:
-    from brainbench.core.records import Interval
+@torch.no_grad()
+def draw_silent_biases(model: nn.Module) -> int:
+    """Draw the biases that are zero, uniform within 1/√fan_in, in a network with layer norm.
 
-    spread = values["spread"] if values["spread"] is not None else math.nan
-    return Evaluation(**{**values, "spread": spread, "interval": Interval(**values["interval"])})
+    Before an object arrives a sweep is exactly zero, and so is every activation of a network whose biases are zero.
+    There layer norm has its steepest slope, 1/√ε = 316, at every place, step and layer: back through 22 steps of an
+    unrolled network the gradient overflows single precision, and four S4 blocks alone make it 1e9. With drawn biases
+    silence has a spread over channels, and the slope is of the order of one.
 
+    Args:
+        model: Changed in place; a network without layer norm is left alone.
 
-def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
-    """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log.
-
-    Raises:
-        DataError: the folder holds no log.
+    Returns:
+        How many layers got biases. They come from PyTorch's global random state.
     """
-    from brainbench.models.training.logs import LOG
-
-    path = Path(folder) / LOG
-    if not path.is_file():
-        raise DataError(f"There is no log {str(path)!r}.")
-    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return [line for line in lines if line["kind"] == kind]
+    if not any(isinstance(part, nn.LayerNorm) for part in model.modules()):
+        return 0
+    drawn = 0
+    for part in model.modules():
+        if isinstance(part, (nn.Conv2d, nn.Linear)) and part.bias is not None and not part.bias.any():
+            bound = 1.0 / math.sqrt(part.weight[0].numel())
+            part.bias.uniform_(-bound, bound)
+            drawn += 1
+    return drawn

@@ -26,8 +26,7 @@ from torch import nn
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, provenance, read_json, to_plain, write_json
 from brainbench.core.progress import Progress
-from brainbench.models.training.logs import RunLog
-from brainbench.models.training.state import load_state, save_state
+from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.shipped import student_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep

@@ -1,14 +1,15 @@
 import pytest
 
+from brainbench.core.statistics import wilson_interval
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.evaluation import Evaluation, wilson
+from brainbench.models.training.evaluation import Evaluation
 
 DATA = {"hash": "0123abcd", "train": 3259, "validation": 405, "test": 407, "left_out": 921, "classes": 2}
 
 
 def _found(correct, count=400):
-    return Evaluation(correct / count, 0.9, wilson(correct, count), count, 2, 0.8, False, "", "feed")
+    return Evaluation(correct / count, 0.9, wilson_interval(correct, count), count, 2, 0.8, False, "", "feed")
 
 
 def _card(correct, twin=None, **changes):
@@ -17,7 +18,7 @@ def _card(correct, twin=None, **changes):
     if twin is not None:
         info["twin_evaluation"] = {
             "top1": twin / 400,
-            "interval": {"low": wilson(twin, 400).low, "high": wilson(twin, 400).high},
+            "interval": {"low": wilson_interval(twin, 400).low, "high": wilson_interval(twin, 400).high},
         }
     return model_card(config, info | {"data": DATA})
 

@@ -1,9 +1,15 @@
 import json
+import logging
 
 import pytest
+import torch
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.models.training.config import TrainingConfig, read_options
+from brainbench.models.registry import load_model
+from brainbench.models.training.augmentation import reverse_time
+from brainbench.models.training.config import TrainingConfig, config_warnings, read_options
+from brainbench.models.training.trainer import train
+from tests.factories.training_sweeps import sweeps, tiny
 
 
 def test_a_published_configuration_follows_its_recipe():
@@ -61,3 +67,63 @@ def test_options_are_read_from_toml_and_json(tmp_path):
     (tmp_path / "c.json").write_text("[1]")
     with pytest.raises(DataError, match="holds a list"):
         read_options(tmp_path / "c.json")
+
+
+def _warnings(name, objective, **changes):
+    return config_warnings(TrainingConfig.published(name, objective, **changes), load_model(name))
+
+
+def test_published_recipes_of_networks_with_memory_raise_no_warning():
+    assert _warnings("zhuang-intersection-ln-small", "simclr") == []
+    assert _warnings("resnet18-small+gpt", "simclr") == []
+    assert _warnings("resnet18-small", "supervised", augmentation="none") == []
+
+
+def test_equal_views_raise_a_warning():
+    (warning,) = _warnings("zhuang-intersection-ln-small", "simclr", augmentation="none")
+    assert "both views of a sweep are equal" in warning
+    assert "Choose an augmentation" in warning
+    assert _warnings("zhuang-intersection-ln-small", "simclr", augmentation="none", masking=0.75) == []
+
+
+def test_a_network_without_memory_raises_a_warning_where_time_may_run_backwards():
+    (warning,) = _warnings("resnet18-small", "simclr")
+    assert "resnet18-small has no memory: its last answer sees the last step" in warning
+    assert _warnings("resnet18-small", "simclr", augmentation="image") == []
+
+
+def test_played_backwards_sweeps_that_begin_in_silence_look_all_alike_to_a_network_without_memory():
+    x, _ = sweeps(6, 1)
+    x[:, 0] = 0.0  # no whisker touches at first
+    for name, alike in (("resnet18-small", True), ("resnet18-small+gpt", False)):
+        with torch.no_grad():
+            features = load_model(name).eval().encode(reverse_time(x), last=True)
+        assert torch.allclose(features, features[:1].expand_as(features), rtol=1e-4, atol=1e-6) == alike
+
+
+def test_a_run_says_its_warnings_and_goes_on(tmp_path, caplog):
+    options = {"epochs": 1, "batch_size": 8, "probe_epochs": 0, "precision": "float32", "learning_rate": 1e-3}
+    config = TrainingConfig.published("resnet18-small", "simclr", optimizer="adamw", **options)
+    with caplog.at_level(logging.WARNING):
+        assert train(config, tiny(), out=tmp_path, device="cpu").status == "finished"
+    assert "has no memory" in caplog.text
+
+
+@pytest.mark.parametrize(("objective", "mixed"), [("simclr", True), ("supervised", False)])
+def test_validation_of_a_contrastive_run_mixes_the_classes(objective, mixed, tmp_path, monkeypatch):
+    data, asked = tiny(), []
+    batches = data.batches
+
+    def spy(split, **options):
+        asked.append((split, options["shuffle"]))
+        return batches(split, **options)
+
+    monkeypatch.setattr(data, "batches", spy)
+    options = {"epochs": 1, "batch_size": 8, "probe_epochs": 0, "precision": "float32", "learning_rate": 1e-3}
+    train(
+        TrainingConfig.published("zhuang-small", objective, optimizer="adamw", **options),
+        data,
+        out=tmp_path,
+        device="cpu",
+    )
+    assert ("validation", mixed) in asked

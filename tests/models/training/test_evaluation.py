@@ -6,7 +6,7 @@ from torch import nn
 
 from brainbench.core.errors import DataError
 from brainbench.models.registry import load_model
-from brainbench.models.training.evaluation import collapse, evaluate, topk, wilson
+from brainbench.models.training.evaluation import collapse, evaluate, fit_probe, topk
 
 
 class Fixed(nn.Module):
@@ -18,15 +18,6 @@ class Fixed(nn.Module):
 
     def forward(self, x):
         return x.flatten(1)[:, : self.classes]
-
-
-def test_wilson_equals_a_published_value():
-    # 10 of 100 (Newcombe 1998, method 3, without continuity correction): .0552 to .1744.
-    interval = wilson(10, 100)
-    assert (interval.low, interval.high) == pytest.approx((0.0552, 0.1744), abs=5e-5)
-    assert wilson(0, 10).low == pytest.approx(0.0, abs=1e-12)
-    with pytest.raises(DataError, match="at least one observation"):
-        wilson(0, 0)
 
 
 def test_top_k_counts_labels_among_the_largest_and_ties_against_the_network():
@@ -68,3 +59,37 @@ def test_features_in_one_point_have_collapsed():
 def test_an_empty_data_set_is_refused():
     with pytest.raises(DataError, match="gave no batch"):
         evaluate(Fixed(3), [])
+
+
+class _Frozen(nn.Module):
+    """Passes its input on as features."""
+
+    features = 3
+
+    def __init__(self):
+        super().__init__()
+        self.decoder = nn.Linear(3, 2)
+
+    def encode(self, x, *, last=False):
+        return x
+
+
+def _batches(scales):
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.arange(200) % 2
+    x = torch.randn(200, 3, generator=generator)
+    x[:, 0] += 4.0 * labels
+    return x * torch.tensor(scales), labels
+
+
+def test_a_probe_reads_features_of_any_scale():
+    x, labels = _batches((1e-3, 1e-3, 1e-3))
+    layer = fit_probe(_Frozen(), [(x, labels)], classes=2, epochs=20)
+    assert (layer(x).argmax(1) == labels).float().mean() > 0.95
+
+
+def test_features_that_hardly_vary_leave_weights_that_half_precision_holds():
+    x, labels = _batches((1.0, 1e-9, 0.0))
+    layer = fit_probe(_Frozen(), [(x, labels)], classes=2, epochs=20)
+    assert torch.isfinite(layer.weight.half()).all()
+    assert (layer(x).argmax(1) == labels).float().mean() > 0.95

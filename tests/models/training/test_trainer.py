@@ -9,11 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.trainer import read_log, train
+from brainbench.models.training.objectives import make_learner
+from brainbench.models.training.run_folder import read_log
+from brainbench.models.training.trainer import draw_silent_biases, train
 from tests.factories.training_sweeps import CLASSES, sweeps, tiny
 
 MODEL = "zhuang-small"
@@ -165,6 +169,14 @@ def test_mixed_precision_trains_and_half_precision_weights_are_evaluated_as_ship
     assert again == pytest.approx(result.evaluation.top1)
 
 
+@pytest.mark.parametrize(("precision", "stored"), [("bf16", torch.bfloat16), ("float32", torch.float32)])
+def test_weights_are_stored_as_they_were_trained(precision, stored, tmp_path):
+    result = train(_config(epochs=1, precision=precision), tiny(), out=tmp_path, device="cpu")
+    assert {value.dtype for name, value in _weights(tmp_path).items() if not name.startswith("normaliser")} == {stored}
+    model = load_model(f"local-dir:{result.folder}")
+    assert {value.dtype for value in model.parameters()} == {torch.float32}
+
+
 SCRIPT = """
 import sys
 import torch
@@ -230,3 +242,64 @@ def test_a_compiled_run_learns_too(how, tmp_path):
     result = train(_config(epochs=4, compile=how, model="zhuang-small"), tiny(), out=tmp_path, device="cpu")
     assert result.status == "finished"
     assert result.evaluation.top1 > 0.5
+
+
+NORMALISED = ("zhuang-intersection-ln-small", "zhuang-gru-ln-small", "s4-small+gpt")
+
+
+def _late_touch(silent=14, loud=8):
+    """Sweeps of nothing at first, as before an object arrives."""
+    x, labels = sweeps(4, 0, steps=silent + loud)
+    x[:, :silent] = 0.0
+    return x, labels
+
+
+def _gradient_norm(model):
+    x, labels = _late_touch()
+    loss, _ = make_learner("supervised", model.train())((x,), labels)
+    loss.backward()
+    return torch.stack([p.grad.norm() for p in model.parameters() if p.grad is not None]).norm()
+
+
+@pytest.mark.parametrize("name", NORMALISED)
+def test_silence_before_touch_explodes_the_gradient_of_layer_norm_unless_biases_are_drawn(name):
+    assert not _gradient_norm(load_model(name, classes=3)) < 1e6
+    model = load_model(name, classes=3)
+    with seeded(0):
+        assert draw_silent_biases(model) > 0
+    assert _gradient_norm(model) < 1e3
+
+
+def test_biases_lie_where_pytorch_draws_them_and_repeat_with_the_seed():
+    def drawn(seed):
+        layer = nn.Sequential(nn.Conv2d(3, 200, 2), nn.LayerNorm(2))
+        nn.init.zeros_(layer[0].bias)
+        with seeded(seed):
+            assert draw_silent_biases(layer) == 1
+        return layer[0].bias.detach()
+
+    bound = 12**-0.5
+    assert drawn(0).abs().max() <= bound
+    assert drawn(0).std() == pytest.approx(bound / 3**0.5, rel=0.1)
+    assert torch.equal(drawn(0), drawn(0))
+    assert not torch.equal(drawn(0), drawn(1))
+
+
+def test_networks_without_layer_norm_and_biases_that_are_there_stay_as_they_are():
+    model = load_model("zhuang-small", classes=3)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    assert draw_silent_biases(model) == 0
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    layer = nn.Sequential(nn.Linear(2, 2), nn.LayerNorm(2))
+    nn.init.ones_(layer[0].bias)
+    assert draw_silent_biases(layer) == 0
+    assert layer[0].bias.tolist() == [1.0, 1.0]
+
+
+def test_a_run_of_a_layer_normalised_network_on_late_touch_trains(tmp_path):
+    from brainbench.models.training.batches import ArrayData
+
+    data = ArrayData(("front", "middle", "back"), train=_late_touch())
+    config = _config(model="zhuang-intersection-ln-small", epochs=1, batch_size=4)
+    result = train(config, data, out=tmp_path, device="cpu")
+    assert result.status == "finished", result.reason

@@ -1,4 +1,4 @@
-"""All that an IntersectionRNN does after its convolution (Collins et al. 2017): a kernel forward, a kernel backward.
+"""The gates of an IntersectionRNN, after its convolution (Collins et al. 2017): a kernel forward, a kernel backward.
 
 With p, m, q, n the four gates' pre-activations, normalised over channels if asked (Ba et al. 2016):
 s' = σ(p + 1) s + (1 − σ(p + 1)) tanh(m) and y = σ(q + 1) x + (1 − σ(q + 1)) relu(n). Letters: R rows (stimulus, then
@@ -13,7 +13,7 @@ GATES = 4
 EPS = 1e-5
 WARPS = 8
 BACK_WARPS = 4
-"""Of a backward pass: fewer threads that keep more each take 72 instead of 84 µs (384 channels, NVIDIA H200)."""
+"""Warps of a backward pass: fewer threads that keep more each take 72, not 84 µs (384 channels, NVIDIA H200)."""
 PROGRAMS = 264
 """Programs of a backward pass: each sums the gradients of the norms over its own rows, always in the same order."""
 

@@ -2,10 +2,11 @@ import pytest
 import torch
 
 from brainbench.models.cells import CELLS
-from brainbench.models.training import trainer as running
+from brainbench.models.training import gradients
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.cuda_graphs import captured, copy_state, fuse, make_capturable, reset_optimizer
-from brainbench.models.training.optimizers import OPTIMIZERS, make_optimizer
+from brainbench.models.training.gradients import copy_state, fuse
+from brainbench.models.training.optimizers import OPTIMIZERS, make_capturable, make_optimizer, reset_optimizer
+from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
 from tests.factories.training_sweeps import tiny
 
@@ -37,16 +38,9 @@ def test_an_optimizer_put_back_to_zero_steps_like_a_new_one_with_its_rate_in_a_t
     torch.testing.assert_close(second.weight, first.weight)
 
 
-def test_on_the_cpu_work_is_repeated_as_it_is():
-    done = []
-    again = captured(lambda: done.append(1), torch.device("cpu"), warm_up=2)
-    again()
-    assert len(done) == 3
-
-
 @pytest.mark.parametrize("model", ["zhuang-small", "resnet18-small"])
 def test_a_run_of_recorded_steps_ends_with_the_weights_of_a_plain_one(model, tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "fuse", lambda module: None)
+    monkeypatch.setattr(gradients, "fuse", lambda module: None)
     finals = []
     for how in ("off", "graphs"):
         # 20 sweeps in batches of 8: the last batch of each epoch has another shape than the recorded one.
@@ -95,5 +89,5 @@ def test_recorded_steps_learn_on_a_gpu_as_plain_ones_do(objective, tmp_path):
         )
         result = train(config, tiny(), out=tmp_path / how, device="cuda")
         assert result.status == "finished"
-        losses.append([line["loss"] for line in running.read_log(tmp_path / how, "epoch")])
+        losses.append([line["loss"] for line in read_log(tmp_path / how, "epoch")])
     assert losses[1] == pytest.approx(losses[0], rel=0.02)

@@ -1,65 +1,41 @@
-"""Whole training steps as CUDA graphs: thousands of small kernels launched by one call.
+"""The gradients of a training step: compiled, and on CUDA recorded as a graph.
 
 A recurrent network of 22 steps launches some ten thousand kernels per optimiser step, and on a fast GPU the launching
-takes longest. A captured step reads its inputs from tensors that stay in place.
+takes longest; a recorded step is launched by one call and reads its inputs from tensors that stay in place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
 from torch import nn
 
-from brainbench.models.cells import GatedCell
+from brainbench.core.cuda_graphs import record_step
+from brainbench.models.attenders.gpt import GPTBlock
+from brainbench.models.attenders.mamba import MambaBlock
+from brainbench.models.cells import Cell, GatedCell
+from brainbench.models.encoders.resnet import BasicBlock
+from brainbench.models.encoders.s4 import S4Block
 
-WARM_UP = 3
-"""Runs before a capture: they choose algorithms, fill caches and allocate the optimiser's state."""
+PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)
+"""Modules that are compiled on their own: called at every step or block, with few shapes."""
 
 
-def captured(
-    work: Callable[[], None],
-    device: torch.device,
-    *,
-    generators: Sequence[torch.Generator] = (),
-    warm_up: int = WARM_UP,
-    together: Callable[[], AbstractContextManager[Any]] = nullcontext,
-    alone: Callable[[], AbstractContextManager[Any]] = nullcontext,
-) -> Callable[[], None]:
-    """Run ``work`` a few times and record it; return what repeats it. On the CPU that is ``work`` itself.
-
-    Args:
-        work: Reads and writes tensors that stay where they are; waits for nothing and asks for no value.
-        device: Where it works.
-        generators: Random numbers it draws, beside PyTorch's own on the device.
-        warm_up: Runs before the recording.
-        together: Entered for these runs, and left before the recording.
-        alone: Entered for the recording, during which nothing else may use the device.
-
-    What the runs before the recording change (weights, counters) stays changed: see :func:`reset_optimizer`.
-    """
-    if device.type != "cuda":
-        with together():
-            for _ in range(warm_up):
-                work()
-        return work
-    with together():
-        side = torch.cuda.Stream(device)
-        side.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(side):
-            for _ in range(warm_up):
-                work()
-        torch.cuda.current_stream(device).wait_stream(side)
-        side.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    for generator in generators:
-        graph.register_generator_state(generator)
-    # Other threads may train on the same device meanwhile.
-    with alone(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        work()
-    return graph.replay
+def compiled(module: torch.nn.Module, how: str) -> Any:
+    """Return a module compiled in one of the ways of :data:`~brainbench.models.training.config.COMPILE`."""
+    if how == "off":
+        return module
+    if how == "parts":
+        for part in module.modules():
+            if isinstance(part, PARTS):
+                part.compile()
+        return module
+    if how == "graphs":
+        fuse(module)
+        return module
+    return torch.compile(module)
 
 
 def fuse(module: nn.Module, on: bool = True) -> None:
@@ -72,30 +48,6 @@ def fuse(module: nn.Module, on: bool = True) -> None:
         torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
     for cell in cells:
         cell.fuse(on)
-
-
-def make_capturable(optimizer: torch.optim.Optimizer, rate: torch.Tensor) -> None:
-    """Let an optimiser read its learning rate from a tensor, and keep its counters on the device.
-
-    Args:
-        optimizer: One of :data:`~brainbench.models.training.optimizers.OPTIMIZERS`, before its first step.
-        rate: The learning rate [], on the device of the parameters.
-    """
-    for group in optimizer.param_groups:
-        group["lr"] = rate
-        if "fused" in group:
-            group["fused"], group["foreach"] = True, False
-        if "capturable" in group:
-            group["capturable"] = rate.is_cuda
-
-
-@torch.no_grad()
-def reset_optimizer(optimizer: torch.optim.Optimizer) -> None:
-    """Put all moments and counters back to zero, in place."""
-    for entries in optimizer.state.values():
-        for value in entries.values():
-            if isinstance(value, torch.Tensor):
-                value.zero_()
 
 
 @torch.no_grad()
@@ -170,7 +122,7 @@ class Gradients:
             self._found = self._compute(self._inputs)
             self._kept = [parameter.grad for parameter in self.parameters]
 
-        self._replay = captured(work, device)
+        self._replay = record_step(work, device)
         if device.type == "cuda":
             torch.cuda.set_rng_state(random, device)
         else:

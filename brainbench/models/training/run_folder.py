@@ -1,0 +1,178 @@
+"""The files of a run: what it trains, where it stands, its log, and a batch that broke it.
+
+``run.json`` identifies the run and tells its end. ``state.safetensors`` is its whole state, so that it goes on exactly
+where it stood: tensors (weights, optimiser, random states) as they are, everything else as JSON in the header. It
+replaces its predecessor in one move: after a kill there is the old state or the new one. ``log.jsonl`` has one JSON
+document per line, repeated in ``tensorboard/`` where that is installed.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import atomic_path, read_json, write_json, write_text
+
+_log = logging.getLogger(__name__)
+
+RUN, STATE, LOG, BEST, FAILED = "run.json", "state.safetensors", "log.jsonl", "best", "failed-batch.safetensors"
+
+
+def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
+    """Enter a run into its folder, or find it there.
+
+    Args:
+        folder: The run's folder.
+        identity: What must be equal for a run to be resumed.
+        write: Enter it if the folder holds none; other processes only look.
+
+    Raises:
+        UsageError: the folder holds another run.
+    """
+    path = folder / RUN
+    if path.is_file():
+        other = read_json(path).get("run", {})
+        differing = [name for name, value in identity.items() if other.get(name) != value]
+        if differing:
+            told = ", ".join(f"{name} {other.get(name)!r} (now {identity[name]!r})" for name in differing[:4])
+            raise UsageError(
+                f"{str(folder)!r} holds another run: {told}. Choose another folder, or delete it to start anew."
+            )
+    elif write:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(path, {"run": dict(identity), "status": "running"})
+
+
+def mark(folder: Path, **values: Any) -> None:
+    """Add to what the folder says of its run."""
+    write_json(folder / RUN, {**read_json(folder / RUN), **values})
+
+
+def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer, plain: Mapping[str, Any]) -> None:
+    """Write weights, optimiser, random states and plain values."""
+    from safetensors.torch import save_file
+
+    tensors = {f"learner.{name}": value for name, value in learner.state_dict().items()}
+    packed = optimizer.state_dict()
+    scalars: dict[str, dict[str, Any]] = {}
+    for index, entries in packed["state"].items():
+        for key, value in entries.items():
+            if isinstance(value, torch.Tensor):
+                tensors[f"optimizer.{index}.{key}"] = value
+            else:
+                scalars.setdefault(str(index), {})[key] = value
+    tensors["random.cpu"] = torch.get_rng_state()
+    if torch.cuda.is_available():
+        tensors["random.cuda"] = torch.cuda.get_rng_state()
+    header = {"groups": packed["param_groups"], "scalars": scalars, "plain": dict(plain)}
+    with atomic_path(path) as temporary:
+        save_file(
+            {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()},
+            temporary,
+            metadata={"state": json.dumps(header)},
+        )
+
+
+def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    """Put a run back where :func:`save_state` found it; return the plain values.
+
+    Raises:
+        DataError: the file is damaged or belongs to another network.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads(file.metadata()["state"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise DataError(
+            f"{str(path)!r} is not a readable training state ({error}); delete it to start anew."
+        ) from error
+    weights = {name.removeprefix("learner."): value for name, value in tensors.items() if name.startswith("learner.")}
+    try:
+        learner.load_state_dict(weights)
+    except RuntimeError as error:
+        raise DataError(f"{str(path)!r} belongs to another network: {error}") from error
+    entries: dict[int, dict[str, Any]] = {int(key): dict(value) for key, value in header["scalars"].items()}
+    for name, value in tensors.items():
+        if name.startswith("optimizer."):
+            _, index, key = name.split(".", 2)
+            entries.setdefault(int(index), {})[key] = value
+    optimizer.load_state_dict({"state": entries, "param_groups": header["groups"]})
+    torch.set_rng_state(tensors["random.cpu"])
+    if torch.cuda.is_available() and "random.cuda" in tensors:
+        torch.cuda.set_rng_state(tensors["random.cuda"])
+    return header["plain"]
+
+
+class RunLog:
+    """Appends to ``log.jsonl`` and to TensorBoard's folder.
+
+    Args:
+        folder: The run's folder.
+        step: Optimiser steps done; lines of later steps, written before an interruption, are dropped.
+        active: Only the first process of a run writes.
+    """
+
+    def __init__(self, folder: Path, *, step: int, active: bool = True) -> None:
+        self._writer: Any = None
+        self._file: Any = None
+        if not active:
+            return
+        path = folder / LOG
+        kept = []
+        if path.exists():
+            for line in path.read_text(encoding="utf-8").splitlines():
+                try:
+                    if json.loads(line)["step"] <= step:
+                        kept.append(line)
+                except (json.JSONDecodeError, KeyError):  # the line that a kill cut short
+                    break
+        write_text(path, "".join(f"{line}\n" for line in kept))
+        self._file = path.open("a", encoding="utf-8")
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            _log.info("TensorBoard is not installed (pip install 'brainbench[train]'); %s is written alone.", LOG)
+        else:
+            self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
+
+    def write(self, kind: str, step: int, **values: float) -> None:
+        """Log numbers of one kind (``train``, ``validation``, …) at an optimiser step; NaN becomes null."""
+        if self._file is None:
+            return
+        plain = {name: value if math.isfinite(value) else None for name, value in values.items()}
+        self._file.write(json.dumps({"kind": kind, "step": step, **plain}) + "\n")
+        self._file.flush()
+        if self._writer is not None:
+            for name, value in values.items():
+                self._writer.add_scalar(f"{kind}/{name}", value, step)
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._file is not None:
+            self._file.close()
+        if self._writer is not None:
+            self._writer.close()
+
+
+def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
+    """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log.
+
+    Raises:
+        DataError: the folder holds no log.
+    """
+    path = Path(folder) / LOG
+    if not path.is_file():
+        raise DataError(f"There is no log {str(path)!r}.")
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [line for line in lines if line["kind"] == kind]
