@@ -53,7 +53,7 @@ class Contacts:
         (runtime,) = self._suite.runtimes
         self.planes: torch.Tensor = wp.to_torch(runtime.measured())
         """[1, B, F] distances in the order of the suite (m)."""
-        order = [runtime.places[tip].start for tip in tips]
+        order = [runtime.slices[tip].start for tip in tips]
         self._order = torch.as_tensor(order, device=world.device)
         rows = np.full(len(scene.geometries), -1, dtype=np.int32)
         for row, link in enumerate((*tips, *model.objects)):

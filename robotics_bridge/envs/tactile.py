@@ -117,8 +117,8 @@ class TactileObservation:
         self._parts: list[tuple[Any, torch.Tensor, torch.Tensor]] = []
         starts = dict(zip(taxels, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         for runtime in self.suite.runtimes:
-            source = np.concatenate([place.start + active[name] for name, place in runtime.places.items()])
-            target = np.concatenate([starts[name] + np.arange(len(active[name])) for name in runtime.places])
+            source = np.concatenate([place.start + active[name] for name, place in runtime.slices.items()])
+            target = np.concatenate([starts[name] + np.arange(len(active[name])) for name in runtime.slices])
             planes = warp().to_torch(runtime.measured())
             self._parts.append((planes, torch.as_tensor(source, device=where), torch.as_tensor(target, device=where)))
         width: int = 3 if observe == "force" else int(self._parts[0][0].shape[0])

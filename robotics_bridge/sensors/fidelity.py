@@ -73,6 +73,9 @@ class SensorFidelity:
         return out
 
 
+Fidelity = SensorFidelity
+"""Its public name, ``robotics_bridge.sensors.Fidelity``."""
+
 PRESETS: dict[str, SensorFidelity] = {
     "fast": SensorFidelity("sdf", 32, 500),
     "balanced": SensorFidelity("sdf", 64, 2000),

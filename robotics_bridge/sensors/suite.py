@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.state import DIVERGED, HandState
-from robotics_bridge.sensors.probes.sensors import DistanceRuntime
-from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_clock
-from robotics_bridge.sensors.queries.pairs import PairTable
-from robotics_bridge.sensors.queries.solids import Solids
-from robotics_bridge.sensors.sensor import Clock, Context, History, ReadoutSlice, Runtime, Sensor
+from robotics_bridge.sensors.context import Clock, ReadoutSlice, SuiteContext
+from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
+from robotics_bridge.sensors.sensor import QueryRequirements, Sensor
 
 if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.physics.scene import TouchScene
     from robotics_bridge.sensors.fidelity import SensorFidelity
+    from robotics_bridge.sensors.probes.runtime import DistanceRuntime
+    from robotics_bridge.sensors.runtime import Runtime
 
 
 class SensorSuite:
@@ -66,6 +66,10 @@ class SensorSuite:
         resolution: int | None = None,
         fidelity: SensorFidelity | None = None,
     ) -> None:
+        from robotics_bridge.sensors.queries.pairs import PairTable
+        from robotics_bridge.sensors.queries.solids import Solids
+        from robotics_bridge.sensors.runtime import History
+
         wp = warp()
         if fidelity is not None:
             sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
@@ -82,22 +86,24 @@ class SensorSuite:
                 )
             scene.link_index(sensor.link)
             groups.setdefault((type(sensor), sensor.group()), {})[name] = sensor
-        asks = [sensor.asks(scene) for sensor in self.sensors.values()]
-        fields = frozenset().union(*(ask.fields for ask in asks))
-        trees = frozenset().union(*(ask.trees for ask in asks))
+        required = QueryRequirements()
+        for sensor in self.sensors.values():
+            required |= sensor.requirements(scene)
         with wp.ScopedDevice(self.device):
             age = wp.full(num_envs, -1, dtype=wp.int32, device=self.device)
             self.clock = Clock(age, wp.zeros(num_envs, dtype=wp.int32, device=self.device), env_offset)
-            self.solids = Solids(scene, num_envs, self.device, fields=fields, trees=trees, resolution=resolution)
+            self.solids = Solids(scene, num_envs, self.device, required, resolution=resolution)
             self.pairs = PairTable(self.solids, num_envs, self.device)
-            context = Context(scene, num_envs, self.device, seed, self.clock, self.solids, self.pairs)
+            self.context = context = SuiteContext(
+                num_envs, self.device, seed, self.clock, scene, self.solids, self.pairs
+            )
             self.runtimes: list[Runtime] = [kind.build(members, context) for (kind, _group), members in groups.items()]
-            self._owner = {name: runtime for runtime in self.runtimes for name in runtime.places}
+            self._owner = {name: runtime for runtime in self.runtimes for name in runtime.slices}
             self.pairs.freeze()
             self._updates = 0
-            self._counter = wp.zeros(1, dtype=wp.int32, device=self.device)
+            self._counter = context.zeros(1, int)
             self._histories = {
-                name: History(self._place(name), max(sensor.channels, 1), sensor.history, context)
+                name: History(self._slice(name), max(sensor.channels, 1), sensor.history, context)
                 for name, sensor in self.sensors.items()
                 if sensor.history
             }
@@ -145,11 +151,11 @@ class SensorSuite:
 
     def read(self, name: str) -> torch.Tensor:
         """Return the measured reading of a sensor, [B, N] or [B, rows, columns], and channels last; a view."""
-        return self._view(name, self._runtime(name).measured())
+        return self._view(name, self.runtime_of(name).measured())
 
     def read_ground_truth(self, name: str) -> torch.Tensor:
         """Return the reading without noise, in the shape of :meth:`read`; a view."""
-        return self._view(name, self._runtime(name).truth())
+        return self._view(name, self.runtime_of(name).truth())
 
     def read_history(self, name: str) -> torch.Tensor:
         """Return the last measured readings [B, T, N(, C)], oldest first; zeros before the reset. A view.
@@ -157,14 +163,14 @@ class SensorSuite:
         Raises:
             UsageError: the sensor keeps no history.
         """
-        self._runtime(name)
+        self.runtime_of(name)
         if name not in self._histories:
             raise UsageError(f"The sensor {name!r} keeps no history; configure it with history=<readings>.")
         kept = self._histories[name]
         first = self._updates % kept.length
         window = warp().to_torch(kept.ring)[first : first + kept.length]
-        tensor = window.permute(2, 0, 3, 1).unflatten(2, kept.place.layout)
-        return tensor.squeeze(-1) if kept.place.scalar else tensor
+        tensor = window.permute(2, 0, 3, 1).unflatten(2, kept.part.layout)
+        return tensor.squeeze(-1) if kept.part.scalar else tensor
 
     def read_nearest(self, name: str) -> torch.Tensor:
         """Return the nearest surface points [B, N, 3] of a SurfaceDistanceProbe (m, link frame); a view.
@@ -172,12 +178,12 @@ class SensorSuite:
         Raises:
             UsageError: the sensor keeps no nearest points.
         """
-        runtime = self._runtime(name)
-        if not (isinstance(runtime, DistanceRuntime) and getattr(self.sensors[name], "nearest", False)):
+        runtime, sensor = self.runtime_of(name), self.sensors[name]
+        if not (isinstance(sensor, SurfaceDistanceProbe) and sensor.nearest):
             raise UsageError(f"{name!r} keeps no nearest points; it needs SurfaceDistanceProbe(..., nearest=True).")
-        place = runtime.places[name]
-        points = warp().to_torch(runtime.points)[:, :, place.start : place.start + place.count]
-        return points.permute(1, 2, 0).unflatten(1, place.layout)
+        part = runtime.slices[name]
+        points = warp().to_torch(cast("DistanceRuntime", runtime).points)[:, :, part.span]
+        return points.permute(1, 2, 0).unflatten(1, part.layout)
 
     def reset(self, env_ids: Sequence[int] | np.ndarray | torch.Tensor | None = None) -> None:
         """Start a new episode in some environments (all by default): memories are cleared, new errors drawn.
@@ -186,6 +192,8 @@ class SensorSuite:
             UsageError: an environment does not exist.
         """
         import torch
+
+        from robotics_bridge.sensors.queries.kernels.pairs import reset_clock
 
         wp = warp()
         where = wp.device_to_torch(self.device)
@@ -202,8 +210,8 @@ class SensorSuite:
                 if not self.device.is_cuda and bool(((numbers < 0) | (numbers >= self.num_envs)).any()):
                     raise UsageError(f"Environments are 0 to {self.num_envs - 1}; received {numbers.tolist()}.")
                 chosen[numbers] = True
-        inputs = [wp.from_torch(chosen), self.clock.age, self.clock.episode]
-        wp.launch(reset_clock, dim=self.num_envs, inputs=inputs, device=self.device)
+        mask = wp.from_torch(chosen)
+        self.context.launch(reset_clock, self.num_envs, mask, self.clock.age, self.clock.episode)
 
     @property
     def diverged(self) -> torch.Tensor:
@@ -227,7 +235,6 @@ class SensorSuite:
         return {"sensors": sensors, "shared": 8 + self.pairs.state_bytes, "rings": rings, "scratch": scratch}
 
     def _launch(self, state: HandState, dt: float) -> None:
-        wp = warp()
         self.pairs.start(state, self.clock.age)
         self.pairs.update(state)
         for runtime in self.runtimes:
@@ -235,7 +242,9 @@ class SensorSuite:
         for name, history in self._histories.items():
             history.launch(self._owner[name].measured(), self._counter)
         if self._histories:
-            wp.launch(count_update, dim=1, inputs=[self._counter], device=self.device)
+            from robotics_bridge.sensors.queries.kernels.pairs import count_update
+
+            self.context.launch(count_update, 1, self._counter)
 
     def _check(self, state: HandState) -> None:
         wanted = (self.num_envs, len(self.scene.links))
@@ -247,16 +256,26 @@ class SensorSuite:
         if str(state.device) != str(self.device):
             raise UsageError(f"The state lies on {state.device}, the suite on {self.device}; build both on one device.")
 
-    def _runtime(self, name: str) -> Runtime:
-        if name not in self._owner:
-            raise unknown_name("sensor", name, tuple(self._owner))
+    def runtime_of(self, name: str, kind: type[Sensor] = Sensor, what: str = "sensor") -> Runtime:
+        """Return the runtime of a sensor.
+
+        Args:
+            name: of the sensor.
+            kind: class that it must have.
+            what: what such a sensor is called in a message.
+
+        Raises:
+            UsageError: there is no such sensor.
+        """
+        choices = tuple(key for key, sensor in self.sensors.items() if isinstance(sensor, kind))
+        if name not in choices:
+            raise unknown_name(what, name, choices)
         return self._owner[name]
 
-    def _place(self, name: str) -> ReadoutSlice:
-        return self._owner[name].places[name]
+    def _slice(self, name: str) -> ReadoutSlice:
+        return self._owner[name].slices[name]
 
     def _view(self, name: str, planes: Any) -> torch.Tensor:
-        place = self._place(name)
-        tensor = warp().to_torch(planes)[:, :, place.start : place.start + place.count]
-        tensor = tensor.permute(1, 2, 0).unflatten(1, place.layout)
-        return tensor.squeeze(-1) if place.scalar else tensor
+        part = self._slice(name)
+        tensor = warp().to_torch(planes)[:, :, part.span].permute(1, 2, 0).unflatten(1, part.layout)
+        return tensor.squeeze(-1) if part.scalar else tensor

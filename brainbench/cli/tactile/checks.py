@@ -63,7 +63,7 @@ def _force(device: str) -> Result:
 
 def _hysteresis(device: str) -> Result:
     from robotics_bridge.sensors import Noise
-    from robotics_bridge.sensors.noise.model import simulate
+    from robotics_bridge.sensors.noise import simulate
 
     noise = Noise(hysteresis=0.5, hysteresis_tau=0.05)
     return float(simulate(noise, np.full((5, 1, 1, 1), 0.03), dt=0.01, device=device)[-1, 0, 0, 0]), 0.036740, 1e-4
@@ -71,7 +71,7 @@ def _hysteresis(device: str) -> Result:
 
 def _white(device: str) -> Result:
     from robotics_bridge.sensors import Noise
-    from robotics_bridge.sensors.noise.model import simulate
+    from robotics_bridge.sensors.noise import simulate
 
     read = simulate(Noise(white=1.0), np.zeros((50, 16, 64, 6)), dt=0.01, device=device)
     return float(read.std()), 1.0, 0.01

@@ -86,7 +86,7 @@ def time_class(grip: Grip, name: str, resolution: str, placement: str, *, noisy:
         wp.synchronize()
         times.append(time.perf_counter() - start)
     seconds = statistics.median(times[3:])
-    probes = sum(runtime.places[key].count for runtime in suite.runtimes for key in runtime.places)
+    probes = sum(runtime.slices[key].count for runtime in suite.runtimes for key in runtime.slices)
     envs = engine.state.num_envs
     return {
         "sensor": name, "probes": probes, "seconds": seconds, "per_probe_ns": 1e9 * seconds / (probes * envs),

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, cast
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError, unknown_name
-from robotics_bridge.sensors.audio.runtime import ContactAudioRuntime, DriveAudioRuntime
+from brainbench.core.errors import UsageError
+from robotics_bridge.sensors.audio.sensors import AudioSensor
 
 if TYPE_CHECKING:
     import torch
@@ -67,30 +65,21 @@ class Listener:
 
     def __init__(self, microphone: Microphone, suite: SensorSuite) -> None:
         self.microphone, self._suite = microphone, suite
-        found: dict[str, ContactAudioRuntime | DriveAudioRuntime] = {
-            name: runtime
-            for runtime in suite.runtimes
-            if isinstance(runtime, (ContactAudioRuntime, DriveAudioRuntime))
-            for name in runtime.places
-        }
-        for name in microphone.sources:
-            if name not in found:
-                raise unknown_name("source of sound", name, found)
-        self._sources = {name: found[name] for name in microphone.sources or found}
-        lengths = {runtime.samples for runtime in self._sources.values()}
+        found = [name for name, sensor in suite.sensors.items() if isinstance(sensor, AudioSensor)]
+        names = microphone.sources or found
+        self._sources = {name: suite.runtime_of(name, AudioSensor, "source of sound") for name in names}
+        lengths = {cast("AudioSensor", suite.sensors[name]).samples for name in names}
         if len(lengths) != 1:
             raise UsageError(
                 "A microphone needs sources with one length of block; "
                 + (f"these have {sorted(lengths)}." if lengths else "the suite has no source of sound.")
             )
         self.samples = lengths.pop()
-        wp, scene = warp(), suite.scene
+        c, scene = suite.context, suite.scene
         self._link = -1 if microphone.link is None else scene.link_index(microphone.link)
-        links = [scene.link_index(suite.sensors[name].link) for name in self._sources]
-        self._links = wp.array(np.array(links, np.int32), dtype=wp.int32, device=suite.device)
-        shape = (suite.num_envs, len(links))
-        self._now, self._before = (wp.zeros(shape, dtype=wp.float32, device=suite.device) for _ in range(2))
-        self._out = wp.zeros((self.samples, suite.num_envs), dtype=wp.float32, device=suite.device)
+        self._links = c.array([scene.link_index(suite.sensors[name].link) for name in self._sources], int)
+        self._now, self._before = (c.zeros((suite.num_envs, len(self._sources))) for _ in range(2))
+        self._out = c.zeros((self.samples, suite.num_envs))
         self._ring: Any = None
         self._slot = 0
 
@@ -102,28 +91,20 @@ class Listener:
         """
         from robotics_bridge.sensors.audio.kernels import sound as k
 
-        wp, suite, m = warp(), self._suite, self.microphone
-        rate, envs = self.samples / dt, suite.num_envs
+        c, m, envs = self._suite.context, self.microphone, self._suite.num_envs
+        rate, age, block = self.samples / dt, c.clock.age, (self.samples, envs)
         blocks = math.ceil((m.reach / m.speed_of_sound * rate + 3) / self.samples) + 1
         if self._ring is None:
-            shape = (blocks * self.samples, envs, len(self._sources))
-            self._ring = wp.zeros(shape, dtype=wp.float32, device=suite.device)
+            self._ring = c.zeros((blocks * self.samples, envs, len(self._sources)))
         if self._ring.shape[0] != blocks * self.samples:
             raise UsageError(f"The time step of a microphone stays as it was; received another, {dt:g} s.")
-
-        def run(kernel: Any, dim: Any, *inputs: Any) -> None:
-            wp.launch(kernel, dim=dim, inputs=inputs, device=suite.device)
-
         for index, (name, runtime) in enumerate(self._sources.items()):
-            place = runtime.places[name]
-            sound = runtime.truth()
-            run(k.record_source, (self.samples, envs), sound, place.start, place.count, self._slot, index, self._ring)
-        age, place = suite.clock.age, wp.vec3f(*m.position)
-        run(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, self._now, self._before)
-        run(
-            k.mix_sources, (self.samples, envs), self._ring, self._slot, self.samples, rate, m.speed_of_sound, m.nearest,
-            m.power, age, self._now, self._before, self._out,
-        )  # fmt: skip
+            part = runtime.slices[name]
+            c.launch(k.record_source, block, runtime.truth(), part.start, part.count, self._slot, index, self._ring)
+        place, paths = warp().vec3f(*m.position), [self._now, self._before]
+        c.launch(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, *paths)
+        inputs = [self._ring, self._slot, self.samples, rate, m.speed_of_sound, m.nearest, m.power, age]
+        c.launch(k.mix_sources, block, *inputs, *paths, self._out)
         self._slot = (self._slot + self.samples) % self._ring.shape[0]
 
     def read(self) -> torch.Tensor:

@@ -7,10 +7,11 @@ surface (m/s) when its modes come from :func:`robotics_bridge.sensors.audio.mode
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, cast
 
+from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.sensor import Sensor
@@ -18,8 +19,7 @@ from robotics_bridge.sensors.sensor import Sensor
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.sensors.audio.runtime import ContactAudioRuntime, DriveAudioRuntime
-    from robotics_bridge.sensors.sensor import Context
+    from robotics_bridge.sensors.audio.runtime import DriveAudioRuntime
     from robotics_bridge.sensors.suite import SensorSuite
 
 
@@ -58,6 +58,8 @@ class ContactAudio(AudioSensor):
         UsageError: a threshold, strength or contact time is negative or no number.
     """
 
+    runtime: ClassVar[str] = "robotics_bridge.sensors.audio.runtime:ContactAudioRuntime"
+
     modes: Modes
     """Of the link, from ``find_modes`` or by hand."""
     threshold: float = 0.1
@@ -83,13 +85,6 @@ class ContactAudio(AudioSensor):
         """Sensors of equal block and number of modes share one runtime."""
         return (self.samples, (len(self.modes.frequency) + 3) // 4)
 
-    @classmethod
-    def build(cls, sensors: Mapping[str, Self], context: Context) -> ContactAudioRuntime:
-        """Return the runtime that serves these sensors together."""
-        from robotics_bridge.sensors.audio.runtime import ContactAudioRuntime
-
-        return ContactAudioRuntime(sensors, context)
-
 
 @dataclass(frozen=True, kw_only=True)
 class ActuationAudio(AudioSensor):
@@ -101,6 +96,8 @@ class ActuationAudio(AudioSensor):
     Raises:
         UsageError: there is no joint, or a strength, pitch or frequency is negative or no number.
     """
+
+    runtime: ClassVar[str] = "robotics_bridge.sensors.audio.runtime:DriveAudioRuntime"
 
     joints: int
     """J."""
@@ -136,13 +133,6 @@ class ActuationAudio(AudioSensor):
         """Sensors of equal block share one runtime."""
         return self.samples
 
-    @classmethod
-    def build(cls, sensors: Mapping[str, Self], context: Context) -> DriveAudioRuntime:
-        """Return the runtime that serves these sensors together."""
-        from robotics_bridge.sensors.audio.runtime import DriveAudioRuntime
-
-        return DriveAudioRuntime(sensors, context)
-
 
 def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the views [B, J] for torque (N·m) and speed (rad/s) of the joints of an ActuationAudio.
@@ -150,14 +140,6 @@ def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tens
     Raises:
         UsageError: the suite has no such sensor.
     """
-    from brainbench.core.devices import warp
-    from brainbench.core.errors import unknown_name
-    from robotics_bridge.sensors.audio.runtime import DriveAudioRuntime
-
-    served = [runtime for runtime in suite.runtimes if isinstance(runtime, DriveAudioRuntime)]
-    runtime = next((item for item in served if name in item.places), None)
-    if runtime is None:
-        raise unknown_name("actuation sound", name, [key for item in served for key in item.places])
-    place, wp = runtime.places[name], warp()
-    window = slice(place.start, place.start + place.count)
+    runtime = cast("DriveAudioRuntime", suite.runtime_of(name, ActuationAudio, "actuation sound"))
+    window, wp = runtime.slices[name].span, warp()
     return wp.to_torch(runtime.effort)[:, window], wp.to_torch(runtime.speed)[:, window]

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import read_json, to_plain, write_json
@@ -21,7 +19,6 @@ from brainbench.core.files import read_json, to_plain, write_json
 if TYPE_CHECKING:
     import os
 
-    from numpy.typing import ArrayLike, NDArray
 
 BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
 """Knobs of every sensor (table 4.2)."""
@@ -112,26 +109,6 @@ class Noise:
         """Whether the measured reading can differ from the truth."""
         return bool(self.set_knobs)
 
-    @property
-    def stores_hysteresis(self) -> bool:
-        """Whether one number per channel is kept for the hysteresis."""
-        return self.hysteresis != 0
-
-    @property
-    def stores_walk(self) -> bool:
-        """Whether one number per channel is kept for the drift."""
-        return self.walk > 0
-
-    @property
-    def delays(self) -> bool:
-        """Whether readings are late."""
-        return self.read_delay > 0
-
-    @property
-    def crosstalks(self) -> bool:
-        """Whether neighbours mix."""
-        return self.crosstalk > 0
-
     def check(self, knobs: frozenset[str], sensor: str) -> None:
         """Refuse knobs that a sensor does not have (table 4.2).
 
@@ -214,69 +191,3 @@ for _alias, _name in {"agg_bool": "bool", "agg_force": "depth", "force_torque": 
 def stream_seed(seed: int, name: str) -> int:
     """Return the 64-bit seed of one sensor: a stable hash of the experiment's seed and the sensor's name."""
     return int.from_bytes(hashlib.sha256(f"{seed}:{name}".encode()).digest()[:8], "little")
-
-
-@dataclass
-class _Clock:
-    age: Any
-    episode: Any
-    env_offset: int
-
-
-@dataclass
-class _Context:
-    clock: _Clock
-    device: Any
-    seed: int
-
-
-def simulate(
-    noise: Noise,
-    clean: ArrayLike,
-    *,
-    dt: float,
-    seed: int = 0,
-    layout: tuple[int, ...] | None = None,
-    name: str = "sensor",
-    device: str = "cpu",
-    env_offset: int = 0,
-) -> NDArray[np.float32]:
-    """Return what a sensor with this noise measures of a recorded clean signal.
-
-    The error of the sensing radius needs the geometry and is left out.
-
-    Args:
-        noise: Knobs.
-        clean: [T, B, N, C] signal [unit of the sensor].
-        dt: Time step [s].
-        seed: Seed of the experiment.
-        layout: (ny, nx) where crosstalk is wanted.
-        name: Name of the sensor.
-        device: ``cpu`` or ``cuda``.
-        env_offset: Number of the first environment in the whole experiment.
-
-    Raises:
-        UsageError: the signal has not four axes.
-    """
-    from brainbench.core.devices import pick_device, warp
-    from robotics_bridge.sensors.noise.stages import DelayLine, NoisePart, NoiseStage
-
-    signal = np.asarray(clean, dtype=np.float32)
-    if signal.ndim != 4:
-        raise UsageError(f"A recorded signal has axes [time, environment, probe, channel]; received {signal.shape}.")
-    wp, where = warp(), pick_device(device)
-    _steps, envs, probes, channels = signal.shape
-    clock = _Clock(*(wp.zeros(envs, dtype=wp.int32, device=where) for _ in range(2)), env_offset=env_offset)
-    context = _Context(clock, where, seed)
-    parts = [NoisePart(name, replace(noise, radius=0.0), 0, layout or (probes,))]
-    stage = NoiseStage(parts, channels, envs, context, gained=False)
-    line = DelayLine(parts, channels, envs, context) if noise.delays else None
-    measured = wp.zeros((channels, envs, probes), dtype=wp.float32, device=where)
-    out = np.empty_like(signal)
-    for step, frame in enumerate(signal):
-        clock.age.fill_(step)
-        stage.launch(wp.array(np.ascontiguousarray(frame.transpose(2, 0, 1)), device=where), measured, dt)
-        if line:
-            line.launch(measured, dt)
-        out[step] = (line.out if line else measured).numpy().transpose(1, 2, 0)
-    return out

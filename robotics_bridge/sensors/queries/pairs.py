@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.devices import warp
+from brainbench.core.devices import to_struct, warp
 from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
 
 if TYPE_CHECKING:
@@ -78,44 +78,40 @@ class PairTable:
 
     def freeze(self) -> None:
         """Make the arrays."""
-        wp, device, slots = warp(), self._device, self._slots
+        wp, device, slots, envs = warp(), self._device, self._slots, self._num_envs
         # Contacts of one link with many geometries at once are rare; all of a short list always fit.
         self._rooms = [max(1, min(len(s["members"]), _LISTED) if s["contact"] else len(s["members"])) for s in slots]
         self._words = max([1, *(-(-len(s["members"]) // 32) for s in slots)])
-        count = len(slots)
-        geometries = self._solids.kinds.shape[1]
-        place = np.full((max(count, 1), geometries), -1, np.int32)
+        count = max(len(slots), 1)
+        place = np.full((count, self._solids.kinds.shape[1]), -1)
         for number, slot in enumerate(slots):
             place[number, list(slot["members"])] = np.arange(len(slot["members"]))
-
-        def ints(values: Any) -> Any:
-            return wp.array(np.asarray(values, dtype=np.int32).reshape(-1), dtype=wp.int32, device=device)
-
-        plan = SlotArrays()
-        plan.link, plan.contact = ints([s["link"] for s in slots]), ints([int(s["contact"]) for s in slots])
         # The link of every geometry whose contacts matter, to turn the others away at once.
         links = self._solids.scene.link_of if self._solids.scene.geometries else np.full(1, -1)
-        plan.watched = ints(np.where(np.isin(links, [s["link"] for s in slots if s["contact"]]), links, -1))
         first = np.cumsum([0, *self._rooms])
-        plan.first, plan.room = ints(first), ints(self._rooms)
-        plan.members = ints([m for s in slots for m in s["members"]] or [0])
-        plan.member_first = ints(np.cumsum([0, *(len(s["members"]) for s in slots)]))
-        plan.place = wp.array(place, dtype=wp.int32, device=device)
-        centers = np.array([s["center"] for s in slots], np.float32).reshape(-1, 3)
-        plan.center = wp.array(centers, dtype=wp.vec3f, device=device)
-        plan.reach = wp.array(np.array([s["reach"] for s in slots], np.float32), dtype=wp.float32, device=device)
-        self.plan = plan
-        shape = (self._num_envs, max(int(first[-1]), 1))
+        plan = {
+            "link": [s["link"] for s in slots],
+            "watched": np.where(np.isin(links, [s["link"] for s in slots if s["contact"]]), links, -1),
+            "contact": [int(s["contact"]) for s in slots],
+            "first": first,
+            "room": self._rooms,
+            "members": [m for s in slots for m in s["members"]],
+            "member_first": np.cumsum([0, *(len(s["members"]) for s in slots)]),
+            "place": place,
+            "center": np.reshape([s["center"] for s in slots], (-1, 3)),
+            "reach": [s["reach"] for s in slots],
+        }
+        self.plan = to_struct(SlotArrays, {name: np.asarray(values) for name, values in plan.items()}, device)
+        listed = (envs, max(int(first[-1]), 1))
         found = PairArrays()
-        found.first = plan.first
-        found.count = wp.zeros((self._num_envs, max(count, 1)), dtype=wp.int32, device=device)
-        found.geometry = wp.zeros(shape, dtype=wp.int32, device=device)
-        found.rotation = wp.zeros(shape, dtype=wp.mat33f, device=device)
+        found.first, found.count = self.plan.first, wp.zeros((envs, count), dtype=int, device=device)
+        found.geometry = wp.zeros(listed, dtype=int, device=device)
+        found.rotation = wp.zeros(listed, dtype=wp.mat33f, device=device)
         for name in ("offset", "velocity", "spin"):
-            setattr(found, name, wp.zeros(shape, dtype=wp.vec3f, device=device))
+            setattr(found, name, wp.zeros(listed, dtype=wp.vec3f, device=device))
         self.struct = found
-        self._bits = wp.zeros((self._num_envs, max(count, 1) * self._words), dtype=wp.int32, device=device)
-        self.crowded = wp.zeros(self._num_envs, dtype=wp.int32, device=device)
+        self._bits = wp.zeros((envs, count * self._words), dtype=int, device=device)
+        self.crowded = wp.zeros(envs, dtype=int, device=device)
 
     def start(self, state: HandState, age: Any) -> None:
         """Count an update, refresh the state's status and mark contacts."""

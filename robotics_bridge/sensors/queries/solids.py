@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.devices import warp
+from brainbench.core.devices import to_struct
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.scene import KINDS, Geometry
 from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from brainbench.geometry import Mesh
     from robotics_bridge.physics.scene import TouchScene
+    from robotics_bridge.sensors.sensor import QueryRequirements
 
 _UNBOUNDED = 1.0e6
 
@@ -75,8 +76,7 @@ class Solids:
         scene: what there is.
         num_envs: B; geometries that differ between environments take one row each.
         device: where.
-        fields: numbers of geometries whose distance is asked for (meshes among them get a sampled field).
-        trees: numbers of geometries whose triangles are asked for.
+        required: geometries whose distances or triangles are asked for.
         resolution: of the fields.
     """
 
@@ -85,18 +85,12 @@ class Solids:
         scene: TouchScene,
         num_envs: int,
         device: Any,
+        required: QueryRequirements,
         *,
-        fields: Iterable[int] = (),
-        trees: Iterable[int] = (),
         resolution: int = 64,
     ) -> None:
-        wp = warp()
         self.scene, self.device = scene, device
         self.rows = num_envs if scene.variants else 1
-        self.field_count = 0
-        """Distance fields on the device."""
-        self.tree_count = 0
-        """Triangle trees on the device."""
         count = max(len(scene.geometries), 1)
         shape = (self.rows, count)
         self.kinds = np.full(shape, OTHER, dtype=np.int32)
@@ -104,40 +98,40 @@ class Solids:
         frame = np.zeros((*shape, 7), np.float32)
         frame[..., 6] = 1
         field, mesh = np.full(shape, -1, np.int32), np.zeros(shape, np.uint64)
-        wanted, treed = set(fields), set(trees)
-        found: dict[str, int] = {}
-        self._fields: list[Field] = []
+        self._fields: dict[str, Field] = {}
         self._trees: dict[str, Any] = {}
         for index in range(len(scene.geometries)):
             seen: dict[int, tuple] = {}
             for row in range(self.rows if index in scene.variants else 1):
                 geometry = scene.geometry_in(row, index)
                 if id(geometry) not in seen:
-                    seen[id(geometry)] = self._describe(geometry, index in wanted, index in treed, found, resolution)
+                    asked = (index in required.fields, index in required.trees)
+                    seen[id(geometry)] = self._describe(geometry, *asked, resolution)
                 rows = row if index in scene.variants else slice(None)
                 described = seen[id(geometry)]
                 self.kinds[rows, index], size[rows, index], bound[rows, index] = described[:3]
                 frame[rows, index], field[rows, index], mesh[rows, index] = described[3:]
         self.field_count, self.tree_count = len(self._fields), len(self._trees)
-        s = SolidArrays()
-        s.kind = wp.array(self.kinds, dtype=wp.int32, device=device)
-        s.size = wp.array(size, dtype=wp.vec3f, device=device)
-        s.frame = wp.array(frame, dtype=wp.transformf, device=device)
-        s.bound = wp.array(bound, dtype=wp.vec4f, device=device)
-        links = scene.link_of if scene.geometries else np.zeros(1, np.int32)
-        s.link = wp.array(links, dtype=wp.int32, device=device)
-        s.field = wp.array(field, dtype=wp.int32, device=device)
-        s.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
-        volumes = self._fields or [Field(np.zeros((2, 2, 2), np.float32), np.zeros(3, np.float32), 1.0)]
+        """Distance fields and triangle trees on the device."""
+        volumes = list(self._fields.values()) or [Field(np.zeros((2, 2, 2), np.float32), np.zeros(3, np.float32), 1.0)]
         starts = np.cumsum([0, *(v.values.size for v in volumes)])
         if starts[-1] >= 2**31:
             raise UsageError("The distance fields hold more than 2³¹ samples together; lower the resolution.")
-        s.first = wp.array(starts[:-1].astype(np.int32), dtype=wp.int32, device=device)
-        s.counts = wp.array(np.array([v.values.shape for v in volumes], np.int32), dtype=wp.vec3i, device=device)
-        s.origin = wp.array(np.array([v.origin for v in volumes], np.float32), dtype=wp.vec3f, device=device)
-        s.spacing = wp.array(np.array([v.spacing for v in volumes], np.float32), dtype=wp.float32, device=device)
-        s.values = wp.array(np.concatenate([v.values.ravel() for v in volumes]), dtype=wp.float32, device=device)
-        self.struct: Any = s
+        arrays = {
+            "kind": self.kinds,
+            "size": size,
+            "frame": frame,
+            "bound": bound,
+            "link": scene.link_of,
+            "field": field,
+            "mesh": mesh,
+            "first": starts[:-1],
+            "counts": [v.values.shape for v in volumes],
+            "origin": [v.origin for v in volumes],
+            "spacing": [v.spacing for v in volumes],
+            "values": np.concatenate([v.values.ravel() for v in volumes]),
+        }
+        self.struct: Any = to_struct(SolidArrays, {k: np.asarray(v) for k, v in arrays.items()}, device)
         """The Warp structure that kernels take."""
 
     def kinds_of(self, geometries: Iterable[int]) -> frozenset[int]:
@@ -156,27 +150,20 @@ class Solids:
             )
         return kinds
 
-    def _describe(self, geometry: Geometry, field: bool, tree: bool, found: dict[str, int], resolution: int) -> tuple:
+    def _describe(self, geometry: Geometry, field: bool, tree: bool, resolution: int) -> tuple:
+        """Return kind, size, bounding sphere, frame, number of the distance field and id of the tree."""
         number, mesh = -1, 0
         if field and geometry.mesh is not None:
             key = geometry.mesh.content_hash
-            if key not in found:
-                found[key] = len(self._fields)
-                self._fields.append(sample_field(geometry.mesh, resolution, self.device))
-            number = found[key]
+            if key not in self._fields:
+                self._fields[key] = sample_field(geometry.mesh, resolution, self.device)
+            number = list(self._fields).index(key)
         if tree and geometry.kind not in ("plane", "other"):
             surface = tessellate(geometry)
             key = surface.content_hash
             if key not in self._trees:
                 self._trees[key] = mesh_tree(surface, self.device)
             mesh = self._trees[key].id
-        w, x, y, z = geometry.quaternion
-        size = np.array([*geometry.size, 0.0, 0.0, 0.0][:3], np.float32)
-        return (
-            KINDS.index(geometry.kind),
-            size,
-            bounding_sphere(geometry),
-            (*geometry.position, x, y, z, w),
-            number,
-            mesh,
-        )
+        size, (w, x, y, z) = [*geometry.size, 0.0, 0.0, 0.0][:3], geometry.quaternion
+        frame = (*geometry.position, x, y, z, w)
+        return KINDS.index(geometry.kind), size, bounding_sphere(geometry), frame, number, mesh

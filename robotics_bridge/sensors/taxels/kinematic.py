@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
-import numpy as np
-
-from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.sensors.noise.model import GRID_KNOBS
-from robotics_bridge.sensors.sensor import Convention, ProbeRuntime, QuerySensor, probe_rows
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.sensor import Context
+from robotics_bridge.sensors.sensor import Convention, QuerySensor
 
 CONVENTIONS = ("physical", "thesis")
 
@@ -59,6 +52,7 @@ class KinematicTaxel(QuerySensor):
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
     knobs: ClassVar[frozenset[str]] = GRID_KNOBS
+    runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:KinematicRuntime"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,79 +63,5 @@ class KinematicTaxel(QuerySensor):
             raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
 
     def group(self) -> Hashable:
-        """Sensors of one class and equal group share one runtime and its kernels."""
+        """Return what decides which kernels run."""
         return (self.query, self.convention, self.total)
-
-    @classmethod
-    def build(cls, sensors: Mapping[str, Self], context: Context) -> KinematicRuntime:
-        """Return the runtime that serves these sensors together."""
-        return KinematicRuntime(sensors, context)
-
-
-class KinematicRuntime(ProbeRuntime):
-    """Serves kinematic taxels.
-
-    Args:
-        sensors: Of one group, by name; those of a group share what decides which kernels run.
-        context: Of the suite: scene, environments, device, clock and geometries.
-    """
-
-    def __init__(self, sensors: Mapping[str, KinematicTaxel], context: Context) -> None:
-        from robotics_bridge.sensors.probes.kernels.probe import KinematicParams
-
-        first = next(iter(sensors.values()))
-        scaled = first.total == "engine"
-        super().__init__(sensors, 6, context, fusable=not scaled)
-        self._options = (first.query == "raycast", first.convention == "physical")
-        laws = []
-        for sensor in sensors.values():
-            law = KinematicParams()
-            for name in ("stiffness", "damping", "exponent", "shear", "twist"):
-                setattr(law, name, getattr(sensor, name))
-            laws.append(law)
-        wp = warp()
-        self._laws = wp.array(laws, dtype=KinematicParams, device=context.device)
-        self._loads: Any = (
-            wp.zeros((len(laws), context.num_envs), dtype=wp.vec3f, device=context.device) if scaled else None
-        )
-        self._scales = wp.zeros((len(laws), context.num_envs), dtype=wp.float32, device=context.device)
-        slots = self.probes.slot.numpy()
-        spans = np.array([(p.start, p.start + p.count, slots[p.start]) for p in self.places.values()], np.int32)
-        self._spans = wp.array(spans, dtype=wp.vec3i, device=context.device)
-        self._rows = wp.array(
-            probe_rows(self.places.values(), context, self.mode), dtype=wp.vec4i, device=context.device
-        )
-
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state."""
-        from robotics_bridge.sensors.probes.kernels.probe import kinematic_kernel
-
-        self.begin(state, dt)
-        kernel = kinematic_kernel(self.kinds, *self._options, self.mode, *self.stores, self.context.device.is_cuda)
-        c = self.context
-        inputs = [self.probes, self._rows, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._laws]
-        warp().launch(kernel, dim=(c.num_envs, self._rows.shape[0]), inputs=inputs, device=c.device)
-        if self._loads is not None:
-            self._scale(state)
-        self.finish(dt)
-
-    def _scale(self, state: HandState) -> None:
-        """Make the field push as the engine does."""
-        from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
-
-        wp, c = warp(), self.context
-        dim, device = self._loads.shape, c.device
-        self._loads.zero_()
-        contacts = [
-            state.contact_count,
-            state.contact_geom,
-            state.contact_env,
-            state.contact_normal,
-            state.contact_force,
-        ]
-        inputs = [self._spans, c.pairs.plan, c.solids.struct.link, *contacts, self._loads]
-        wp.launch(gather_loads, dim=state.contact_env.shape[0], inputs=inputs, device=device)
-        inputs = [self._spans, c.pairs.plan, state.pose, self._truth, self._loads, self._scales]
-        wp.launch(weigh_field, dim=dim, inputs=inputs, device=device)
-        inputs = [self.probes.part, self._scales, self._truth, self._measured, int(self.noisy)]
-        self.launch(scale_field, *inputs)

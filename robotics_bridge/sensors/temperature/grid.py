@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robotics_bridge.physics.scene import Geometry, TouchScene
-    from robotics_bridge.sensors.sensor import Context
     from robotics_bridge.sensors.suite import SensorSuite
     from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
 
@@ -78,6 +77,7 @@ class TemperatureGrid(Sensor):
     """How far below it [K]; skin reads farther down than up."""
 
     units: ClassVar[str] = "degC"
+    runtime: ClassVar[str] = "robotics_bridge.sensors.temperature.runtime:TemperatureRuntime"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -110,13 +110,6 @@ class TemperatureGrid(Sensor):
         """Grids that think alike of other links share one runtime."""
         return (tuple(sorted(self.bodies.items(), key=lambda item: item[0])), self.other)
 
-    @classmethod
-    def build(cls, sensors: Mapping[str, Self], context: Context) -> TemperatureRuntime:
-        """Return the runtime that serves these sensors together."""
-        from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
-
-        return TemperatureRuntime(sensors, context)
-
     def corners(self, scene: TouchScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and upper corner of the grid [3] (m, link frame)."""
         if self.low is not None and self.high is not None:
@@ -138,7 +131,7 @@ def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
     Raises:
         UsageError: the suite has no such temperature grid.
     """
-    return warp().to_torch(_runtime(suite, name).link_temperature)
+    return warp().to_torch(_runtime_of(suite, name).link_temperature)
 
 
 def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
@@ -149,19 +142,13 @@ def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
     """
     from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY
 
-    runtime = _runtime(suite, name)
-    column = list(runtime.places).index(name)
+    runtime = _runtime_of(suite, name)
+    column = list(runtime.slices).index(name)
     return (warp().to_torch(runtime.found_contacts)[:, column] - CAPACITY).clamp(min=0)
 
 
-def _runtime(suite: SensorSuite, name: str) -> TemperatureRuntime:
-    from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
-
-    served = [runtime for runtime in suite.runtimes if isinstance(runtime, TemperatureRuntime)]
-    for runtime in served:
-        if name in runtime.places:
-            return runtime
-    raise unknown_name("temperature grid", name, [key for runtime in served for key in runtime.places])
+def _runtime_of(suite: SensorSuite, name: str) -> TemperatureRuntime:
+    return cast("TemperatureRuntime", suite.runtime_of(name, TemperatureGrid, "temperature grid"))
 
 
 def _bounds(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,56 +9,60 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.sensor import ReadoutRuntime
+from robotics_bridge.sensors.runtime import ReadoutRuntime
+from robotics_bridge.sensors.temperature.kernels.heat import (
+    CAPACITY,
+    ThermalParams,
+    collect_contacts,
+    conduct_contacts,
+    diffuse_heat,
+    exchange_heat,
+    sense_temperature,
+)
 from robotics_bridge.sensors.temperature.materials import ThermalBody, material
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.sensor import Context
+    from robotics_bridge.sensors.context import SuiteContext
     from robotics_bridge.sensors.temperature.grid import TemperatureGrid
+
+
+wp = warp()
 
 
 class TemperatureRuntime(ReadoutRuntime):
     """Serves temperature grids."""
 
-    def __init__(self, sensors: Mapping[str, TemperatureGrid], context: Context) -> None:
-        from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY, ThermalParams
-
+    def __init__(self, sensors: Mapping[str, TemperatureGrid], context: SuiteContext) -> None:
         super().__init__(sensors, 1, context, fusable=False)
-        wp, device, scene = warp(), context.device, context.scene
+        scene = context.scene
         self._sensors = list(sensors.values())
         self._edges: list[NDArray[np.float64]] = []
-        structures, part, exposed, source = [], [], [], []
-        for number, (sensor, place) in enumerate(zip(self._sensors, self.places.values(), strict=True)):
+        structures, exposed, source = [], [], []
+        for sensor, place in zip(self._sensors, self.slices.values(), strict=True):
             structures.append(self._structure(sensor, place.start))
-            part.append(np.full(place.count, number))
-            exposed.append(_exposed(sensor.cells, self._edges[number]).ravel())
-            watts = np.broadcast_to(np.asarray(sensor.source, float), sensor.cells) * self._edges[number].prod()
-            source.append(watts.ravel())
-
-        def floats(values: ArrayLike) -> Any:
-            return wp.array(np.asarray(values, np.float32), dtype=wp.float32, device=device)
-
-        self._structures = wp.array(structures, dtype=ThermalParams, device=device)
-        self._part = wp.array(np.concatenate(part).astype(np.int32), dtype=wp.int32, device=device)
-        self._exposed, self._source = floats(np.concatenate(exposed)), floats(np.concatenate(source))
-        self._link_of = wp.array(scene.link_of.astype(np.int32), dtype=wp.int32, device=device)
+            edges = self._edges[-1]
+            exposed.append(_exposed(sensor.cells, edges).ravel())
+            source.append((np.broadcast_to(np.asarray(sensor.source, float), sensor.cells) * edges.prod()).ravel())
+        self._structures = context.array(structures, ThermalParams)
+        self._exposed = context.array(np.concatenate(exposed), float)
+        self._source = context.array(np.concatenate(source), float)
         links = [_body(self._sensors, name) for name in scene.links]
         materials = [material(body.material) for body in links]
-        self._conductivity = floats([item.conductivity for item in materials])
-        self._diffusivity = floats([item.diffusivity for item in materials])
-        self.link_temperature = floats(np.tile([body.temperature for body in links], (context.num_envs, 1)))
+        self._conductivity = context.array([item.conductivity for item in materials], float)
+        self._diffusivity = context.array([item.diffusivity for item in materials], float)
+        temperatures = np.tile([body.temperature for body in links], (context.num_envs, 1))
+        self.link_temperature = context.array(temperatures, float)
         """Warp array [B, L] (°C) of the bodies that may be touched."""
-        shape = (context.num_envs, self.count)
-        many = (context.num_envs, len(structures))
-        self.found_contacts = wp.zeros(many, dtype=wp.int32, device=device)
+        shape, many = (context.num_envs, self.count), (context.num_envs, len(structures))
+        self.found_contacts = context.zeros(many, int)
         """Warp array [B, S]: contacts of each grid at the last update."""
-        self._kept = wp.zeros((*many, CAPACITY), dtype=wp.int32, device=device)
-        fields = [wp.zeros(shape, dtype=wp.float64, device=device) for _ in range(4)]
-        self._field, self._first, self._second, self._element = fields
-        self._touched, self._g, self._inflow = (wp.zeros(shape, dtype=wp.float32, device=device) for _ in range(3))
+        self._kept = context.zeros((*many, CAPACITY), int)
+        self.field, self._first, self._second, self._element = (context.zeros(shape, wp.float64) for _ in range(4))
+        """Warp array [B, N]: temperature of every cell (°C)."""
+        self._touched, self._g, self._inflow = (context.zeros(shape) for _ in range(3))
         self._axes = [axis for axis in range(3) if any(sensor.cells[axis] > 1 for sensor in self._sensors)]
         if not self.noisy and any(_lags(sensor) for sensor in self._sensors):
             self._measured = wp.zeros_like(self._truth)
@@ -69,9 +73,7 @@ class TemperatureRuntime(ReadoutRuntime):
         low, high = sensor.corners(self.context.scene)
         edges = (high - low) / np.array(sensor.cells)
         self._edges.append(edges)
-        from robotics_bridge.sensors.temperature.kernels.heat import ThermalParams
-
-        own, wp = material(sensor.material), warp()
+        own = material(sensor.material)
         item = ThermalParams()
         item.link, item.first = self.context.scene.link_index(sensor.link), first
         item.shape, item.low, item.cell = wp.vec3i(*sensor.cells), wp.vec3f(*low), wp.vec3f(*edges)
@@ -94,7 +96,6 @@ class TemperatureRuntime(ReadoutRuntime):
         """Exponentiate the diffusion of every axis for a time step (s)."""
         if dt == self._dt:
             return
-        wp, device = warp(), self.context.device
         matrices, offsets, start = [], [], 0
         for sensor, edges in zip(self._sensors, self._edges, strict=True):
             row = []
@@ -106,8 +107,7 @@ class TemperatureRuntime(ReadoutRuntime):
             offsets.append(row)
         values = np.concatenate(matrices).astype(np.float32)
         if math.isnan(self._dt):
-            self._matrix = wp.array(values, dtype=wp.float32, device=device)
-            self._offset = wp.array(np.array(offsets, np.int32), dtype=wp.int32, device=device)
+            self._matrix, self._offset = self.context.array(values, float), self.context.array(offsets, int)
         else:
             self._matrix.assign(values)
         self._dt = dt
@@ -115,45 +115,30 @@ class TemperatureRuntime(ReadoutRuntime):
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; a new time step re-computes the diffusion matrices first."""
         self._set_step(dt)
-        from robotics_bridge.sensors.temperature.kernels import heat as k
-
-        wp, c = warp(), self.context
-        cells = (c.num_envs, self.count)
-
-        def run(kernel: Any, dim: Any, *inputs: Any) -> None:
-            wp.launch(kernel, dim=dim, inputs=inputs, device=c.device)
-
+        c, age = self.context, self.context.clock.age
+        cells, grids = (c.num_envs, self.count), self._structures
+        lists = [c.solids.struct.link, grids, self.found_contacts, self._kept]
         self.found_contacts.zero_()
-        run(
-            k.collect_contacts, state.contact_env.shape[0], state.contact_count, state.contact_env, state.contact_geom,
-            self._link_of, self._structures, self.found_contacts, self._kept,
+        contacts = [state.contact_count, state.contact_env, state.contact_geom]
+        c.launch(collect_contacts, state.contact_env.shape[0], *contacts, *lists)
+        c.launch(
+            conduct_contacts, self._kept.shape, state.contact_geom, state.contact_distance, state.contact_position,
+            state.contact_normal, *lists, state.status, state.pose, self._conductivity, self._diffusivity,
+            self.link_temperature, self._touched, dt, self._g, self._inflow,
         )  # fmt: skip
-        run(
-            k.conduct_contacts, self._kept.shape, state.contact_geom, state.contact_distance, state.contact_position,
-            state.contact_normal, self._link_of, self._structures, self.found_contacts, self._kept, state.status,
-            state.pose, self._conductivity, self._diffusivity, self.link_temperature, self._touched, dt, self._g,
-            self._inflow,
-        )  # fmt: skip
-        age = c.clock.age
-        run(
-            k.exchange_heat, cells, self._structures, self._part, self._exposed, self._source, age, state.status, dt,
-            self._g, self._inflow, self._touched, self._field, self._first,
-        )  # fmt: skip
+        inputs = [grids, self.part, self._exposed, self._source, age, state.status, dt, self._g, self._inflow]
+        c.launch(exchange_heat, cells, *inputs, self._touched, self.field, self._first)
         now, spare = self._first, self._second
         for axis in self._axes:
-            run(k.diffuse_heat, cells, axis, self._structures, self._part, self._offset, self._matrix, now, spare)
+            c.launch(diffuse_heat, cells, axis, grids, self.part, self._offset, self._matrix, now, spare)
             now, spare = spare, now
-        run(
-            k.sense_temperature, cells, self._structures, self._part, age, state.status, dt, now, self._field, self._element,
-            self._truth, self._measured,
-        )  # fmt: skip
+        inputs = [grids, self.part, age, state.status, dt, now, self.field, self._element]
+        c.launch(sense_temperature, cells, *inputs, self._truth, self._measured)
         self.finish(dt)
 
     @property
     def state_bytes(self) -> int:
         """Lasting memory per environment [bytes]."""
-        from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY
-
         lists = len(self._sensors) * (1 + CAPACITY) * 4 + 4 * self.link_temperature.shape[1]
         return super().state_bytes + (4 * 8 + 3 * 4) * self.count + lists
 

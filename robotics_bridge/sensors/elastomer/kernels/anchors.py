@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.elastomer.kernels.dilation import GelParams
+from robotics_bridge.sensors.elastomer.kernels.dilation import ElastomerArrays, GelParams, mark_of
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 from robotics_bridge.sensors.queries.kernels.distance import FAR, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
@@ -48,20 +48,11 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
 
     @wp.kernel(module="unique")
     def anchors(
-        gels: wp.array(dtype=GelParams),
-        own: wp.array(dtype=wp.int32),
-        tracked: wp.array(dtype=wp.int32),
+        pads: ElastomerArrays,
         solids: SolidArrays,
         pairs: PairArrays,
         cloud: CloudArrays,
         io: ReadoutArrays,
-        blocks: int,
-        anchor: wp.array3d(dtype=wp.float32),
-        held: wp.array2d(dtype=wp.int32),
-        moved: wp.array2d(dtype=wp.int32),
-        dragged: wp.array2d(dtype=wp.int32),
-        drive: wp.array2d(dtype=wp.float32),
-        order: wp.array2d(dtype=wp.uint8),
     ):
         i, j = wp.tid()
         env = i
@@ -69,30 +60,30 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
         if wp.static(side_by_side):
             env = j
             store = i
-        part = store // blocks
-        gel = gels[part]
-        had = held[store, env]
+        part = store // pads.blocks
+        gel = pads.gels[part]
+        had = pads.held[store, env]
         if io.age[env] == 0:
             had = 0
-        moved[store, env] = 0
+        pads.moved[store, env] = 0
         count = pairs.count[env, gel.slot]
         row = env % cloud.first.shape[0]
         # Which geometry the block belongs to, counted through those that are tracked.
-        block = store - part * blocks
+        block = store - part * pads.blocks
         geometry = int(-1)
-        for member in range(tracked.shape[0]):
+        for member in range(pads.tracked.shape[0]):
             if geometry < 0:
-                if block < cloud.blocks[row, tracked[member]]:
-                    geometry = tracked[member]
+                if block < cloud.blocks[row, pads.tracked[member]]:
+                    geometry = pads.tracked[member]
                 else:
-                    block -= cloud.blocks[row, tracked[member]]
+                    block -= cloud.blocks[row, pads.tracked[member]]
         at = int(-1)
         if geometry >= 0:
             for k in range(count):
                 if pairs.geometry[env, pairs.first[gel.slot] + k] == geometry:
                     at = pairs.first[gel.slot] + k
         if at < 0 or (io.status[env] & 1) != 0:
-            held[store, env] = 0
+            pads.held[store, env] = 0
             return
         rotation = wp.transpose(pairs.rotation[env, at])
         offset = pairs.offset[env, at]
@@ -100,8 +91,8 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
         sphere = cloud.sphere[first]
         solid_row = env % solids.kind.shape[0]
         middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
-        if height_over(solids, own, gel, solid_row, middle) - sphere[3] > gel.leave:
-            held[store, env] = 0
+        if height_over(solids, pads.own, gel, solid_row, middle) - sphere[3] > gel.leave:
+            pads.held[store, env] = 0
             return
         found = int(0)
         holds = int(0)
@@ -113,7 +104,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
         if wp.static(hoisted):
             alone = gel.own_last - gel.own_first == 1
             if alone:
-                pad = own[gel.own_first]
+                pad = pads.own[gel.own_first]
                 frame = wp.transform_inverse(solids.frame[solid_row, pad])
                 turn = wp.quat_to_matrix(wp.transform_get_rotation(frame)) @ rotation
                 shift = wp.transform_get_translation(frame) - turn @ offset
@@ -126,35 +117,35 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
             if not wp.isnan(p[0]):
                 kept = wp.static(float("nan"))
                 if had > 0:
-                    kept = anchor[index, 0, env]
+                    kept = pads.anchor[index, 0, env]
                 z = rotation @ (p - offset)
                 phi = float(0.0)
                 if wp.static(not hoisted):
-                    phi = height_over(solids, own, gel, solid_row, z)
+                    phi = height_over(solids, pads.own, gel, solid_row, z)
                 elif alone:
                     phi = distance_to(solids.values, shape, turn @ p + shift, limit)[3]
                 else:
-                    phi = height_over(solids, own, gel, solid_row, z)
+                    phi = height_over(solids, pads.own, gel, solid_row, z)
                 if wp.isnan(kept):
                     if phi < -gel.enter:
                         kept = z[0]
-                        anchor[index, 1, env] = z[1]
-                        anchor[index, 2, env] = z[2]
+                        pads.anchor[index, 1, env] = z[1]
+                        pads.anchor[index, 2, env] = z[2]
                 elif phi > gel.leave:
                     kept = wp.static(float("nan"))
-                anchor[index, 0, env] = kept
+                pads.anchor[index, 0, env] = kept
                 if not wp.isnan(kept):
-                    way = z - wp.vec3f(kept, anchor[index, 1, env], anchor[index, 2, env])
+                    way = z - wp.vec3f(kept, pads.anchor[index, 1, env], pads.anchor[index, 2, env])
                     if wp.length_sq(way) > 0.0:
                         strength = gel.shear * wp.max(-phi, 0.0)
                     holds += 1
             if strength > 0.0:
-                drive[store * wp.static(BLOCK) + found, env] = strength
-                order[store * wp.static(BLOCK) + found, env] = wp.uint8(n)
+                pads.drive[store * wp.static(BLOCK) + found, env] = strength
+                pads.order[store * wp.static(BLOCK) + found, env] = wp.uint8(n)
                 found += 1
-        held[store, env] = holds
+        pads.held[store, env] = holds
         if found > 0:
-            moved[store, env] = 64 * (at + 1) + found
-            dragged[env, part] = io.age[env] * 1024 + io.episode[env]
+            pads.moved[store, env] = 64 * (at + 1) + found
+            pads.dragged[env, part] = mark_of(io, env)
 
     return anchors

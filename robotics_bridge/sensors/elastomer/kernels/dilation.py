@@ -58,6 +58,63 @@ class GelParams:
     own_last: wp.int32
 
 
+@wp.struct
+class ElastomerArrays:
+    """Arrays of the elastomers of a group. P counts the points of all sensors, K their blocks of 32.
+
+    ``stamp`` and ``dragged`` mark that something happened in this update: age · 1024 + episode.
+    """
+
+    gels: wp.array(dtype=GelParams)
+    """[S]."""
+    weights: wp.array3d(dtype=wp.float32)
+    """[S, 2, …] Gaussian weights along columns and rows, by distance in markers."""
+    reach: wp.array2d(dtype=wp.int32)
+    """[S, 2] how many markers away they count."""
+    stamp: wp.array2d(dtype=wp.int32)
+    """[B, S] mark of an indentation."""
+    height: wp.array3d(dtype=wp.float32)
+    """[2 planes, B, N] indentation h (m), then its bulge h^α."""
+    spread: wp.array3d(dtype=wp.float32)
+    """[3 planes, B, N] sums over columns, or the full convolution."""
+    tracked: wp.array(dtype=wp.int32)
+    """Geometries whose points are followed."""
+    own: wp.array(dtype=wp.int32)
+    """Geometries of the pads."""
+    blocks: wp.int32
+    """K of one sensor."""
+    anchor: wp.array3d(dtype=wp.float32)
+    """[P, 3, B] where a point sank in (m); x NaN: nowhere."""
+    held: wp.array2d(dtype=wp.int32)
+    """[K, B] anchors in a block."""
+    moved: wp.array2d(dtype=wp.int32)
+    """[K, B] points that moved since they sank in, plus 64 times one more than the block's place in the pair list."""
+    dragged: wp.array2d(dtype=wp.int32)
+    """[B, S] mark of a drag."""
+    drive: wp.array2d(dtype=wp.float32)
+    """[P, B] s_s h of the points that moved, without gaps."""
+    order: wp.array2d(dtype=wp.uint8)
+    """[P, B] their numbers in the block."""
+    drag: wp.array2d(dtype=wp.vec2f)
+    """[B, N] shear along and across (m), where it is summed by rows and columns."""
+    along: wp.array3d(dtype=wp.vec4f)
+    """[B, groups of four columns, CHUNK] weights of columns."""
+    across: wp.array3d(dtype=wp.vec2f)
+    """[B, rows, CHUNK] drives times weights of rows."""
+
+
+@wp.func
+def mark_of(io: ReadoutArrays, env: int) -> int:
+    """Return the mark of this update."""
+    return io.age[env] * 1024 + io.episode[env]
+
+
+@wp.func
+def anchor_of(pads: ElastomerArrays, index: int, env: int) -> wp.vec3f:
+    """Return where a point sank in."""
+    return wp.vec3f(pads.anchor[index, 0, env], pads.anchor[index, 1, env], pads.anchor[index, 2, env])
+
+
 @cache
 def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bool = False) -> Any:
     """Return the kernel of the indentation h (4.18), and with ``planes`` 2 of the one with radius noise.
@@ -73,9 +130,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
         pairs: PairArrays,
         io: ReadoutArrays,
         knobs: wp.array(dtype=NoiseParams),
-        stamp: wp.array2d(dtype=wp.int32),
-        exponent: wp.array(dtype=wp.float32),
-        height: wp.array3d(dtype=wp.float32),
+        pads: ElastomerArrays,
         env: int,
         n: int,
     ):
@@ -90,10 +145,10 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
                 error = radius_noise(knobs[part], env + io.env_offset, probes.probe[n], io.age[env], io.episode[env])
                 noisy = wp.max(error - best, 0.0)
             if h > 0.0 or noisy > 0.0:
-                stamp[env, part] = io.age[env] * 1024 + io.episode[env]
-        height[0, env, n] = h
+                pads.stamp[env, part] = mark_of(io, env)
+        pads.height[0, env, n] = h
         if wp.static(planes == 2):
-            height[1, env, n] = noisy
+            pads.height[1, env, n] = noisy
         # The bulge h^α is asked for by many markers, so it is raised once.
         for plane in range(wp.static(planes)):
             value = h
@@ -101,8 +156,8 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
                 value = noisy
             raised = float(0.0)
             if value > 0.0:
-                raised = wp.pow(value, exponent[part])
-            height[wp.static(planes) + plane, env, n] = raised
+                raised = wp.pow(value, pads.gels[part].exponent)
+            pads.height[wp.static(planes) + plane, env, n] = raised
 
     @wp.kernel(module="unique")
     def indent(
@@ -111,16 +166,14 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
         pairs: PairArrays,
         io: ReadoutArrays,
         knobs: wp.array(dtype=NoiseParams),
-        stamp: wp.array2d(dtype=wp.int32),
-        exponent: wp.array(dtype=wp.float32),
-        height: wp.array3d(dtype=wp.float32),
+        pads: ElastomerArrays,
     ):
         env, n = wp.tid()
         if wp.static(in_turn):
             for m in range(probes.radius.shape[0]):
-                indent_one(probes, solids, pairs, io, knobs, stamp, exponent, height, env, m)
+                indent_one(probes, solids, pairs, io, knobs, pads, env, m)
         else:
-            indent_one(probes, solids, pairs, io, knobs, stamp, exponent, height, env, n)
+            indent_one(probes, solids, pairs, io, knobs, pads, env, n)
 
     return indent
 
@@ -138,63 +191,53 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
     def spread_one(
         probes: ProbeArrays,
         io: ReadoutArrays,
-        gels: wp.array(dtype=GelParams),
-        weights: wp.array3d(dtype=wp.float32),
-        reach: wp.array2d(dtype=wp.int32),
-        stamp: wp.array2d(dtype=wp.int32),
-        height: wp.array3d(dtype=wp.float32),
-        out: wp.array3d(dtype=wp.float32),
+        pads: ElastomerArrays,
         env: int,
         n: int,
     ):
         """Sum over the columns around one marker."""
         part = probes.part[n]
-        if stamp[env, part] == io.age[env] * 1024 + io.episode[env]:
-            gel = gels[part]
+        if pads.stamp[env, part] == mark_of(io, env):
+            gel = pads.gels[part]
             place = probes.probe[n] % gel.columns
             row = n - place
             for plane in range(wp.static(planes)):
                 plain = float(0.0)
                 tilted = float(0.0)
                 raised = float(0.0)
-                low = wp.max(place - reach[part, 0], 0)
-                high = wp.min(place + reach[part, 0] + 1, gel.columns)
+                low = wp.max(place - pads.reach[part, 0], 0)
+                high = wp.min(place + pads.reach[part, 0] + 1, gel.columns)
                 for source in range(low, high):
-                    h = height[plane, env, row + source]
+                    h = pads.height[plane, env, row + source]
                     if h > 0.0:
                         away = place - source
-                        w = weights[part, 0, wp.abs(away)]
+                        w = pads.weights[part, 0, wp.abs(away)]
                         plain += h * w
                         tilted += h * w * float(away) * gel.step_x
-                        raised += height[wp.static(planes) + plane, env, row + source] * w
-                out[3 * plane, env, n] = plain
-                out[3 * plane + 1, env, n] = tilted
-                out[3 * plane + 2, env, n] = raised
+                        raised += pads.height[wp.static(planes) + plane, env, row + source] * w
+                pads.spread[3 * plane, env, n] = plain
+                pads.spread[3 * plane + 1, env, n] = tilted
+                pads.spread[3 * plane + 2, env, n] = raised
 
     @wp.kernel(module="unique")
     def spread(
         probes: ProbeArrays,
         io: ReadoutArrays,
-        gels: wp.array(dtype=GelParams),
-        weights: wp.array3d(dtype=wp.float32),
-        reach: wp.array2d(dtype=wp.int32),
-        stamp: wp.array2d(dtype=wp.int32),
-        height: wp.array3d(dtype=wp.float32),
-        out: wp.array3d(dtype=wp.float32),
+        pads: ElastomerArrays,
     ):
         env, n = wp.tid()
         if wp.static(in_turn):
             for m in range(probes.radius.shape[0]):
-                spread_one(probes, io, gels, weights, reach, stamp, height, out, env, m)
+                spread_one(probes, io, pads, env, m)
         else:
-            spread_one(probes, io, gels, weights, reach, stamp, height, out, env, n)
+            spread_one(probes, io, pads, env, n)
 
     return spread
 
 
 @wp.func
 def block_of(cloud: CloudArrays, tracked: wp.array(dtype=wp.int32), row: int, geometry: int, block: int) -> int:
-    """Number in the cloud of a block that was counted through all tracked geometries."""
+    """Return the number in the cloud of a block that was counted through all tracked geometries."""
     before = int(0)
     for member in range(tracked.shape[0]):
         if tracked[member] == geometry:
@@ -205,12 +248,13 @@ def block_of(cloud: CloudArrays, tracked: wp.array(dtype=wp.int32), row: int, ge
 
 @wp.func
 def across_plane(v: wp.vec3f, n: wp.vec3f) -> wp.vec3f:
+    """Return the part of a vector across a unit normal."""
     return v - wp.dot(v, n) * n
 
 
 @wp.func
 def traction(gel: GelParams, away: wp.vec3f, slip: wp.vec3f) -> wp.vec3f:
-    """Cerruti's surface displacement, softened over the contact, minus its image below the bonded base."""
+    """Return Cerruti's surface displacement, softened over the contact, minus its image below the bonded base."""
     square = wp.dot(away, away) + gel.softening * gel.softening
     inverse = 1.0 / wp.sqrt(square)
     u = inverse * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * inverse * inverse) * away)
@@ -251,22 +295,9 @@ def marker_kernel(
         probes: ProbeArrays,
         io: ReadoutArrays,
         knobs: wp.array(dtype=NoiseParams),
-        gels: wp.array(dtype=GelParams),
-        weights: wp.array3d(dtype=wp.float32),
-        reach: wp.array2d(dtype=wp.int32),
-        stamp: wp.array2d(dtype=wp.int32),
-        height: wp.array3d(dtype=wp.float32),
-        spread: wp.array3d(dtype=wp.float32),
-        blocks: int,
-        tracked: wp.array(dtype=wp.int32),
+        pads: ElastomerArrays,
         pairs: PairArrays,
         cloud: CloudArrays,
-        moved: wp.array2d(dtype=wp.int32),
-        dragged: wp.array2d(dtype=wp.int32),
-        anchor: wp.array3d(dtype=wp.float32),
-        drive: wp.array2d(dtype=wp.float32),
-        order: wp.array2d(dtype=wp.uint8),
-        drag: wp.array2d(dtype=wp.vec2f),
         env: int,
         n: int,
     ):
@@ -278,50 +309,50 @@ def marker_kernel(
         else:
             part = probes.part[n]
             probe = probes.probe[n]
-            gel = gels[part]
+            gel = pads.gels[part]
             x = probes.position[n]
             normal = probes.normal[n]
             truth = wp.vec3f(0.0)
             signal = wp.vec3f(0.0)
-            if stamp[env, part] == io.age[env] * 1024 + io.episode[env]:
+            if pads.stamp[env, part] == mark_of(io, env):
                 for plane in range(wp.static(planes)):
                     u = wp.vec3f(0.0)
                     total = float(0.0)
                     if wp.static(way == 2):
                         u = gel.dilate * (
-                            spread[3 * plane, env, n] * gel.along
-                            + spread[3 * plane + 1, env, n] * gel.across
-                            + spread[3 * plane + 2, env, n] * normal
+                            pads.spread[3 * plane, env, n] * gel.along
+                            + pads.spread[3 * plane + 1, env, n] * gel.across
+                            + pads.spread[3 * plane + 2, env, n] * normal
                         )
                     elif wp.static(way == 1):
                         place = probe // gel.columns
                         along = float(0.0)
                         across = float(0.0)
                         raised = float(0.0)
-                        low = wp.max(place - reach[part, 1], 0)
-                        high = wp.min(place + reach[part, 1] + 1, gel.rows)
+                        low = wp.max(place - pads.reach[part, 1], 0)
+                        high = wp.min(place + pads.reach[part, 1] + 1, gel.rows)
                         for source in range(low, high):
                             at = n + (source - place) * gel.columns
-                            w = weights[part, 1, wp.abs(place - source)]
-                            along += w * spread[3 * plane + 1, env, at]
-                            across += w * float(place - source) * gel.step_y * spread[3 * plane, env, at]
-                            raised += w * spread[3 * plane + 2, env, at]
+                            w = pads.weights[part, 1, wp.abs(place - source)]
+                            along += w * pads.spread[3 * plane + 1, env, at]
+                            across += w * float(place - source) * gel.step_y * pads.spread[3 * plane, env, at]
+                            raised += w * pads.spread[3 * plane + 2, env, at]
                         u = gel.dilate * (along * gel.along + across * gel.across + raised * normal)
                     else:
                         for source in range(gel.rows * gel.columns):
-                            h = height[plane, env, gel.start + source]
+                            h = pads.height[plane, env, gel.start + source]
                             if h > 0.0:
                                 away = across_plane(x - probes.position[gel.start + source], normal)
                                 square = gel.spread * wp.dot(away, away)
                                 w = wp.exp(-square)
                                 if wp.static(layered):
                                     away = (1.0 - gel.recoil * square) * away
-                                bulge = height[wp.static(planes) + plane, env, gel.start + source]
+                                bulge = pads.height[wp.static(planes) + plane, env, gel.start + source]
                                 u += gel.dilate * w * (h * away + bulge * normal)
                     if wp.static(layered):
                         if gel.expansion_x != 0.0 or gel.expansion_y != 0.0:
                             for source in range(gel.rows * gel.columns):
-                                total += height[plane, env, gel.start + source]
+                                total += pads.height[plane, env, gel.start + source]
                             local = x - gel.center
                             bx = wp.dot(local, gel.along)
                             by = wp.dot(local, gel.across)
@@ -338,20 +369,20 @@ def marker_kernel(
                     else:
                         signal = u
             slide = wp.vec3f(0.0)
-            if dragged[env, part] == io.age[env] * 1024 + io.episode[env]:
+            if pads.dragged[env, part] == mark_of(io, env):
                 row = env % cloud.first.shape[0]
-                last = part * blocks + blocks
+                last = part * pads.blocks + pads.blocks
                 if wp.static(apart):
                     if gel.layered == 0:
-                        slide = drag[env, n][0] * gel.along + drag[env, n][1] * gel.across
+                        slide = pads.drag[env, n][0] * gel.along + pads.drag[env, n][1] * gel.across
                         last = 0
-                for block in range(part * blocks, last):
-                    packed = moved[block, env]
+                for block in range(part * pads.blocks, last):
+                    packed = pads.moved[block, env]
                     if packed > 0:
                         at = packed // 64 - 1
                         rotation = wp.transpose(pairs.rotation[env, at])
                         offset = pairs.offset[env, at]
-                        first = block_of(cloud, tracked, row, pairs.geometry[env, at], block - part * blocks)
+                        first = block_of(cloud, pads.tracked, row, pairs.geometry[env, at], block - part * pads.blocks)
                         # Σ w (z − anchor) with z = rotation (p − offset): the pose of the block is applied once.
                         here = wp.transpose(rotation) @ x + offset
                         up = wp.transpose(rotation) @ normal
@@ -359,11 +390,11 @@ def marker_kernel(
                         carried = wp.vec3f(0.0)
                         left = wp.vec3f(0.0)
                         for k in range(packed % 64):
-                            own = int(order[block * wp.static(BLOCK) + k, env])
+                            own = int(pads.order[block * wp.static(BLOCK) + k, env])
                             index = block * wp.static(BLOCK) + own
                             p = cloud.point[first * wp.static(BLOCK) + own]
-                            strength = drive[block * wp.static(BLOCK) + k, env]
-                            kept = wp.vec3f(anchor[index, 0, env], anchor[index, 1, env], anchor[index, 2, env])
+                            strength = pads.drive[block * wp.static(BLOCK) + k, env]
+                            kept = anchor_of(pads, index, env)
                             if wp.static(layered):
                                 if gel.layered == 1:
                                     z = rotation @ (p - offset)
@@ -401,72 +432,15 @@ def marker_kernel(
         probes: ProbeArrays,
         io: ReadoutArrays,
         knobs: wp.array(dtype=NoiseParams),
-        gels: wp.array(dtype=GelParams),
-        weights: wp.array3d(dtype=wp.float32),
-        reach: wp.array2d(dtype=wp.int32),
-        stamp: wp.array2d(dtype=wp.int32),
-        height: wp.array3d(dtype=wp.float32),
-        spread: wp.array3d(dtype=wp.float32),
-        blocks: int,
-        tracked: wp.array(dtype=wp.int32),
+        pads: ElastomerArrays,
         pairs: PairArrays,
         cloud: CloudArrays,
-        moved: wp.array2d(dtype=wp.int32),
-        dragged: wp.array2d(dtype=wp.int32),
-        anchor: wp.array3d(dtype=wp.float32),
-        drive: wp.array2d(dtype=wp.float32),
-        order: wp.array2d(dtype=wp.uint8),
-        drag: wp.array2d(dtype=wp.vec2f),
     ):
         env, n = wp.tid()
         if wp.static(in_turn):
             for m in range(probes.radius.shape[0]):
-                read_one(
-                    probes,
-                    io,
-                    knobs,
-                    gels,
-                    weights,
-                    reach,
-                    stamp,
-                    height,
-                    spread,
-                    blocks,
-                    tracked,
-                    pairs,
-                    cloud,
-                    moved,
-                    dragged,
-                    anchor,
-                    drive,
-                    order,
-                    drag,
-                    env,
-                    m,
-                )
+                read_one(probes, io, knobs, pads, pairs, cloud, env, m)
         else:
-            read_one(
-                probes,
-                io,
-                knobs,
-                gels,
-                weights,
-                reach,
-                stamp,
-                height,
-                spread,
-                blocks,
-                tracked,
-                pairs,
-                cloud,
-                moved,
-                dragged,
-                anchor,
-                drive,
-                order,
-                drag,
-                env,
-                n,
-            )
+            read_one(probes, io, knobs, pads, pairs, cloud, env, n)
 
     return markers

@@ -4,7 +4,7 @@ Vectors are in the frame of the sensor link. Letters: B environment, N marker, G
 """
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.elastomer.kernels.dilation import NEGLIGIBLE, GelParams, block_of
+from robotics_bridge.sensors.elastomer.kernels.dilation import NEGLIGIBLE, ElastomerArrays, anchor_of, block_of, mark_of
 from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
@@ -26,9 +26,7 @@ def weight(smear: float, away: float) -> float:
 
 @wp.func
 def add_chunk(
-    along: wp.array3d(dtype=wp.vec4f),
-    across: wp.array3d(dtype=wp.vec2f),
-    out: wp.array2d(dtype=wp.vec2f),
+    pads: ElastomerArrays,
     env: int,
     points: int,
     start: int,
@@ -41,70 +39,59 @@ def add_chunk(
             x = wp.vec4f()
             y = wp.vec4f()
             for k in range(points):
-                w = along[env, group, k]
-                s = across[env, row, k]
+                w = pads.along[env, group, k]
+                s = pads.across[env, row, k]
                 x += w * s[0]
                 y += w * s[1]
             for i in range(4):
                 column = 4 * group + i
                 if column < columns:
                     n = start + row * columns + column
-                    out[env, n] = out[env, n] + wp.vec2f(x[i], y[i])
+                    pads.drag[env, n] = pads.drag[env, n] + wp.vec2f(x[i], y[i])
 
 
 @wp.kernel
 def sum_shear(
     probes: ProbeArrays,
     io: ReadoutArrays,
-    gels: wp.array(dtype=GelParams),
-    blocks: int,
-    tracked: wp.array(dtype=wp.int32),
+    pads: ElastomerArrays,
     pairs: PairArrays,
     cloud: CloudArrays,
-    moved: wp.array2d(dtype=wp.int32),
-    dragged: wp.array2d(dtype=wp.int32),
-    anchor: wp.array3d(dtype=wp.float32),
-    drive: wp.array2d(dtype=wp.float32),
-    order: wp.array2d(dtype=wp.uint8),
-    along: wp.array3d(dtype=wp.vec4f),
-    across: wp.array3d(dtype=wp.vec2f),
-    out: wp.array2d(dtype=wp.vec2f),
 ):
-    """Sum the shear of points that moved, ``out`` [B, N] along and across (m). Thread: environment [B].
+    """Sum the shear of points that moved into ``drag``. Thread: environment [B].
 
-    Sensors with a layer are left out: their kernel is no product. ``along`` [B, G, CHUNK] takes weights of columns,
-    ``across`` [B, R, CHUNK] drives times weights of rows.
+    Sensors with a layer are left out: their kernel is no product.
     """
     env = wp.tid()
     variant = env % cloud.first.shape[0]
-    for part in range(gels.shape[0]):
-        gel = gels[part]
-        if dragged[env, part] == io.age[env] * 1024 + io.episode[env] and gel.layered == 0:
+    for part in range(pads.gels.shape[0]):
+        gel = pads.gels[part]
+        if pads.dragged[env, part] == mark_of(io, env) and gel.layered == 0:
             for n in range(gel.start, gel.start + gel.rows * gel.columns):
-                out[env, n] = wp.vec2f()
+                pads.drag[env, n] = wp.vec2f()
             groups = (gel.columns + 3) // 4
             corner = probes.position[gel.start]
             points = int(0)
             span = wp.vec4i(gel.rows, 0, groups, 0)
-            for block in range(part * blocks, part * blocks + blocks):
-                packed = moved[block, env]
+            for block in range(part * pads.blocks, part * pads.blocks + pads.blocks):
+                packed = pads.moved[block, env]
                 if packed > 0:
                     at = packed // 64 - 1
                     rotation = wp.transpose(pairs.rotation[env, at])
                     offset = pairs.offset[env, at]
-                    first = block_of(cloud, tracked, variant, pairs.geometry[env, at], block - part * blocks)
+                    first = block_of(cloud, pads.tracked, variant, pairs.geometry[env, at], block - part * pads.blocks)
                     for k in range(packed % 64):
-                        own = int(order[block * wp.static(BLOCK) + k, env])
+                        own = int(pads.order[block * wp.static(BLOCK) + k, env])
                         index = block * wp.static(BLOCK) + own
                         z = rotation @ (cloud.point[first * wp.static(BLOCK) + own] - offset)
-                        kept = wp.vec3f(anchor[index, 0, env], anchor[index, 1, env], anchor[index, 2, env])
-                        slip = drive[block * wp.static(BLOCK) + k, env] * (z - kept)
+                        kept = anchor_of(pads, index, env)
+                        slip = pads.drive[block * wp.static(BLOCK) + k, env] * (z - kept)
                         force = wp.vec2f(wp.dot(slip, gel.along), wp.dot(slip, gel.across))
                         x = wp.dot(z - corner, gel.along)
                         y = wp.dot(z - corner, gel.across)
                         for row in range(gel.rows):
                             w = weight(gel.smear, y - float(row) * gel.step_y)
-                            across[env, row, points] = w * force
+                            pads.across[env, row, points] = w * force
                             if w > 0.0:
                                 span[0] = wp.min(span[0], row)
                                 span[1] = wp.max(span[1], row + 1)
@@ -112,13 +99,13 @@ def sum_shear(
                             four = wp.vec4f()
                             for i in range(4):
                                 four[i] = weight(gel.smear, x - float(4 * group + i) * gel.step_x)
-                            along[env, group, points] = four
+                            pads.along[env, group, points] = four
                             if four[0] + four[1] + four[2] + four[3] > 0.0:
                                 span[2] = wp.min(span[2], group)
                                 span[3] = wp.max(span[3], group + 1)
                         points += 1
                         if points == wp.static(CHUNK):
-                            add_chunk(along, across, out, env, points, gel.start, gel.columns, span)
+                            add_chunk(pads, env, points, gel.start, gel.columns, span)
                             points = 0
                             span = wp.vec4i(gel.rows, 0, groups, 0)
-            add_chunk(along, across, out, env, points, gel.start, gel.columns, span)
+            add_chunk(pads, env, points, gel.start, gel.columns, span)

@@ -10,7 +10,7 @@ import pytest
 from brainbench.core.errors import DataError
 from robotics_bridge.sensors.calibration.calibrate import Log, calibrate, describe, read_log
 from robotics_bridge.sensors.calibration.likelihood import find_quantum
-from robotics_bridge.sensors.noise.model import Noise, simulate
+from robotics_bridge.sensors.noise import Noise, simulate
 
 DT = 0.005
 

@@ -67,7 +67,7 @@ def test_shear_is_the_published_sum_over_anchored_points() -> None:
     suite = _suite({"all": _taxel(), "press": _taxel(points=0)})
     _press(suite, (0, 0, -0.001), (0.0006, 0, -0.001))
     runtime = suite.runtimes[0]
-    points = runtime._points.point.numpy()  # type: ignore[attr-defined]
+    points = runtime.points.point.numpy()  # type: ignore[attr-defined]
     points = points[~np.isnan(points[:, 0])].astype(float)
     before, now = points + np.array([0, 0, 0.01]), points + np.array([0.0006, 0, 0.01])
     anchored = before[:, 2] < 0.005 - 1e-5
@@ -147,7 +147,7 @@ def test_a_clamped_frame_stops_the_widening_where_a_free_edge_moves_most() -> No
 
 def test_shear_does_not_depend_on_the_order_of_threads_that_a_gpu_has() -> None:
     suites = [_suite({"a": _taxel(), "b": _taxel(enter=2e-5)}, envs=3) for _ in range(2)]
-    suites[1].runtimes[0]._side_by_side = True  # type: ignore[attr-defined]
+    suites[1].runtimes[0].side_by_side = True  # type: ignore[attr-defined]
     for suite in suites:
         _press(suite, (0, 0, -0.001), (0.0003, 0, -0.001))
         suite.reset([1])
@@ -173,12 +173,12 @@ def test_shear_by_rows_and_columns_is_that_of_every_marker_by_itself() -> None:
     assert sensors["row"].way == "direct"
     suites = [_suite({**sensors, "press": _taxel(points=0)}, envs=3) for _ in range(2)]
     for runtime in suites[1].runtimes:
-        runtime._apart = False  # type: ignore[attr-defined]
+        runtime.apart = False  # type: ignore[attr-defined]
     for suite in suites:
         _press(suite, (0, 0, -0.001), (0.0005, -0.0002, -0.0012))
         suite.reset([1])
         _press(suite, (0.0008, 0.0003, -0.0012))
-    moved = suites[0].runtimes[0]._moved.numpy()  # type: ignore[attr-defined]
+    moved = suites[0].runtimes[0].pads.moved.numpy()  # type: ignore[attr-defined]
     # More than are kept at once, and environments that differ.
     assert (moved % 64).sum(axis=0)[0] > 4 * 32
     assert not moved[:, 1].any()

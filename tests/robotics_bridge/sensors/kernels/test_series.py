@@ -18,13 +18,10 @@ EXPONENTS = (0.5, 1.0, 1.2, 1.5, 2.0, 3.0)
 @cache
 def _kernels() -> SimpleNamespace:
     from brainbench.core.devices import warp
-    from robotics_bridge.sensors.kernels.series import series_functions
-    from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+    from robotics_bridge.sensors.kernels.series import power, power_of_two, split_log
+    from robotics_bridge.sensors.noise.kernels.noise import decay, normals
 
     wp = warp()
-    series, noise = series_functions(), noise_functions()
-    split_log, power_of_two, power = series.split_log, series.power_of_two, series.power
-    normals, decay = noise.normals, noise.decay
 
     @wp.kernel(module="unique", enable_backward=False)
     def split(x: wp.array(dtype=float), out: wp.array(dtype=wp.vec2)):

@@ -10,16 +10,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.sensors.noise.model import (
-    PRESETS,
-    TAXEL_KNOBS,
-    Noise,
-    _Clock,
-    _Context,
-    simulate,
-    stream_seed,
-)
-from robotics_bridge.sensors.noise.stages import DelayLine, NoisePart, NoiseStage, gaussian_weights
+from robotics_bridge.sensors.context import Clock, LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
+from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage, gaussian_weights, simulate
 
 
 def _constant(value: float = 0.0, steps: int = 50, envs: int = 40, probes: int = 30, channels: int = 2) -> np.ndarray:
@@ -29,10 +22,9 @@ def _constant(value: float = 0.0, steps: int = 50, envs: int = 40, probes: int =
 @cache
 def _words_kernel():
     from brainbench.core.devices import warp
-    from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+    from robotics_bridge.sensors.noise.kernels.noise import philox
 
     wp = warp()
-    philox = noise_functions().philox
 
     @wp.kernel(module="unique", enable_backward=False)
     def words(counter: wp.array(dtype=wp.uint32), key: wp.array(dtype=wp.uint32), out: wp.array(dtype=wp.uint32)):
@@ -129,14 +121,12 @@ def test_dead_probes_are_as_many_as_asked_for_and_stuck_at_one_value_in_all_chan
 @cache
 def _radius_kernel():
     from brainbench.core.devices import warp
-    from robotics_bridge.sensors.noise.kernels.noise import noise_functions
+    from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, radius_noise
 
     wp = warp()
-    f = noise_functions()
-    params, radius_noise = f.NoiseParams, f.radius_noise
 
     @wp.kernel(module="unique", enable_backward=False)
-    def radii(p: params, out: wp.array2d(dtype=wp.float32)):
+    def radii(p: NoiseParams, out: wp.array2d(dtype=wp.float32)):
         age, probe = wp.tid()
         out[age, probe] = radius_noise(p, 0, probe, age, 0)
 
@@ -224,21 +214,20 @@ def test_jitter_varies_the_delay_within_its_bounds_and_alike_for_all_probes():
     assert not np.array_equal(settled[:, 0], settled[:, 1])
 
 
-def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | None = None):
+def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | None = None, gained: bool = True):
     from brainbench.core.devices import pick_device, warp
 
     wp = warp()
-    clock = _Clock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
-    context = _Context(clock, pick_device("cpu"), 0)
-    parts = [NoisePart("sensor", noise, 0, (probes,), active)]
+    clock = Clock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
+    context = LaunchContext(envs, pick_device("cpu"), 0, clock)
+    arrays = NoiseArrays([ReadoutSlice("sensor", noise, 0, (probes,), active=active)], 1, context)
     x, out = (wp.zeros((1, envs, probes), dtype=wp.float32, device="cpu") for _ in range(2))
-    return clock, NoiseStage(parts, 1, envs, context), DelayLine(parts, 1, envs, context), x, out
+    return clock, NoiseStage(arrays, gained=gained), DelayLine(arrays), x, out
 
 
 def test_a_reset_redraws_and_forgets_in_its_environment_alone():
     noise = Noise(walk=1.0, gain=(0.5, 2.0), hysteresis=1.0)
-    clock, stage, _line, x, out = _stage(noise)
-    stage._gained = False
+    clock, stage, _line, x, out = _stage(noise, gained=False)
     x.fill_(1.0)
     for step in range(10):
         clock.age.fill_(step)

@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 
 from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry
-from robotics_bridge.sensors import KinematicTaxel, Noise, Probes, SensorSuite, sensor
+from robotics_bridge.sensors import KinematicTaxel, Noise, Probes, SensorSuite
+from robotics_bridge.sensors import runtime as sensor_runtime
+from robotics_bridge.sensors.context import ReadoutSlice
 from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED
-from robotics_bridge.sensors.sensor import ReadoutSlice, probe_rows
-from robotics_bridge.sensors.taxels import kinematic
+from robotics_bridge.sensors.runtime import probe_rows
+from robotics_bridge.sensors.taxels import runtime as taxels
 from tests.factories.touch_scenes import pad_scene, random_pose, state_of
 
 NOISE = Noise(radius=5e-4, gain=(0.8, 1.2), white=1e-3, walk=1e-3, hysteresis=0.3, dead_probability=0.1, bias=0.01)
@@ -45,9 +47,9 @@ def test_every_probe_is_taken_once_and_by_its_own_sensor(counts: list[int], envs
     context = _gpu(envs)
     context.device.is_cuda = cuda
     starts = np.cumsum([0, *counts])
-    places = [ReadoutSlice(int(start), (count,), False) for start, count in zip(starts, counts, strict=False)]
+    slices = [ReadoutSlice("s", Noise(), int(start), (count,)) for start, count in zip(starts, counts, strict=False)]
     owner = np.full(starts[-1], -1)
-    for first, end, step, part in probe_rows(places, context, mode):
+    for first, end, step, part in probe_rows(slices, context, mode):
         taken = np.arange(first, end, step)
         assert taken.size
         assert (owner[taken] == -1).all()
@@ -60,7 +62,7 @@ def test_every_probe_is_taken_once_and_by_its_own_sensor(counts: list[int], envs
     [(1, CLEAN, 1), (100, CLEAN, 4), (1000, CLEAN, 8), (100, FUSED, 2), (1000, FUSED, 4), (10_000, FUSED, 4)],
 )
 def test_a_gpu_shares_as_much_as_was_fastest_when_measured(taxels: int, mode: int, expected: int) -> None:
-    rows = probe_rows([ReadoutSlice(0, (taxels,), False)], _gpu(16_384), mode)
+    rows = probe_rows([ReadoutSlice("s", Noise(), 0, (taxels,))], _gpu(16_384), mode)
     assert len(rows) == -(-taxels // expected)
 
 
@@ -94,24 +96,24 @@ def test_probes_that_share_a_thread_read_the_same(
     counts: tuple[int, ...], noise: Noise, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     envs = 4
-    monkeypatch.setattr(sensor, "_SHARED", 1)
+    monkeypatch.setattr(sensor_runtime, "_SHARED", 1)
     alone = _readings(counts, envs, noise, "sdf")
     assert any(np.nanmax(np.abs(read)) > 0 for read in alone)
-    monkeypatch.setattr(sensor, "_SHARED", 32)
+    monkeypatch.setattr(sensor_runtime, "_SHARED", 32)
     for shared, one in zip(_readings(counts, envs, noise, "sdf"), alone, strict=True):
         np.testing.assert_array_equal(shared, one)
     # The rows of a GPU, interleaved, four and eight probes of a thread.
     for most in (4, 8):
-        monkeypatch.setattr(sensor, "_SHARED_CUDA", dict.fromkeys((CLEAN, FUSED, STAGED), (most, 1e-9)))
-        monkeypatch.setattr(kinematic, "probe_rows", lambda places, context, mode: probe_rows(places, _gpu(envs), mode))
+        monkeypatch.setattr(sensor_runtime, "_SHARED_CUDA", dict.fromkeys((CLEAN, FUSED, STAGED), (most, 1e-9)))
+        monkeypatch.setattr(taxels, "probe_rows", lambda slices, context, mode: probe_rows(slices, _gpu(envs), mode))
         for shared, one in zip(_readings(counts, envs, noise, "sdf"), alone, strict=True):
             np.testing.assert_array_equal(shared, one)
 
 
 def test_triangles_are_asked_alike_by_probes_that_share_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sensor, "_SHARED", 1)
+    monkeypatch.setattr(sensor_runtime, "_SHARED", 1)
     alone = _readings((5, 33), 3, Noise(), "raycast")
-    monkeypatch.setattr(sensor, "_SHARED", 32)
+    monkeypatch.setattr(sensor_runtime, "_SHARED", 32)
     for shared, one in zip(_readings((5, 33), 3, Noise(), "raycast"), alone, strict=True):
         np.testing.assert_array_equal(shared, one)
 

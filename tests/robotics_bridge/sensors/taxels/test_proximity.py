@@ -110,7 +110,7 @@ def test_points_gathered_by_cells_are_summed_as_each_probe_would_find_them() -> 
     }
     scene = pad_scene(*OBJECTS)
     suites = [SensorSuite(scene, sensors, num_envs=3) for _ in range(2)]
-    suites[1].runtimes[0]._gathered = False  # type: ignore[attr-defined]
+    suites[1].runtimes[0].gathered = False  # type: ignore[attr-defined]
     poses = poses_at(len(scene.links), {}, 3)
     poses[:, 2, :3] = (0.002, 0.001, 0.011)
     poses[:, 3, :3] = (-0.006, 0.002, 0.012)

@@ -1,0 +1,94 @@
+"""Device, clock and launches that the parts of a suite share, and where each sensor's reading lies.
+
+Letters: B environment, N probe, C channel; readings are stored planar [C, B, N].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.devices import warp
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from robotics_bridge.physics.scene import TouchScene
+    from robotics_bridge.sensors.noise.model import Noise
+    from robotics_bridge.sensors.queries.pairs import PairTable
+    from robotics_bridge.sensors.queries.solids import Solids
+
+
+@dataclass(eq=False)
+class Clock:
+    """Counters of updates and episodes on the device."""
+
+    age: Any
+    """Warp array [B] int32: updates since the environment's reset, 0 at the first."""
+    episode: Any
+    """Warp array [B] int32: resets so far."""
+    env_offset: int = 0
+    """Number, in the whole experiment, of environment 0."""
+
+
+@dataclass(eq=False)
+class LaunchContext:
+    """Where kernels run, and what their random numbers depend on."""
+
+    num_envs: int
+    """B."""
+    device: Any
+    """Warp device."""
+    seed: int
+    clock: Clock
+
+    def array(self, values: Any, dtype: Any) -> Any:
+        """Copy values to the device as a Warp array."""
+        return warp().array(values, dtype=dtype, device=self.device)
+
+    def zeros(self, shape: int | Sequence[int], dtype: Any = float) -> Any:
+        """Return a Warp array of zeros on the device."""
+        return warp().zeros(shape, dtype=dtype, device=self.device)
+
+    def launch(self, kernel: Any, dim: int | Sequence[int], *inputs: Any) -> None:
+        """Run a kernel on the device."""
+        warp().launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+
+@dataclass(eq=False)
+class SuiteContext(LaunchContext):
+    """What a suite lends to the runtimes of its sensors."""
+
+    scene: TouchScene
+    solids: Solids
+    pairs: PairTable
+
+
+@dataclass(frozen=True)
+class ReadoutSlice:
+    """The probes of one sensor within a planar array [C, B, N]."""
+
+    name: str
+    """Name of the sensor, for its random numbers."""
+    noise: Noise
+    start: int
+    """Its first probe on N."""
+    layout: tuple[int, ...]
+    """(n,) or (ny, nx)."""
+    scalar: bool = False
+    """Whether a reading has no channel axis."""
+    active: NDArray[np.bool_] | None = None
+    """[n] False for fillers, which read 0; None if there are none."""
+
+    @property
+    def count(self) -> int:
+        """Number of probes."""
+        return math.prod(self.layout)
+
+    @property
+    def span(self) -> slice:
+        """Its probes on N."""
+        return slice(self.start, self.start + self.count)

@@ -1,0 +1,235 @@
+"""Runtime of elastomers: indentation, its spreading, anchored points and the sum over both, in that order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
+from robotics_bridge.sensors.elastomer.kernels.dilation import (
+    ElastomerArrays,
+    GelParams,
+    indent_kernel,
+    marker_kernel,
+    spread_kernel,
+)
+from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, sum_shear
+from robotics_bridge.sensors.elastomer.taxel import Layer
+from robotics_bridge.sensors.queries.surface_points import sample_cloud
+from robotics_bridge.sensors.runtime import ProbeRuntime
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
+
+if TYPE_CHECKING:
+    from robotics_bridge.physics.state import HandState
+    from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext
+    from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel
+
+wp = warp()
+
+_NEGLIGIBLE = 1e-7
+"""Weight of a Gaussian from which on it is left out."""
+
+
+class ElastomerRuntime(ProbeRuntime):
+    """Serves elastomers that follow the same points and sum their dilation in the same way."""
+
+    def __init__(self, sensors: Mapping[str, ElastomerTaxel], context: SuiteContext) -> None:
+        super().__init__(sensors, 3, context)
+        scene, envs = context.scene, context.num_envs
+        self._sensors = list(sensors.values())
+        first = self._sensors[0]
+        self._raycast, self._way = first.query == "raycast", first.way
+        self.recordable = self._way != "fft"
+        self._layered = any(sensor.layer for sensor in self._sensors)
+        self._planes = 2 if any(sensor.noise.radius for sensor in self._sensors) else 1
+        count, tracked = len(self._sensors), first.tracked(scene)
+        self._followed = first.points > 0 and bool(tracked)
+        cloud = (
+            sample_cloud(scene, tracked, first.points, context.solids.rows, context.device) if self._followed else None
+        )
+        self.points = cloud.struct if cloud else CloudArrays()
+        """Warp structure of the surface points that are followed."""
+        self._total = cloud.total if cloud else 0
+        own = [sensor.own(scene) if self._followed else () for sensor in self._sensors]
+        members = [g for one in own for g in one]
+        self._own_kinds = context.solids.kinds_of(sorted(set(members)))
+        # Threads of a GPU are environments and want them side by side; a processor walks through the points of one.
+        self.side_by_side = bool(context.device.is_cuda)
+        # A processor starts a thread for every marker at a cost that markers in turn do not have.
+        self._in_turn = not context.device.is_cuda
+        # Only a processor finds a grid's shear cheaper by rows and columns than marker by marker.
+        self.apart = self._followed and self._way != "direct" and self._in_turn
+        self._blocks = -(-self._total // BLOCK)
+        total, blocks = max(count * self._blocks * BLOCK, 1), max(count * self._blocks, 1)
+        rows, columns = (max(side) for side in zip(*map(_sides, self.slices.values()), strict=True))
+        pads = ElastomerArrays()
+        pads.gels, pads.blocks = self._describe(own), self._blocks
+        pads.weights, pads.reach = self._weigh()
+        pads.tracked, pads.own = context.array(tracked or [0], int), context.array(members or [0], int)
+        pads.height = context.zeros((2 * self._planes, envs, self.count))
+        pads.spread = context.zeros((3 * self._planes, envs, self.count) if self._way != "direct" else (1, 1, 1))
+        pads.stamp, pads.dragged = (context.array(np.full((envs, count), -1), int) for _ in range(2))
+        pads.held, pads.moved = (context.zeros((blocks, envs), int) for _ in range(2))
+        pads.anchor = self._by_point((total, 3, envs), float)
+        pads.drive, pads.order = self._by_point((total, envs), float), self._by_point((total, envs), wp.uint8)
+        shapes = {"drag": (envs, self.count), "along": (envs, -(-columns // 4), CHUNK), "across": (envs, rows, CHUNK)}
+        for (name, shape), dtype in zip(shapes.items(), (wp.vec2f, wp.vec4f, wp.vec2f), strict=True):
+            setattr(pads, name, context.zeros(shape if self.apart else (1,) * len(shape), dtype))
+        self.pads = pads
+        """Warp structure of gels, sums and anchors."""
+        self._spectra: list[Any] = []
+
+    def _by_point(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        """Return zeros [..., B] whose fastest axis in memory is B on a GPU, and the points of one on a processor."""
+        if self.side_by_side:
+            return self.context.zeros(shape, dtype)
+        order = (*range(1, len(shape)), 0)
+        return self.context.zeros((shape[-1], *shape[:-1]), dtype).transpose(order)
+
+    @property
+    def state_bytes(self) -> int:
+        """Lasting memory per environment [bytes]: readings and anchors."""
+        return super().state_bytes + 4 * (3 * self._total + self._blocks + 2) * len(self._sensors)
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Memory per environment [bytes] that every update writes anew: heights, their sums and drives of points."""
+        spread = 3 * self._planes if self._way != "direct" else 0
+        followed = (5 * self._total + 4 * self._blocks) * len(self._sensors)
+        if self.apart:
+            followed += 8 * self.count + CHUNK * (16 * self.pads.along.shape[1] + 8 * self.pads.across.shape[1])
+        return followed + 4 * self.count * (2 * self._planes + spread)
+
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state."""
+        c, pads = self.context, self.pads
+        self.begin(state, dt)
+        solids, pairs = c.solids.struct, c.pairs.struct
+        indent = indent_kernel(self.kinds, self._raycast, self._planes, self._in_turn)
+        self.launch(indent, self.probes, solids, pairs, self.io, self.knobs, pads)
+        if self._way == "separable":
+            self.launch(spread_kernel(self._planes, self._in_turn), self.probes, self.io, pads)
+        elif self._way == "fft":
+            self._transform()
+        if self._followed:
+            kernel = anchor_kernel(self._own_kinds, self._raycast, self.side_by_side, self._in_turn)
+            dim = pads.held.shape if self.side_by_side else pads.held.shape[::-1]
+            c.launch(kernel, dim, pads, solids, pairs, self.points, self.io)
+        if self.apart:
+            c.launch(sum_shear, c.num_envs, self.probes, self.io, pads, pairs, self.points)
+        way = ("direct", "separable", "fft").index(self._way)
+        kernel = marker_kernel(way, self._layered, self._planes, self.mode, *self.stores, self._in_turn, self.apart)
+        self.launch(kernel, self.probes, self.io, self.knobs, pads, pairs, self.points)
+        self.finish(dt)
+
+    def launch(self, kernel: Any, *inputs: Any) -> None:
+        """Run a kernel over all environments and markers."""
+        self.context.launch(kernel, (self.context.num_envs, 1 if self._in_turn else self.count), *inputs)
+
+    def _describe(self, own: list[tuple[int, ...]]) -> Any:
+        """Return the structures of the gels; ``own`` are the geometries of each pad."""
+        gels, owned = [], 0
+        for index, (sensor, place) in enumerate(zip(self._sensors, self.slices.values(), strict=True)):
+            gel, probes, layer = GelParams(), sensor.probes, sensor.layer or Layer()
+            rows, columns = _sides(place)
+            widening = layer.expansion if isinstance(layer.expansion, tuple) else (layer.expansion,) * 2
+            for source, names in (
+                (sensor, ("exponent", "enter", "leave")),
+                (layer, ("poisson", "softening", "thickness", "recoil")),
+            ):
+                for name in names:
+                    setattr(gel, name, getattr(source, name))
+            gel.dilate, gel.shear = sensor.dilate_scale, sensor.shear_scale
+            gel.spread, gel.smear = sensor.dilate_spread, sensor.shear_spread
+            gel.layered = int(sensor.layer is not None)
+            gel.expansion_x, gel.expansion_y = widening
+            gel.frame_x, gel.frame_y = layer.frame or (0.0, 0.0)
+            gel.start, gel.rows, gel.columns = place.start, rows, columns
+            gel.step_y, gel.step_x = probes.pitch or (0.0, 0.0)
+            gel.link, gel.slot = self.context.scene.link_index(sensor.link), self.slots[index]
+            gel.own_first, owned = owned, owned + len(own[index])
+            gel.own_last = owned
+            gel.along, gel.across, gel.normal = (wp.vec3f(*axis.tolist()) for axis in _axes(sensor))
+            gel.center = wp.vec3f(*probes.position[probes.active].mean(axis=0).tolist())
+            gels.append(gel)
+        return self.context.array(gels, GelParams)
+
+    def _weigh(self) -> tuple[Any, Any]:
+        """Return one-dimensional weights [S, 2, K] along columns and rows, and how far [S, 2] they count."""
+        if self._way != "separable":
+            return self.context.zeros((1, 1, 1)), self.context.zeros((1, 1), int)
+        reach = np.zeros((len(self._sensors), 2), np.int32)
+        columns = []
+        for row, sensor in zip(reach, self._sensors, strict=True):
+            shape, pitch = sensor.probes.shape, sensor.probes.pitch or (1.0, 1.0)
+            for axis, (step, length) in enumerate(((pitch[1], shape[1]), (pitch[0], shape[0]))):
+                far = math.sqrt(-math.log(_NEGLIGIBLE) / sensor.dilate_spread) if sensor.dilate_spread else math.inf
+                row[axis] = length - 1 if step * length <= far else min(length - 1, math.ceil(far / step))
+                columns.append((sensor.dilate_spread, step))
+        weights = np.zeros((len(reach), 2, int(reach.max()) + 1), np.float32)
+        away = np.arange(weights.shape[2])
+        for index, (spread, step) in enumerate(columns):
+            weights[index // 2, index % 2] = np.exp(-spread * (away * step) ** 2)
+        return self.context.array(weights, float), self.context.array(reach, int)
+
+    def _transform(self) -> None:
+        """Convolve h with the three dilation kernels in Fourier space, zero outside the grid."""
+        import torch
+
+        height, out = wp.to_torch(self.pads.height), wp.to_torch(self.pads.spread)
+        if not self._spectra:
+            self._spectra = [_spectrum(sensor, height.device) for sensor in self._sensors]
+        for place, (size, spectrum) in zip(self.slices.values(), self._spectra, strict=True):
+            rows, columns = place.layout
+            span = place.span
+            for plane in range(self._planes):
+                h = height[plane, :, span].unflatten(1, (rows, columns))
+                flat = torch.fft.rfft2(h, s=size)
+                bulge = height[self._planes + plane, :, span].unflatten(1, (rows, columns))
+                raised = torch.fft.rfft2(bulge, s=size)
+                for channel, signal in enumerate((flat, flat, raised)):
+                    field = torch.fft.irfft2(signal * spectrum[channel], s=size)
+                    out[3 * plane + channel, :, span] = field[
+                        :, rows - 1 : 2 * rows - 1, columns - 1 : 2 * columns - 1
+                    ].flatten(1)
+
+
+def _sides(place: ReadoutSlice) -> tuple[int, int]:
+    """Return rows and columns of a sensor's markers."""
+    return (place.layout[0], place.layout[1]) if len(place.layout) == 2 else (1, place.count)
+
+
+def _axes(sensor: ElastomerTaxel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the unit vectors of a grid: the way columns grow, the way rows grow, and out of the pad."""
+    probes = sensor.probes
+    normal = probes.normal[probes.active].mean(axis=0)
+    normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
+    along = np.cross([0.0, 1.0, 0.0], normal) if abs(normal[1]) < 0.9 else np.cross([0.0, 0.0, 1.0], normal)
+    if len(probes.shape) == 2:
+        corners = probes.position.reshape(*probes.shape, 3)
+        if probes.shape[1] > 1:
+            along = corners[0, -1] - corners[0, 0]
+        elif probes.shape[0] > 1:
+            along = np.cross(corners[-1, 0] - corners[0, 0], normal)
+    along = along - normal * (along @ normal)
+    along = along / max(float(np.linalg.norm(along)), 1e-12)
+    return along, np.cross(normal, along), normal
+
+
+def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any]:
+    """Return the padded size of a grid and the spectra [3, …] of its kernels: along, across and normal."""
+    import torch
+
+    rows, columns = sensor.probes.shape
+    pitch = sensor.probes.pitch or (1.0, 1.0)
+    y = torch.arange(1 - rows, rows, device=device)[:, None] * pitch[0]
+    x = torch.arange(1 - columns, columns, device=device)[None, :] * pitch[1]
+    reach = sensor.dilate_spread * (x**2 + y**2)
+    bell = torch.exp(-reach)
+    push = bell * (1 - (sensor.layer.recoil if sensor.layer else 0.0) * reach)
+    size = (3 * rows - 2, 3 * columns - 2)
+    return size, torch.fft.rfft2(torch.stack([x * push, y * push, bell]), s=size)

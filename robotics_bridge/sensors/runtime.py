@@ -1,0 +1,263 @@
+"""Runtimes: the arrays and launches that serve all sensors of one kind. Letters: B environment, N probe, C channel.
+
+Readings are stored planar [C, B, N]. :class:`ReadoutRuntime` keeps readings and noise, :class:`ProbeRuntime` adds
+probes that meet geometries.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
+from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage
+
+if TYPE_CHECKING:
+    from robotics_bridge.physics.state import HandState
+    from robotics_bridge.sensors.probes.placement import Probes
+    from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
+
+wp = warp()
+
+
+class Runtime(abc.ABC):
+    """Serves the sensors of one group. Updates launch kernels and do nothing else, so that they can be recorded."""
+
+    slices: Mapping[str, ReadoutSlice]
+    """Where the reading of each sensor lies, by name."""
+    recordable: bool = True
+    """Whether its updates can become part of a CUDA graph."""
+
+    @abc.abstractmethod
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state; ``dt`` seconds have passed since the last update."""
+
+    @abc.abstractmethod
+    def measured(self) -> Any:
+        """Return the planar Warp array of measured readings."""
+
+    @abc.abstractmethod
+    def truth(self) -> Any:
+        """Return the planar Warp array of readings without noise."""
+
+    @property
+    @abc.abstractmethod
+    def state_bytes(self) -> int:
+        """Lasting memory per environment [bytes], readings included, without history and delay."""
+
+    @property
+    def ring_bytes(self) -> int:
+        """Memory per environment [bytes] of delays that the user asked for."""
+        return 0
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Memory per environment [bytes] that every update writes anew."""
+        return 0
+
+
+class ReadoutRuntime(Runtime):
+    """Readings of a group with their noise: fused into the sensor's kernel where that can be, in stages otherwise.
+
+    Args:
+        sensors: by name.
+        channels: planes of the storage.
+        context: of the suite.
+        fusable: whether the sensor's kernel applies the noise itself when no crosstalk forbids it.
+        active: which probes [N] are none of the fillers.
+    """
+
+    def __init__(
+        self,
+        sensors: Mapping[str, Sensor],
+        channels: int,
+        context: SuiteContext,
+        *,
+        fusable: bool = True,
+        active: np.ndarray | None = None,
+    ) -> None:
+        self.context = context
+        self.slices = {}
+        self.count = 0
+        """Probes N of all sensors."""
+        for name, sensor in sensors.items():
+            count = int(np.prod(sensor.layout()))
+            mask = None if active is None else active[self.count : self.count + count]
+            self.slices[name] = ReadoutSlice(
+                name, sensor.noise, self.count, sensor.layout(), sensor.channels == 0, mask
+            )
+            self.count += count
+        noises = [sensor.noise for sensor in sensors.values()]
+        self.noisy = any(noise.active for noise in noises)
+        staged = self.noisy and (not fusable or any(noise.crosstalk for noise in noises))
+        self.mode = STAGED if staged else FUSED if self.noisy else CLEAN
+        fused = self.mode == FUSED
+        self.stores = (
+            fused and any(noise.hysteresis for noise in noises),
+            fused and any(noise.walk for noise in noises),
+        )
+        """Whether the sensor's kernel keeps hysteresis and drift."""
+        shape = (channels, context.num_envs, self.count)
+
+        def planes(wanted: bool) -> Any:
+            return context.zeros(shape if wanted else (1, 1, 1))
+
+        arrays = NoiseArrays(list(self.slices.values()), channels, context)
+        self.part, self.probe, self.knobs = arrays.part, arrays.probe, arrays.params
+        self._truth = planes(True)
+        self._measured = planes(True) if self.noisy else self._truth
+        self._stage = NoiseStage(arrays) if staged else None
+        self._delay = DelayLine(arrays) if any(noise.read_delay for noise in noises) else None
+        io = ReadoutArrays()
+        io.truth, io.measured = self._truth, self._measured
+        io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
+        io.age, io.episode = context.clock.age, context.clock.episode
+        io.env_offset = context.clock.env_offset
+        self.io = io
+        self._channels = channels
+
+    def measured(self) -> Any:
+        """Return the planar Warp array of measured readings."""
+        return self._delay.out if self._delay else self._measured
+
+    def truth(self) -> Any:
+        """Return the planar Warp array of readings without noise."""
+        return self._truth
+
+    def begin(self, state: HandState, dt: float) -> None:
+        """Point the structure that kernels take at this update."""
+        self.io.status, self.io.dt = state.status, dt
+
+    def finish(self, dt: float) -> None:
+        """Run what noise is left after the sensor's own kernel."""
+        if self._stage:
+            self._stage.launch(self._measured, self._measured, dt)
+        if self._delay:
+            self._delay.launch(self._measured, dt)
+
+    @property
+    def state_bytes(self) -> int:
+        """Lasting memory per environment [bytes], readings included, without history and delay."""
+        planes = 1 + int(self.noisy) + sum(self.stores)
+        return 4 * self._channels * self.count * planes + (self._stage.state_bytes if self._stage else 0)
+
+    @property
+    def ring_bytes(self) -> int:
+        """Memory per environment [bytes] of delays that the user asked for."""
+        return self._delay.ring_bytes if self._delay else 0
+
+
+class ProbeRuntime(ReadoutRuntime):
+    """Probes of all sensors of a group, one after another, with their slots.
+
+    Args:
+        sensors: by name.
+        channels: planes of the storage.
+        context: of the suite.
+        reach: how far beyond its radius a probe looks (m); None is unlimited, and geometries need not be in contact.
+        fusable: whether the sensor's kernel applies the noise itself when no crosstalk forbids it.
+    """
+
+    def __init__(
+        self,
+        sensors: Mapping[str, ProbeSensor],
+        channels: int,
+        context: SuiteContext,
+        *,
+        reach: float | None = 0.0,
+        fusable: bool = True,
+    ) -> None:
+        active = np.concatenate([sensor.probes.active for sensor in sensors.values()])
+        super().__init__(sensors, channels, context, fusable=fusable, active=active)
+        tracked = {name: sensor.tracked(context.scene) for name, sensor in sensors.items()}
+        self.kinds = context.solids.kinds_of(sorted({g for members in tracked.values() for g in members}))
+        """Kinds of the geometries that they may meet."""
+        self.slots = [self._slot(sensor, tracked[name], reach) for name, sensor in sensors.items()]
+        """Slot of each sensor in the pair table."""
+        p = ProbeArrays()
+        for name, dtype in (("position", wp.vec3f), ("normal", wp.vec3f), ("radius", float)):
+            columns = [getattr(sensor.probes, name) for sensor in sensors.values()]
+            setattr(p, name, context.array(np.concatenate(columns), dtype))
+        counts = [part.count for part in self.slices.values()]
+        p.slot, p.part, p.probe = context.array(np.repeat(self.slots, counts), int), self.part, self.probe
+        self.probes = p
+
+    def _slot(self, sensor: ProbeSensor, members: tuple[int, ...], reach: float | None) -> int:
+        link = self.context.scene.link_index(sensor.link)
+        contact = reach is not None and sensor.contact_only
+        center, span = enclosing_sphere(sensor.probes)
+        far = 0.0 if reach is None or contact else span + reach
+        return self.context.pairs.slot(link, members, contact=contact, center=center, reach=far)
+
+    def launch(self, kernel: Any, *inputs: Any) -> None:
+        """Run a kernel over all environments and probes."""
+        self.context.launch(kernel, (self.context.num_envs, self.count), *inputs)
+
+
+_SHARED = 32
+"""Probes that one thread of a processor takes in turn."""
+_SHARED_CUDA = {CLEAN: (8, 3072), FUSED: (4, 6144), STAGED: (8, 3072)}
+"""The same on a GPU by mode: at most, and probes of a multiprocessor for each of them (measured on an H200)."""
+
+
+def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int) -> np.ndarray:
+    """Return rows (first, end, step, number of the sensor) [R, 4] of probes that one thread takes in turn.
+
+    What all probes of an environment share is then read less often. On a GPU the rows of neighbouring threads are
+    interleaved, so that these touch neighbouring memory.
+
+    Args:
+        slices: of the sensors, in the order of their numbers.
+        context: of the suite.
+        mode: of the readout; noise leaves fewer registers to share.
+    """
+    slices = list(slices)
+    cuda = bool(context.device.is_cuda)
+    total = context.num_envs * sum(part.count for part in slices)
+    most = _SHARED
+    if cuda:
+        limit, fill = _SHARED_CUDA[mode]
+        most = min(limit, max(1, total // (fill * context.device.sm_count)))
+    rows = []
+    for number, part in enumerate(slices):
+        end, threads = part.start + part.count, -(-part.count // most)
+        if cuda:
+            rows += [(part.start + k, end, threads, number) for k in range(threads)]
+        else:
+            starts = range(part.start, end, most)
+            rows += [(start, min(start + most, end), 1, number) for start in starts]
+    return np.array(rows, dtype=np.int32).reshape(-1, 4)
+
+
+def enclosing_sphere(probes: Probes) -> tuple[np.ndarray, float]:
+    """Return centre [3] and radius (m) of a sphere around the sensing spheres of active probes."""
+    position, radius = probes.position[probes.active], probes.radius[probes.active]
+    if not len(position):
+        return np.zeros(3), 1e-6
+    center = 0.5 * (position.min(axis=0) + position.max(axis=0))
+    return center, float((np.linalg.norm(position - center, axis=1) + radius).max())
+
+
+class History:
+    """The last readings of one sensor, ready as one contiguous window."""
+
+    def __init__(self, part: ReadoutSlice, channels: int, length: int, context: LaunchContext) -> None:
+        self.part, self.length, self._context = part, length, context
+        self.ring: Any = context.zeros((2 * length, channels, context.num_envs, part.count))
+        """Warp array [2 T, C, B, N]: every reading is written twice."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory per environment [bytes]."""
+        return self.ring.size * 4 // self._context.num_envs
+
+    def launch(self, value: Any, counter: Any) -> None:
+        """Append the reading of this update; ``counter`` [1] counts updates on the device."""
+        c = self._context
+        dim = (c.num_envs, self.part.count)
+        c.launch(append_history, dim, value, self.part.start, counter, c.clock.age, self.ring)

@@ -1,0 +1,133 @@
+"""Runtimes of kinematic and proximity taxels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import warp
+from robotics_bridge.sensors.probes.kernels.probe import KinematicParams, kinematic_kernel
+from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
+from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
+from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
+from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityParams, proximity_kernel
+
+if TYPE_CHECKING:
+    from robotics_bridge.physics.state import HandState
+    from robotics_bridge.sensors.context import SuiteContext
+    from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
+    from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
+
+wp = warp()
+
+
+class KinematicRuntime(ProbeRuntime):
+    """Serves kinematic taxels of one group."""
+
+    def __init__(self, sensors: Mapping[str, KinematicTaxel], context: SuiteContext) -> None:
+        first = next(iter(sensors.values()))
+        scaled = first.total == "engine"
+        super().__init__(sensors, 6, context, fusable=not scaled)
+        self._kernel = kinematic_kernel(
+            self.kinds, first.query == "raycast", first.convention == "physical", self.mode, *self.stores,
+            context.device.is_cuda,
+        )  # fmt: skip
+        laws = []
+        for sensor in sensors.values():
+            law = KinematicParams()
+            for name in ("stiffness", "damping", "exponent", "shear", "twist"):
+                setattr(law, name, getattr(sensor, name))
+            laws.append(law)
+        self._laws = context.array(laws, KinematicParams)
+        shape = (len(laws), context.num_envs)
+        self._loads: Any = context.zeros(shape, wp.vec3f) if scaled else None
+        self._scales = context.zeros(shape)
+        parts = list(self.slices.values())
+        spans = [(p.start, p.start + p.count, slot) for p, slot in zip(parts, self.slots, strict=True)]
+        self._spans = context.array(spans, wp.vec3i)
+        self._rows = context.array(probe_rows(parts, context, self.mode), wp.vec4i)
+
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state."""
+        self.begin(state, dt)
+        c = self.context
+        inputs = [self.probes, self._rows, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._laws]
+        c.launch(self._kernel, (c.num_envs, self._rows.shape[0]), *inputs)
+        if self._loads is not None:
+            self._scale(state)
+        self.finish(dt)
+
+    def _scale(self, state: HandState) -> None:
+        """Make the field push as the engine does."""
+        c, plan = self.context, self.context.pairs.plan
+        self._loads.zero_()
+        contacts = [state.contact_count, state.contact_geom, state.contact_env]
+        contacts += [state.contact_normal, state.contact_force]
+        room = state.contact_env.shape[0]
+        c.launch(gather_loads, room, self._spans, plan, c.solids.struct.link, *contacts, self._loads)
+        inputs = [self._spans, plan, state.pose, self._truth, self._loads, self._scales]
+        c.launch(weigh_field, self._loads.shape, *inputs)
+        self.launch(scale_field, self.part, self._scales, self._truth, self._measured, int(self.noisy))
+
+
+class ProximityRuntime(ProbeRuntime):
+    """Serves proximity taxels that track the same geometries."""
+
+    def __init__(self, sensors: Mapping[str, ProximityTaxel], context: SuiteContext) -> None:
+        super().__init__(sensors, 6, context, reach=max(sensor.noise.radius for sensor in sensors.values()))
+        first = next(iter(sensors.values()))
+        tracked, rows = first.tracked(context.scene), context.solids.rows
+        self.cloud = sample_cloud(context.scene, tracked, first.points, rows, context.device)
+        laws, densities = [], np.zeros((len(sensors), rows))
+        for row, sensor in zip(densities, sensors.values(), strict=True):
+            law = ProximityParams()
+            law.stiffness, law.coupling = sensor.stiffness, sensor.coupling
+            laws.append(law)
+            row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
+        self._laws, self._densities = context.array(laws, ProximityParams), context.array(densities, float)
+        self._links = context.array([context.scene.link_index(sensor.link) for sensor in sensors.values()], int)
+        # A processor walks through all probes of an environment anyway, so it may list their points in between.
+        self.gathered = not context.device.is_cuda
+        self._options = (first.convention == "physical", self.mode, *self.stores)
+        room = self.cloud.total + len(tracked) + 1
+        self._near = context.zeros((context.num_envs, room) if self.gathered else (1, 1), int)
+        self._cells = self._cluster(list(sensors.values())) if self.gathered else ()
+
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state."""
+        self.begin(state, dt)
+        kernel, c = proximity_kernel(*self._options, self.gathered), self.context
+        inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self.knobs, self._laws, self._densities]
+        inputs += [self._links, state.pose, state.velocity, self._near]
+        if self.gathered:
+            c.launch(kernel, c.num_envs, *inputs, *self._cells)
+        else:
+            self.launch(kernel, *inputs)
+        self.finish(dt)
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Memory per environment [bytes] that every update writes anew: points near a cell of probes."""
+        return 4 * self._near.shape[1] if self.gathered else 0
+
+    def _cluster(self, sensors: list[ProximityTaxel]) -> tuple[Any, Any, Any]:
+        """Return the probes [N] by cell, cells (first, end, slot) [C, 3], and spheres [C, 4] around their reach."""
+        context, members, cells, around = self.context, [], [], []
+        for sensor, part, slot in zip(sensors, self.slices.values(), self.slots, strict=True):
+            position, radius = sensor.probes.position, sensor.probes.radius + sensor.noise.radius
+            first = part.start
+            for chosen in halve(position, np.arange(part.count), CELL):
+                middle = 0.5 * (position[chosen].min(axis=0) + position[chosen].max(axis=0))
+                far = (np.linalg.norm(position[chosen] - middle, axis=1) + radius[chosen]).max()
+                # Rounding must not lose a point at the rim.
+                around.append((*middle, far * (1 + 1e-5) + 1e-7))
+                cells.append((first, first + len(chosen), slot))
+                members.append(part.start + chosen)
+                first += len(chosen)
+        return (
+            context.array(np.concatenate(members), int),
+            context.array(cells, wp.vec3i),
+            context.array(around, wp.vec4f),
+        )
