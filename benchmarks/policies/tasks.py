@@ -138,12 +138,12 @@ def split(options: argparse.Namespace, out: Path) -> None:
 
         def physics(env: Env = env) -> None:
             for substep in range(env.decimation):
-                env.drives.launch(substep)
-                env.world.step()
+                env.state.actuators.launch(substep)
+                env.simulation.step()
 
         def touch(env: Env = env) -> None:
             for substep in range(env.decimation):
-                env.touch.update(env.world.state, env.physics_dt, substep)  # type: ignore[union-attr]
+                env.touch.update(env.simulation.state, env.simulation.timestep, substep)  # type: ignore[union-attr]
 
         observations = trainer.env.get_observations()
         with torch.inference_mode():

@@ -39,7 +39,7 @@ class TouchAndHold:
         self._columns = [env.action_names.index(f"carriage_{axis}") for axis in "xyz"]
         scales = env.action_map.scale
         self._scale = torch.as_tensor(scales[self._columns], dtype=torch.float32)
-        self._tip = env.world.engine.scene.link_index("right_hand_mid_link2")
+        self._tip = env.simulation.engine.scene.link_index("right_hand_mid_link2")
         self._end = torch.tensor([0.0015, 0.0, 0.0336])
         self._step = 0
 
@@ -49,10 +49,12 @@ class TouchAndHold:
         env = self.env
         rows = torch.arange(env.num_envs)
         ball = env.object_pose[rows, env.target, :3]
-        pose = env.world.state.pose_torch[:, self._tip]
+        pose = env.simulation.state.pose_torch[:, self._tip]
         quat = torch.cat((pose[:, 6:], pose[:, 3:6]), dim=1)
         tip = pose[:, :3] + rotate(quat, self._end)
-        slides = env.world.qpos[:, [env.drives.positions[env.joint_names.index(f"carriage_{a}")] for a in "xyz"]]
+        slides = env.simulation.qpos[
+            :, [env.state.actuators.qpos_columns[env.joint_names.index(f"carriage_{a}")] for a in "xyz"]
+        ]
         goal = ball.clone()
         goal[:, 2] += 0.04 + 0.0088
         away = (goal - tip)[:, :2].norm(dim=1)
@@ -75,7 +77,7 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     task = replace(
         published(),
-        watch=None,
+        task_state=None,
         actuators=None,
         groups={},
         rewards={},
@@ -83,10 +85,12 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
         episode=1e4,
     )
     env = tasks.make(task, num_envs=envs, seed=seed)
-    env.target.copy_(torch.arange(envs) % task.copies)
+    env.state.episode.target.copy_(torch.arange(envs) % task.copies)
     grids = {
         (law, *cell): Thermometers(
-            env, ThermalSettings(conductivity=cell[0], emissivity=cell[1], heat=cell[2], conduction=law), chooses=False
+            env.state,
+            ThermalSettings(conductivity=cell[0], emissivity=cell[1], heat=cell[2], conduction=law),
+            chooses=False,
         )
         for law in ("thesis", "physical")
         for cell in CELLS
@@ -103,8 +107,8 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
     for step in range(steps):
         env.step(act(None))
         for key, grid in grids.items():
-            grid.during(env.step_dt)
-            grid.judge(env.step_dt)
+            grid.after_physics_step(env.step_dt)
+            grid.update_latch(env.step_dt)
             value = grid.temperature().amax(dim=1)
             warmest[key] = torch.maximum(warmest[key], value)
             trace[key].append(float(value.median()))

@@ -38,7 +38,7 @@ def t_interval(values: ArrayLike, level: float = LEVEL, *, over: str = "values")
     return Interval(mean - half, mean + half, level, f"t over {len(array)} {over}")
 
 
-def wilson_interval(successes: int, count: int, level: float = LEVEL, *, over: str = "trials") -> Interval:
+def wilson_interval(successes: float, count: int, level: float = LEVEL, *, over: str = "trials") -> Interval:
     """Return Wilson's score interval of a proportion of independent trials (Wilson 1927).
 
     Raises:
@@ -58,7 +58,13 @@ def wilson_interval(successes: int, count: int, level: float = LEVEL, *, over: s
 
 
 def newcombe_interval(
-    successes: int, count: int, other_successes: int, other_count: int, level: float = LEVEL, *, over: str = "trials"
+    successes: float,
+    count: int,
+    other_successes: float,
+    other_count: int,
+    level: float = LEVEL,
+    *,
+    over: str = "trials",
 ) -> Interval:
     """Return the interval of the difference of two independent proportions (Newcombe 1998, method 10).
 

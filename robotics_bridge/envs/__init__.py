@@ -1,8 +1,13 @@
-"""Batched environments of dexterous tasks, and adapters to rsl_rl and gymnasium."""
+"""Batched environments of dexterous tasks, and adapters to rsl_rl and gymnasium.
+
+``options`` say how a task is simulated; ``state`` holds the parts and the memory of a batch; ``reset`` begins episodes;
+``step`` goes from an action over physics to ``observations`` and rewards; ``env`` puts them together.
+"""
 
 from __future__ import annotations
 
 from robotics_bridge.envs.actions import ActionMap
-from robotics_bridge.envs.env import ENGINES, Env
+from robotics_bridge.envs.env import Env
+from robotics_bridge.envs.options import ENGINES, EnvOptions
 
-__all__ = ["ENGINES", "ActionMap", "Env"]
+__all__ = ["ENGINES", "ActionMap", "Env", "EnvOptions"]

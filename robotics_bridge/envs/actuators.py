@@ -1,4 +1,4 @@
-"""Imperfect position drives: the published actuator randomisation as one kernel per physics step.
+"""Imperfect position actuators: the published randomisation as one kernel per physics step.
 
 Torque = strength · (stiffness · e − damping · q̇ + kick · sign e) + noise, held within the joint's effort. The error e
 is between target and measured position, which carries a bias and the play of the gears (a stop operator on the
@@ -17,62 +17,66 @@ from brainbench.core.devices import warp
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.envs.simulation import World
+    from robotics_bridge.envs.simulation import Simulation
     from robotics_bridge.tasks.scenes import TaskModel
     from robotics_bridge.tasks.task import ActuatorRandomisation
 
-_DRAWN = ("stiffness", "damping", "strength", "bias", "deadband", "backlash", "kick")
-_KEPT = ("play", "before")
+_IMPERFECTIONS = ("strength", "bias", "deadband", "backlash", "kick")
 
 
-class Drives:
-    """Drives of all joints of all environments."""
+class Actuators:
+    """Actuators of all joints of all environments."""
 
     def __init__(
-        self, world: World, model: TaskModel, changes: ActuatorRandomisation | None, *, substeps: int, seed: int
+        self,
+        simulation: Simulation,
+        model: TaskModel,
+        changes: ActuatorRandomisation | None,
+        *,
+        substeps: int,
+        seed: int,
     ) -> None:
         import torch
 
-        from robotics_bridge.envs.kernels.actuation import environment_kernels
-
-        self._world, self._changes, self._substeps, self._seed = world, changes, substeps, seed & 0x3FFFFFFF
-        self._kernels = environment_kernels()
-        device, count, joints = world.device, world.num_envs, len(model.joints)
-        first = model.models[0]
+        self._simulation, self._changes, self._substeps, self._seed = simulation, changes, substeps, seed & 0x3FFFFFFF
+        device, first = simulation.device, simulation.model
         ids = [first.joint(name).id for name in model.joints]
-        self.positions = torch.as_tensor(np.array(first.jnt_qposadr[ids]), device=device).long()
+        self.qpos_columns = torch.as_tensor(np.array(first.jnt_qposadr[ids]), device=device).long()
         """[J] columns of ``qpos``."""
-        self.speeds = torch.as_tensor(np.array(first.jnt_dofadr[ids]), device=device).long()
+        self.qvel_columns = torch.as_tensor(np.array(first.jnt_dofadr[ids]), device=device).long()
         """[J] columns of ``qvel``."""
         self.nominal = {
             name: torch.as_tensor(getattr(model, name), dtype=torch.float32, device=device)
             for name in ("stiffness", "damping", "effort")
         }
-        shape = (count, joints)
-        self.values = {name: torch.zeros(shape, device=device) for name in (*_DRAWN, *_KEPT)}
-        self.target = torch.zeros(shape, device=device)
-        """[B, J] positions that the drives seek (rad)."""
-        self.power = torch.zeros(shape, device=device)
+
+        def zeros() -> torch.Tensor:
+            return torch.zeros(simulation.num_envs, len(ids), device=device)
+
+        names = ("stiffness", "damping", *_IMPERFECTIONS, "play", "before")
+        self.values = {name: zeros() for name in names}
+        """[B, J] gains and imperfections, and what the gears remember (as in ``ActuatorArrays``)."""
+        self.target = zeros()
+        """[B, J] positions that the actuators seek (rad)."""
+        self.power = zeros()
         """[B, J] mean |torque · speed| over the last control step (W)."""
         self._tick = torch.zeros(1, dtype=torch.int32, device=device)
         self._noise = self.nominal["effort"] * (changes.torque_noise if changes else 0.0)
         wp = warp()
-        drive = self._kernels.Drive()
+        from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
+
+        self._actuate, self._count = actuate, count_launch
+        self._arrays = ActuatorArrays()
         for name, value in self.values.items():
-            setattr(drive, name, wp.from_torch(value, dtype=wp.float32))
-        drive.effort = wp.from_torch(self.nominal["effort"])
-        drive.noise = wp.from_torch(self._noise)
+            setattr(self._arrays, name, wp.from_torch(value, dtype=wp.float32))
+        self._arrays.effort, self._arrays.noise = wp.from_torch(self.nominal["effort"]), wp.from_torch(self._noise)
         channels = [first.actuator(name).id for name in model.joints]
         columns = {"position": first.jnt_qposadr[ids], "speed": first.jnt_dofadr[ids], "channel": channels}
         for name, numbers in columns.items():
-            column = wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=world.warp_device)
-            setattr(drive, name, column)
-        self._drive = drive
-        self._arrays: dict[str, Any] = {
-            name: wp.from_torch(value)
-            for name, value in (("target", self.target), ("power", self.power), ("tick", self._tick))
-        }
-        self._arrays |= {name: wp.from_torch(getattr(world, name)) for name in ("qpos", "qvel", "ctrl")}
+            column = wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=simulation.warp_device)
+            setattr(self._arrays, name, column)
+        shared = (simulation.qpos, simulation.qvel, self.target, self._tick, simulation.ctrl, self.power)
+        self._qpos, self._qvel, self._target, self._ticks, self._ctrl, self._power = map(wp.from_torch, shared)
 
     def reset(self, mask: torch.Tensor, draw: Any) -> None:
         """Draw imperfections anew in some environments [B] bool.
@@ -84,8 +88,7 @@ class Drives:
         import torch
 
         column, joints = mask.unsqueeze(1), self.target.shape[1]
-        position = self._world.qpos[:, self.positions]
-        c = self._changes
+        position, c = self._simulation.qpos[:, self.qpos_columns], self._changes
         values = {"stiffness": self.nominal["stiffness"], "damping": self.nominal["damping"]}
         if c is not None:
             values = {
@@ -108,23 +111,24 @@ class Drives:
         self._tick.zero_()
 
     def launch(self, substep: int) -> None:
-        """Write the torques of one physics step to the world's ``ctrl``."""
-        wp, a, device = warp(), self._arrays, self._world.warp_device
-        inputs = [self._drive, a["qpos"], a["qvel"], a["target"], self._seed, a["tick"]]
-        inputs += [int(substep == 0), 1.0 / self._substeps, a["ctrl"], a["power"]]
-        wp.launch(self._kernels.drive, dim=self.target.shape, inputs=inputs, device=device)
-        wp.launch(self._kernels.count, dim=1, inputs=[a["tick"]], device=device)
+        """Write the torques of one physics step to the simulation's ``ctrl``."""
+        wp, device = warp(), self._simulation.warp_device
+        inputs = [self._arrays, self._qpos, self._qvel, self._target, self._seed, self._ticks]
+        inputs += [int(substep == 0), 1.0 / self._substeps, self._ctrl, self._power]
+        wp.launch(self._actuate, dim=self.target.shape, inputs=inputs, device=device)
+        wp.launch(self._count, dim=1, inputs=[self._ticks], device=device)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return all memory."""
-        own = {**self.values, "target": self.target, "power": self.power, "tick": self._tick}
         import torch
 
-        return {**{name: value.clone() for name, value in own.items()}, "seed": torch.tensor(self._seed)}
+        return {name: value.clone() for name, value in self._memory().items()} | {"seed": torch.tensor(self._seed)}
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned."""
-        own = {**self.values, "target": self.target, "power": self.power, "tick": self._tick}
-        for name, value in own.items():
+        for name, value in self._memory().items():
             value.copy_(values[name])
         self._seed = int(values["seed"])
+
+    def _memory(self) -> dict[str, torch.Tensor]:
+        return {**self.values, "target": self.target, "power": self.power, "tick": self._tick}

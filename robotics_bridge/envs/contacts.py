@@ -16,7 +16,7 @@ from brainbench.core.rotations import conjugate, from_xyzw, rotate
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.envs.simulation import World
+    from robotics_bridge.envs.simulation import Simulation
     from robotics_bridge.tasks.scenes import TaskModel
 
 _REACH = 0.5
@@ -28,17 +28,17 @@ _LIMIT = 10.0
 class Contacts:
     """Privileged senses of a task, read once per control step."""
 
-    def __init__(self, world: World, model: TaskModel, *, step_dt: float, seed: int) -> None:
+    def __init__(self, simulation: Simulation, model: TaskModel, *, step_dt: float, seed: int) -> None:
         import torch
 
-        from robotics_bridge.envs.kernels.actuation import environment_kernels
+        from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
         from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
 
-        wp, scene, device = warp(), world.engine.scene, world.warp_device
-        self._world, self._kernels, self._dt = world, environment_kernels(), step_dt
+        wp, scene, device = warp(), simulation.engine.scene, simulation.warp_device
+        self._simulation, self._kernel, self._dt = simulation, add_contact_forces, step_dt
         tips = list(model.tips)
         self._tips = len(tips)
-        self.tip_links = torch.as_tensor([scene.link_index(tip) for tip in tips], device=world.device)
+        self.tip_links = torch.as_tensor([scene.link_index(tip) for tip in tips], device=simulation.device)
         """[F] numbers of the links of finger tips."""
         probes = {
             tip: SurfaceDistanceProbe(
@@ -49,27 +49,29 @@ class Contacts:
             )
             for tip, point in model.tips.items()
         }
-        self._suite = SensorSuite(scene, probes, num_envs=world.num_envs, device=device, seed=seed)
+        self._suite = SensorSuite(scene, probes, num_envs=simulation.num_envs, device=device, seed=seed)
         (runtime,) = self._suite.runtimes
         self.planes: torch.Tensor = wp.to_torch(runtime.measured())
         """[1, B, F] distances in the order of the suite (m)."""
         order = [runtime.slices[tip].start for tip in tips]
-        self._order = torch.as_tensor(order, device=world.device)
+        self._order = torch.as_tensor(order, device=simulation.device)
         rows = np.full(len(scene.geometries), -1, dtype=np.int32)
         for row, link in enumerate((*tips, *model.objects)):
             rows[list(scene.geometries_of(link))] = row
         self._rows = wp.array(rows, dtype=wp.int32, device=device)
-        self._forces: Any = wp.zeros((world.num_envs, len(tips) + len(model.objects)), dtype=wp.vec3f, device=device)
+        self._forces: Any = wp.zeros(
+            (simulation.num_envs, len(tips) + len(model.objects)), dtype=wp.vec3f, device=device
+        )
         self.forces: torch.Tensor = wp.to_torch(self._forces)
         """[B, F + K, 3] net normal contact forces on finger tips, then on objects, world axes (N); a view."""
 
     def read(self) -> None:
-        """Take forces and distances from the world's state."""
-        wp, state = warp(), self._world.state
+        """Take forces and distances from the simulation's state."""
+        wp, state = warp(), self._simulation.state
         self._forces.zero_()
         inputs = [state.contact_count, state.contact_geom, state.contact_env, state.contact_normal]
         inputs += [state.contact_force, self._rows, self._forces]
-        wp.launch(self._kernels.forces, dim=state.contact_env.shape[0], inputs=inputs, device=self._world.warp_device)
+        wp.launch(self._kernel, dim=state.contact_env.shape[0], inputs=inputs, device=self._simulation.warp_device)
         self._suite.update(state, self._dt)
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -79,7 +81,7 @@ class Contacts:
     def refresh(self, mask: torch.Tensor) -> None:
         """Take distances of new episodes, which have no contacts yet, from the refreshed state."""
         self.forces.masked_fill_(mask[:, None, None], 0.0)
-        self._suite.update(self._world.state, self._dt)
+        self._suite.update(self._simulation.state, self._dt)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of what was read last."""
@@ -97,7 +99,7 @@ class Contacts:
     @property
     def tip_force(self) -> torch.Tensor:
         """Net normal contact force [B, F, 3] on finger tips in their own frame, within ±10 N as published."""
-        turn = conjugate(from_xyzw(self._world.pose[:, self.tip_links, 3:]))
+        turn = conjugate(from_xyzw(self._simulation.pose[:, self.tip_links, 3:]))
         return rotate(turn, self.forces[:, : self._tips]).clamp(-_LIMIT, _LIMIT).nan_to_num()
 
     @property

@@ -91,13 +91,13 @@ class GoalState:
         self.missed.copy_((self.left <= 0) & ~self.reached)
         self.count += self.reached
 
-    def practise(self) -> None:
-        """Begin the curriculum of a goal that has one: from now on its threshold is wide and narrows."""
+    def start_curriculum(self) -> None:
+        """Start the curriculum of a goal that has one: from now on its threshold is wide and narrows."""
         if self.goal is not None and self.goal.start_threshold is not None:
             self.threshold.fill_(self.goal.start_threshold)
             self._tally.zero_()
 
-    def account(self, done: torch.Tensor) -> None:
+    def count_episodes(self, done: torch.Tensor) -> None:
         """Count the episodes that end [B] bool, and narrow the threshold when enough of them succeeded."""
         import torch
 

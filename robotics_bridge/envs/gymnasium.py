@@ -44,7 +44,7 @@ class GymVectorEnv(VectorEnv):
     """
 
     def __init__(self, env: Env, groups: tuple[str, ...] = ()) -> None:
-        if not env.keeps_final:
+        if not env.options.keep_final:
             raise UsageError("Gymnasium needs the last observations of episodes: tasks.make(..., keep_final=True).")
         missing = [name for name in groups if name not in env.observation_shapes]
         if missing:

@@ -11,110 +11,106 @@ from brainbench.core.rotations import about, constant, multiply
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.envs.env import Env
+    from robotics_bridge.envs.state import EnvState
 
 
-class Resets:
+class EpisodeReset:
     """Starts new episodes of an environment batch, without looking at which from the host."""
 
-    def __init__(self, env: Env) -> None:
+    def __init__(self, state: EnvState) -> None:
         import torch
 
-        self._nominal = {name: value.clone() for name, value in env.world.fields.items()}
-        first = env.world.model
-        bodies = [first.body(name).id for name in env.model.objects]
-        geoms = np.flatnonzero(np.isin(np.asarray(first.geom_bodyid), bodies))
-        self._geoms = torch.as_tensor(geoms, device=env.device)
-        rows = torch.as_tensor(env.world.shape_of, device=env.device)
+        self._nominal = {name: value.clone() for name, value in state.simulation.fields.items()}
+        bodies = state.object_bodies.cpu().numpy()
+        geoms = np.flatnonzero(np.isin(np.asarray(state.simulation.model.geom_bodyid), bodies))
+        self._geoms = torch.as_tensor(geoms, device=state.device)
 
         def floats(values: object) -> torch.Tensor:
-            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=env.device)
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=state.device)
 
-        self._bottom = floats([shape.bottom for shape in env.model.shapes])[rows]
+        self._bottom = floats([shape.bottom for shape in state.model.shapes])[state.shape_of]
         self._grasps = None
-        if env.task.starts == "grasps":
+        if state.task.starts == "grasps":
             from robotics_bridge.envs.grasps import grasps_for
 
-            self._grasps = {k: floats(v) for k, v in grasps_for(env.task, env.hand, env.model).items()}
+            self._grasps = {k: floats(v) for k, v in grasps_for(state.task, state.hand, state.model).items()}
             # Grasps belong to a shape: each environment takes one of its own.
-            self._grasp_rows = self._grasps["rows"][rows].long()
-        sites = env.task.placement.sites
+            self._grasp_rows = self._grasps["rows"][state.shape_of].long()
+        sites = state.task.placement.sites
         self._sites = floats(sites) if sites else None
-        self.first = True
-        """Whether no episode began yet: friction and mass are drawn then in any case."""
 
-    def begin(self, env: Env, mask: torch.Tensor) -> None:
+    def __call__(self, state: EnvState, mask: torch.Tensor) -> None:
         """Start new episodes where the mask [B] bool is set."""
         import torch
 
-        column = mask.unsqueeze(1)
-        qpos, home = self._starts(env)
-        env._home.copy_(torch.where(column, home, env._home))
-        self._change_objects(env, mask)
-        env.world.reset(mask, qpos)
-        env.drives.reset(mask, env._draw)
-        if env.watch is not None:
-            env.watch.reset(mask)
-        for buffer in (env.action, env.last_action, env._sums):
+        column, episode, simulation = mask.unsqueeze(1), state.episode, state.simulation
+        qpos, targets = self._starts(state)
+        episode.rest_targets.copy_(torch.where(column, targets, episode.rest_targets))
+        self._randomise_objects(state, mask)
+        simulation.reset(mask, qpos)
+        state.actuators.reset(mask, state.draw)
+        if state.task_state is not None:
+            state.task_state.reset(mask)
+        for buffer in (episode.action, episode.last_action, episode.reward_sums):
             buffer.masked_fill_(column, 0.0)
-        for buffer in (env.episode_length_buf, env._steps, env._return, env.metric):
+        for buffer in (episode.age, episode.steps, episode.returns, episode.metric):
             buffer.masked_fill_(mask, 0)
-        joints = env.world.qpos[:, env.drives.positions]
-        env._start_joints.copy_(torch.where(column, joints, env._start_joints))
-        place = env.object_pose[env.rows, env.target, :3]
-        env._start_position.copy_(torch.where(column, place, env._start_position))
-        if env.task.push is not None:
-            fresh = env._draw(1, *env.task.push.interval)[:, 0]
-            env._push_left.copy_(torch.where(mask, fresh, env._push_left))
-        env.goals.reset(mask, env._object_quat(), env._draw)
-        if env.touch is not None:
-            env.touch.reset(mask)
-        env.contacts.reset(mask)
-        env.world.refresh()
-        env.contacts.refresh(mask)
-        self.first = False
+        joints, pose = simulation.qpos[:, state.actuators.qpos_columns], state.target_pose
+        episode.start_joints.copy_(torch.where(column, joints, episode.start_joints))
+        episode.start_position.copy_(torch.where(column, pose[:, :3], episode.start_position))
+        if state.task.push is not None:
+            fresh = state.draw(1, *state.task.push.interval)[:, 0]
+            episode.push_left.copy_(torch.where(mask, fresh, episode.push_left))
+        state.goals.reset(mask, pose[:, 3:], state.draw)
+        if state.touch is not None:
+            state.touch.reset(mask)
+        state.contacts.reset(mask)
+        simulation.refresh()
+        state.contacts.refresh(mask)
+        state.started = True
 
-    def _starts(self, env: Env) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return positions [B, nq] for new episodes, and the drives' targets [B, J] without action."""
+    def _starts(self, state: EnvState) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return positions [B, nq] for new episodes, and the actuators' targets [B, J] without action."""
         import torch
 
-        place, count = env.task.placement, len(env.model.objects)
-        qpos = env.world.start.clone()
+        place, count, joints = state.task.placement, len(state.model.objects), state.actuators.qpos_columns
+        qpos = state.simulation.start.clone()
         if self._grasps is not None:
             size = self._grasp_rows.shape[1]
-            pick = (env._draw(1, 0.0, 1.0)[:, 0] * size).long().clamp(max=size - 1)
+            pick = (state.draw(1, 0.0, 1.0)[:, 0] * size).long().clamp(max=size - 1)
             row = self._grasp_rows.gather(1, pick.unsqueeze(1))[:, 0]
-            qpos[:, env.drives.positions] = self._grasps["joints"][row]
-            qpos[:, env._object_columns] = self._grasps["object"][row]
+            qpos[:, joints] = self._grasps["joints"][row]
+            qpos[:, state.object_qpos] = self._grasps["object"][row]
             return qpos, self._grasps["target"][row]
-        qpos[:, env.drives.positions] = env._rest
-        poses = torch.zeros(env.num_envs, count, 7, device=env.device)
-        home = constant(place.quaternion, poses).expand(env.num_envs, -1)
+        qpos[:, joints] = state.rest
+        poses = torch.zeros(state.num_envs, count, 7, device=state.device)
+        upright = constant(place.quaternion, poses).expand(state.num_envs, -1)
         up = constant((0.0, 0.0, 1.0), poses)
         if self._sites is not None:
-            order = env._draw(len(self._sites), 0.0, 1.0).argsort(dim=1)[:, :count]
+            order = state.draw(len(self._sites), 0.0, 1.0).argsort(dim=1)[:, :count]
             poses[..., :3] = self._sites[order]
         for index in range(count):
-            x, y, yaw = (env._draw(1, *span)[:, 0] for span in (place.x, place.y, place.yaw))
+            x, y, yaw = (state.draw(1, *span)[:, 0] for span in (place.x, place.y, place.yaw))
             poses[:, index, 0] += x
             poses[:, index, 1] += y
             poses[:, index, 2] += place.height + self._bottom
-            poses[:, index, 3:] = multiply(about(up, yaw), home)
-        qpos[:, env._object_columns] = poses.flatten(1)
-        return qpos, env._rest.expand_as(env._home)
+            poses[:, index, 3:] = multiply(about(up, yaw), upright)
+        qpos[:, state.object_qpos] = poses.flatten(1)
+        return qpos, state.rest.expand_as(state.episode.rest_targets)
 
-    def _change_objects(self, env: Env, mask: torch.Tensor) -> None:
+    def _randomise_objects(self, state: EnvState, mask: torch.Tensor) -> None:
         """Draw friction and mass of the objects anew where the mask [B] is set."""
         import torch
 
-        nominal, changes, fields = self._nominal, env.task.object_changes, env.world.fields
-        if not (changes.each_reset or self.first):
+        nominal, changes, fields = self._nominal, state.task.object_changes, state.simulation.fields
+        if state.started and not changes.each_reset:
             return
-        ratio, offset = env._draw(1, *changes.friction), env._draw(1, *changes.mass_offset)
-        bodies, geoms, column = env._bodies, self._geoms, mask.unsqueeze(1)
+        ratio, offset = state.draw(1, *changes.friction), state.draw(1, *changes.mass_offset)
+        bodies, geoms, column = state.object_bodies, self._geoms, mask.unsqueeze(1)
         mass = (nominal["body_mass"][:, bodies] + offset).clamp(min=1e-6)
         growth = (mass / nominal["body_mass"][:, bodies]).unsqueeze(2)
         inertia = nominal["body_inertia"][:, bodies] * growth
+        # What MuJoCo's mj_setConst derives for a body that moves freely.
         weights = torch.stack((1 / mass, (1 / inertia).mean(dim=2)), dim=2)
         values = {
             "body_mass": (bodies, mass), "body_subtreemass": (bodies, mass), "body_inertia": (bodies, inertia),
@@ -124,5 +120,5 @@ class Resets:
         for name, (where, value) in values.items():
             chosen = column if value.ndim == 2 else column.unsqueeze(2)
             fields[name][:, where] = torch.where(chosen, value, fields[name][:, where])
-        env.friction.copy_(torch.where(mask, ratio[:, 0], env.friction))
-        env.mass.copy_(torch.where(mask, mass[:, 0], env.mass))
+        state.episode.friction.copy_(torch.where(mask, ratio[:, 0], state.episode.friction))
+        state.episode.mass.copy_(torch.where(mask, mass[:, 0], state.episode.mass))

@@ -21,7 +21,7 @@ FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "g
 """Numbers of the model that differ between environments and change at resets."""
 
 
-class World:
+class Simulation:
     """Batched physics.
 
     Args:
@@ -36,7 +36,7 @@ class World:
     """
 
     def __init__(
-        self, models: Sequence[Any], num_envs: int, *, device: str, engine: str, threads: int | None = None
+        self, models: Sequence[Any], num_envs: int, *, device: str, engine: str | None, threads: int | None = None
     ) -> None:
         import torch
 
@@ -54,8 +54,9 @@ class World:
         self.shape_of = order
         """Number [B] of the shape that each environment has."""
         nominal = {name: np.stack([getattr(m, name) for m in models])[order] for name in FIELDS}
-        self.native = engine == "warp"
-        if self.native:
+        self.uses_warp = engine == "warp"
+        """Whether MuJoCo Warp simulates; C MuJoCo otherwise."""
+        if self.uses_warp:
             self.engine: Any = MujocoWarpEngine(list(models), num_envs, device=device, fields=nominal)
             self.qpos, self.qvel, self.ctrl = self.engine.qpos, self.engine.qvel, self.engine.ctrl
             self.push = warp().to_torch(self.engine.data.xfrc_applied)
@@ -87,7 +88,7 @@ class World:
 
     def step(self) -> None:
         """Advance all environments by one physics step with ``ctrl`` and ``push``."""
-        if self.native:
+        if self.uses_warp:
             self.engine.step()
             return
         self.engine.set(ctrl=self.ctrl.numpy())
@@ -96,7 +97,7 @@ class World:
 
     def apply_push(self) -> None:
         """Hand ``push`` (force and torque on bodies [B, nbody, 6], N and N·m, world axes) to the engine."""
-        if self.native:
+        if self.uses_warp:
             return
         pushing = bool(self.push.any())
         if pushing or self._pushed:
@@ -122,7 +123,7 @@ class World:
         self.ctrl.masked_fill_(column, 0.0)
         self.push.masked_fill_(column.unsqueeze(2), 0.0)
         self._time.masked_fill_(mask, 0.0)
-        if self.native:
+        if self.uses_warp:
             self._warmstart.masked_fill_(column, 0.0)
             return
         mujoco = mujoco_module()
@@ -138,7 +139,7 @@ class World:
 
         own = {"ctrl": self.ctrl, "push": self.push, "qpos": self.qpos, "qvel": self.qvel}
         own |= {f"field.{name}": value for name, value in self.fields.items()}
-        if self.native:
+        if self.uses_warp:
             own["warmstart"] = self._warmstart
             own["time"] = self._time
         else:
@@ -151,7 +152,7 @@ class World:
             value.copy_(values[f"field.{name}"])
         for name in ("ctrl", "push", "qpos", "qvel"):
             getattr(self, name).copy_(values[name])
-        if self.native:
+        if self.uses_warp:
             self._warmstart.copy_(values["warmstart"])
             self._time.copy_(values["time"])
         else:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.devices import mujoco_module, warp
+from brainbench.core.rotations import to_matrices
 from robotics_bridge.hands.observations import (
     PATCH_FORCE_SCALE,
     TAXELS_IN_CONTACT,
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 
+    from robotics_bridge.envs.options import EnvOptions
+    from robotics_bridge.envs.simulation import Simulation
     from robotics_bridge.hands import Hand
-    from robotics_bridge.physics.scene import TouchScene
     from robotics_bridge.physics.state import HandState
     from robotics_bridge.tasks.scenes import TaskModel
 
@@ -53,7 +55,7 @@ class TactileLayout:
     radius: NDArray[np.float64]
     """[N] sensing radius (m)."""
     rest: NDArray[np.float64]
-    """[L, 7] poses of the links in the palm's frame at the task's rest position (x y z, qx qy qz qw)."""
+    """[L, 7] poses of the links in the palm's frame at the task's rest position (x y z, qw qx qy qz)."""
     base_position: NDArray[np.float64]
     """[N, 3] in the palm's frame at rest (m)."""
     base_normal: NDArray[np.float64]
@@ -66,44 +68,25 @@ class TactileObservation:
     Args:
         model: physics of the task.
         hand: the hand.
-        scene: what the engine simulates.
-        observe: an observation type other than ``none``.
-        placement: ``hand``, ``fingers``, ``tips`` or ``palm``.
-        resolution: ``low``, ``med`` or ``high``.
-        noisy: with the published imperfections.
-        num_envs: B.
+        simulation: what moves the hand.
+        options: of the environments, with an observation type other than ``none``.
         substeps: S.
-        device: Warp device.
-        seed: of the noise.
-        knobs: further settings of the sensor class.
 
     Raises:
         UsageError: a name is unknown.
     """
 
     def __init__(
-        self,
-        model: TaskModel,
-        hand: Hand,
-        scene: TouchScene,
-        *,
-        observe: str,
-        placement: str,
-        resolution: str,
-        noisy: bool,
-        num_envs: int,
-        substeps: int,
-        device: Any,
-        seed: int,
-        knobs: dict[str, Any],
+        self, model: TaskModel, hand: Hand, simulation: Simulation, options: EnvOptions, *, substeps: int
     ) -> None:
         import torch
 
+        observe, num_envs, device = options.observe, options.num_envs, simulation.warp_device
         kind = observation_type(observe)
-        taxels = hand.layout(resolution, placement)
+        taxels = hand.layout(options.resolution, options.placement)
         taxels = {link: probes for link, probes in taxels.items() if probes.active.any()}
-        sensors = sensors_for(observe, taxels, noisy=noisy, track=model.objects, **knobs)
-        self.suite = SensorSuite(scene, sensors, num_envs=num_envs, device=device, seed=seed)
+        sensors = sensors_for(observe, taxels, noisy=options.noisy, track=model.objects, **options.knobs)
+        self.suite = SensorSuite(simulation.engine.scene, sensors, num_envs=num_envs, device=device, seed=options.seed)
         self._name, self._substeps = observe, substeps
         active = {link: np.flatnonzero(probes.active) for link, probes in taxels.items()}
         counts = [len(active[link]) for link in taxels]
@@ -113,7 +96,7 @@ class TactileObservation:
             for name in ("position", "normal")
         )
         radius = np.concatenate([next(iter([sensors[link]])).probes.radius[active[link]] for link in taxels])  # type: ignore[attr-defined]
-        where = torch.device("cpu") if str(device) == "cpu" else warp().device_to_torch(device)
+        where = simulation.device
         self._parts: list[tuple[Any, torch.Tensor, torch.Tensor]] = []
         starts = dict(zip(taxels, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         for runtime in self.suite.runtimes:
@@ -139,12 +122,17 @@ class TactileObservation:
         self.reading = torch.zeros(num_envs, substeps, columns, kind.channels, device=where)
         """[B, S, N, C] of the last control step, oldest first; zeros after a reset."""
         rest = rest_poses(model, hand.palm, tuple(taxels))
+        axes = to_matrices(rest[links, 3:])
+
+        def turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.einsum("nij,nj->ni", axes, vectors)
+
         self.layout = TactileLayout(
-            observe=observe, placement=placement, resolution=resolution, noisy=noisy,
+            observe=observe, placement=options.placement, resolution=options.resolution, noisy=options.noisy,
             units=type(next(iter(sensors.values()))).units, channels=kind.channels, links=tuple(taxels), link=links,
             position=position, normal=normal, radius=radius, rest=rest,
-            base_position=rest[links, :3] + _turn(rest[links, 3:], position),
-            base_normal=_turn(rest[links, 3:], normal),
+            base_position=rest[links, :3] + turn(position),
+            base_normal=turn(normal),
         )  # fmt: skip
 
     def update(self, state: HandState, dt: float, substep: int) -> None:
@@ -171,7 +159,7 @@ class TactileObservation:
 
 
 def rest_poses(model: TaskModel, base: str, links: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return the poses [L, 7] (x y z, qx qy qz qw) of links in the frame of a base link, joints at rest."""
+    """Return the poses [L, 7] (x y z, qw qx qy qz) of links in the frame of a base link, joints at rest."""
     mujoco = mujoco_module()
     first = model.models[0]
     data = mujoco.MjData(first)
@@ -181,17 +169,10 @@ def rest_poses(model: TaskModel, base: str, links: tuple[str, ...]) -> NDArray[n
     home = first.body(base).id
     matrix = data.xmat[home].reshape(3, 3)
     found = np.zeros((len(links), 7))
-    inverse, relative = np.zeros(4), np.zeros(4)
+    inverse = np.zeros(4)
     mujoco.mju_negQuat(inverse, data.xquat[home])
     for row, name in zip(found, links, strict=True):
         body = first.body(name).id
         row[:3] = matrix.T @ (data.xpos[body] - data.xpos[home])
-        mujoco.mju_mulQuat(relative, inverse, data.xquat[body])
-        row[3:] = (*relative[1:], relative[0])
+        mujoco.mju_mulQuat(row[3:], inverse, data.xquat[body])
     return found
-
-
-def _turn(quaternion: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    u, w = quaternion[:, :3], quaternion[:, 3:]
-    t = 2 * np.cross(u, vector)
-    return vector + w * t + np.cross(u, t)

@@ -7,10 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.statistics import wilson_interval
 
 if TYPE_CHECKING:
     import torch
+    from numpy.typing import ArrayLike
 
     from robotics_bridge.envs.env import Env
 
@@ -19,7 +23,7 @@ QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "
 AGENTS = ("zero", "random")
 """Agents that every trained one is held against."""
 _Z = 1.959964
-"""Normal quantile of a 95 % interval."""
+"""Normal quantile of a 95 % interval: episodes are many."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +60,9 @@ class PolicyEvaluation:
         return sum(self.success) / len(self.success)
 
     def interval(self) -> tuple[float, float]:
-        """Return the 95 % interval of the success rate (Wilson 1927)."""
-        n, p = len(self.success), self.success_rate
-        middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)
-        half = _Z / (1 + _Z**2 / n) * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n * n))
-        return max(middle - half, 0.0), min(middle + half, 1.0)
+        """Return the 95 % interval of the success rate."""
+        found = wilson_interval(sum(self.success), len(self.success), over="episodes")
+        return found.low, found.high
 
     def mean(self, name: str) -> tuple[float, float]:
         """Return mean and half width of its 95 % interval over episodes of one of :data:`QUANTITIES`.
@@ -70,10 +72,7 @@ class PolicyEvaluation:
         """
         if name not in QUANTITIES:
             raise unknown_name("quantity of an episode", name, QUANTITIES)
-        values = [float(value) for value in getattr(self, name)]
-        mean = sum(values) / len(values)
-        spread = sum((value - mean) ** 2 for value in values) / max(len(values) - 1, 1)
-        return mean, _Z * math.sqrt(spread / len(values))
+        return mean_of_episodes(getattr(self, name))
 
     def summary(self) -> dict[str, Any]:
         """Return what reports print, as plain numbers."""
@@ -84,6 +83,13 @@ class PolicyEvaluation:
         for name in (name for name in QUANTITIES if getattr(self, name)):
             facts[name], facts[f"{name}_half_width"] = self.mean(name)
         return facts
+
+
+def mean_of_episodes(values: ArrayLike) -> tuple[float, float]:
+    """Return the mean of a quantity of episodes [n], and the half width of its 95 % interval (0 for one episode)."""
+    array = np.asarray(values, dtype=float)
+    spread = array.std(ddof=1) if len(array) > 1 else 0.0
+    return float(array.mean()), float(_Z * spread / math.sqrt(len(array)))
 
 
 def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch.Tensor]], torch.Tensor]:

@@ -20,13 +20,14 @@ import numpy as np
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import content_hash, provenance, read_json
 from brainbench.core.records import Interval, ModelCard, Provenance, ResultRecord, Score, SubjectScore
+from brainbench.core.statistics import newcombe_interval, t_interval, wilson_interval
+from robotics_bridge.policies.evaluate import mean_of_episodes
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 EVALUATION, AGENTS = "evaluation.json", "agents.json"
 """Of a student; of the teacher and the agents that do nothing and anything, as ``policy evaluate --out`` writes it."""
 GRADED = ("metric", "goals", "turn_rate", "seconds", "returns", "dropped")
 """Quantities of an episode beside its success."""
-_Z = 1.959964
 _STOPPED = "stopped after"
 FEWEST_SEEDS = 3
 """Training seeds below which an interval says little about a new student."""
@@ -163,13 +164,13 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
     every = [item for member in members for item in member.evaluations]
     graded = {name: found for name in GRADED if (found := _grade(members, name)) is not None}
     episodes = sum(len(item["success"]) for item in every)
-    interval = t_interval(shares, f"t over {len(members)} training seeds")
+    interval = t_interval(shares, over="training seeds")
     note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
     if len(members) == 1:
         note = "one training seed: the interval covers chance in evaluation alone"
     if interval is None or len(set(shares)) == 1:
         # Equal shares, such as no success at all, tell nothing of their spread.
-        interval = wilson_interval(float(np.mean(shares)), episodes)
+        interval = wilson_interval(float(np.mean(shares)) * episodes, episodes, over="episodes")
     first, seeds = members[0].config, tuple(member.config.seed for member in members)
     metric = graded.get("metric", (math.nan, math.nan))[0]
     learned = tuple(member.learned for member in members)
@@ -197,11 +198,10 @@ def _grade(members: Sequence[_Member], name: str) -> tuple[float, float] | None:
     values = np.concatenate(seeds)
     if not len(values):
         return None
-    over = t_interval([float(found.mean()) for found in seeds if len(found)], "")
+    over = t_interval([float(found.mean()) for found in seeds if len(found)])
     if over is not None:
         return float(values.mean()), (over.high - over.low) / 2
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
-    return float(values.mean()), _Z * spread / math.sqrt(len(values))
+    return mean_of_episodes(values) if len(values) > 1 else (float(values.mean()), math.nan)
 
 
 def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult:
@@ -212,38 +212,12 @@ def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult
     if not common:
         return result
     gains = [own[seed] - other[seed] for seed in common]
-    interval = t_interval(gains, f"paired t over {len(common)} training seeds")
+    interval = t_interval(gains, over="paired training seeds")
     if len(common) == 1:
-        counts = (r.episodes // len(r.seeds) for r in (result, bare))
-        interval = newcombe_interval(own[common[0]], next(counts), other[common[0]], next(counts))
+        count, others = (r.episodes // len(r.seeds) for r in (result, bare))
+        share, bare_share = own[common[0]], other[common[0]]
+        interval = newcombe_interval(share * count, count, bare_share * others, others, over="episodes")
     return replace(result, gain=float(np.mean(gains)), difference=interval)
-
-
-def newcombe_interval(share: float, count: int, other: float, others: int) -> Interval:
-    """Return the 95 % interval of the difference of two shares of independent episodes (Newcombe 1998, method 10)."""
-    one, two = wilson_interval(share, count), wilson_interval(other, others)
-    low = math.hypot(share - one.low, two.high - other)
-    high = math.hypot(one.high - share, other - two.low)
-    return Interval(share - other - low, share - other + high, 0.95, "Newcombe over episodes")
-
-
-def t_interval(values: Sequence[float], method: str, level: float = 0.95) -> Interval | None:
-    """Return the t interval of a mean; None for fewer than two values."""
-    from scipy.special import stdtrit
-
-    if len(values) < 2:
-        return None
-    half = float(stdtrit(len(values) - 1, (1 + level) / 2) * np.std(values, ddof=1) / math.sqrt(len(values)))
-    mean = float(np.mean(values))
-    return Interval(mean - half, mean + half, level, method)
-
-
-def wilson_interval(share: float, count: int) -> Interval:
-    """Return the 95 % interval of a share of independent episodes (Wilson 1927)."""
-    z = 1.959964
-    middle, width = share + z**2 / (2 * count), z * math.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
-    low, high = ((middle + sign * width) / (1 + z**2 / count) for sign in (-1, 1))
-    return Interval(max(low, 0.0), min(high, 1.0), 0.95, f"Wilson over {count} episodes")
 
 
 COLUMNS = (

@@ -21,8 +21,8 @@ from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.envs.env import Env
     from robotics_bridge.tasks.step_context import StepContext
+    from robotics_bridge.tasks.task_state import TaskEnvironment
 
 SIDE, WALL, HEIGHT, TILT = 0.5, 0.0125, 0.25, math.radians(10)
 """Outer edge of the bin, thickness of its walls and floor, its height [m], and how far it leans about y [rad]."""
@@ -54,13 +54,13 @@ def bin_walls(spec: Any) -> None:
         body.add_geom(name=f"bin_{index}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=position, size=size)
 
 
-def thermometers(thermal: ThermalSettings) -> Callable[[Env], Thermometers]:
+def thermometers(thermal: ThermalSettings) -> Callable[[TaskEnvironment], Thermometers]:
     """Return what makes the thermometers of this material."""
     return lambda env: Thermometers(env, thermal)
 
 
 def extra(m: StepContext, *, name: str) -> torch.Tensor:
-    """Return what the thermometers add to a moment: ``progress``, ``latched`` or ``holding`` [B]."""
+    """Return what the thermometers add to a control step: ``progress``, ``latched`` or ``holding`` [B]."""
     return m.extras[name]
 
 
@@ -89,7 +89,7 @@ def with_thermal(thermal: ThermalSettings) -> Task:
         joints={"xhand1": {"right_hand_thumb_bend_joint": 1.5}},
         carriage={axis: (span, 2000.0, 120.0, 100.0) for axis, span in _SPANS.items()},
         furniture=bin_walls,
-        watch=thermometers(thermal),
+        task_state=thermometers(thermal),
         rewards={
             "reach": Reward(1.0, reach, {"sigma": 0.1}),
             "warmth": Reward(5.0, extra, {"name": "progress"}),

@@ -1,4 +1,4 @@
-"""One moment of all environments, as reward terms see it. Letters: B environment, J joint, A action, F finger tip."""
+"""What reward terms see of a control step. Letters: B environment, J joint, A action, F finger tip."""
 
 from __future__ import annotations
 
@@ -74,4 +74,4 @@ class StepContext:
     endings: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Name → [B] bool: conditions of the task that end the episode in this step."""
     extras: dict[str, Any] = field(default_factory=dict)
-    """What a task's own ``watch`` adds."""
+    """What the task's own state adds."""

@@ -13,7 +13,7 @@ from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
 
 if TYPE_CHECKING:
-    from robotics_bridge.tasks.task_state import TaskState
+    from robotics_bridge.tasks.task_state import TaskEnvironment, TaskState
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""
@@ -165,7 +165,7 @@ class Task:
     objects: tuple[ObjectShape, ...] = PRIMITIVES
     """Shapes of the object, spread over environments in turn."""
     copies: int = 1
-    """Objects in the scene; more than one are equal but for what ``watch`` makes of them."""
+    """Objects in the scene; more than one are equal but for what ``task_state`` makes of them."""
     density: float = 200.0
     """Of objects [kg/m³]; the value that the published engine takes by default."""
     friction: float = 1.0
@@ -204,7 +204,7 @@ class Task:
     """Axis of the object whose rotation is counted (its own frame)."""
     turn_window: int = 60
     """Steps over which stagnation is judged."""
-    watch: Callable[..., TaskState] | None = None
+    task_state: Callable[[TaskEnvironment], TaskState] | None = None
     """Makes the part of the task that keeps a state of its own (hot_ball's thermometers)."""
     # --- learning ---
     goal_terms: tuple[str, ...] = ()
@@ -240,6 +240,11 @@ class Task:
     def step_dt(self) -> float:
         """Duration of a control step (s)."""
         return self.solver.timestep * self.solver.decimation
+
+    @property
+    def max_episode_length(self) -> int:
+        """Control steps after which an episode is cut off."""
+        return math.ceil(self.episode / self.step_dt)
 
     def _ranges(self) -> dict[str, Range]:
         found: dict[str, Range] = {}

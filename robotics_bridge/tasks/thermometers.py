@@ -19,8 +19,8 @@ from robotics_bridge.sensors.temperature.grid import link_temperature
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.envs.env import Env
     from robotics_bridge.tasks.step_context import StepContext
+    from robotics_bridge.tasks.task_state import TaskEnvironment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,15 +81,15 @@ class Thermometers:
     """Temperature grids on every finger link, which ball is hot, the latch, and the time of latched contact.
 
     Args:
-        env: the environments; ``env.target`` says which ball is hot.
+        env: the environments; ``env.episode.target`` says which ball is hot.
         thermal: materials and temperatures.
-        chooses: draw the hot ball anew at every reset; otherwise follow ``env.target``.
+        chooses: draw the hot ball anew at every reset; otherwise follow ``env.episode.target``.
     """
 
-    def __init__(self, env: Env, thermal: ThermalSettings, *, chooses: bool = True) -> None:
+    def __init__(self, env: TaskEnvironment, thermal: ThermalSettings, *, chooses: bool = True) -> None:
         import torch
 
-        wp, scene = warp(), env.world.engine.scene
+        wp, scene = warp(), env.simulation.engine.scene
         self._env, self.thermal, self._chooses = env, thermal, chooses
         links = [link for link in env.hand.links("fingers") if scene.geometries_of(link)]
         balls = env.model.objects
@@ -106,7 +106,7 @@ class Thermometers:
                 other=ThermalBody("plastic", thermal.ambient),
                 conduction=thermal.conduction, convection=thermal.convection,
             )  # fmt: skip
-        self.suite = SensorSuite(scene, sensors, num_envs=env.num_envs, device=env.world.warp_device)
+        self.suite = SensorSuite(scene, sensors, num_envs=env.num_envs, device=env.simulation.warp_device)
         self._cells = [self.suite.read(link) for link in links]
         self._heat = link_temperature(self.suite, links[0])
         numbers = [scene.link_index(name) for name in balls]
@@ -118,8 +118,8 @@ class Thermometers:
             roles[list(scene.geometries_of(tip))] = 1
         for index, name in enumerate(balls):
             roles[list(scene.geometries_of(name))] = 2 + index
-        self._roles = wp.array(roles, dtype=wp.int32, device=env.world.warp_device)
-        self._touch = wp.zeros((env.num_envs, len(balls)), dtype=wp.int32, device=env.world.warp_device)
+        self._roles = wp.array(roles, dtype=wp.int32, device=env.simulation.warp_device)
+        self._touch = wp.zeros((env.num_envs, len(balls)), dtype=wp.int32, device=env.simulation.warp_device)
         self._touched = wp.to_torch(self._touch)
         zeros = torch.zeros(env.num_envs, device=env.device)
         self.latched = zeros.bool()
@@ -145,8 +145,8 @@ class Thermometers:
 
         if self._chooses:
             balls = len(self._balls)
-            drawn = (self._env._draw(1, 0.0, 1.0)[:, 0] * balls).long().clamp(max=balls - 1)
-            self._env.target.copy_(torch.where(mask, drawn, self._env.target))
+            drawn = (self._env.draw(1, 0.0, 1.0)[:, 0] * balls).long().clamp(max=balls - 1)
+            self._env.episode.target.copy_(torch.where(mask, drawn, self._env.episode.target))
         self._apply(mask)
         self.suite.reset(mask)
         for cells in self._cells:
@@ -158,38 +158,38 @@ class Thermometers:
         self.contact.masked_fill_(mask, 0.0)
         self.age.masked_fill_(mask, 0.0)
 
-    def during(self, dt: float) -> None:
+    def after_physics_step(self, dt: float) -> None:
         """Let heat flow for a physics step of dt (s)."""
-        self.suite.update(self._env.world.state, dt)
+        self.suite.update(self._env.simulation.state, dt)
 
-    def after(self, moment: StepContext) -> None:
+    def after_control_step(self, context: StepContext) -> None:
         """Read the thermometers at the end of a control step, and tell the rewards."""
-        self.judge(moment.dt)
-        tips = self._env.world.pose[:, self._env.contacts.tip_links, :3]
-        target = self._env.object_pose[self._env.rows, self._env.target, :3]
-        moment.extras["progress"] = progress(self.temperature().amax(dim=1), self.thermal)
-        moment.extras["holding"] = (self.latched & self.touching).float()
-        moment.extras["latched"] = self.latched.float()
-        moment.extras["reach"] = (tips - target.unsqueeze(1)).norm(dim=2).amin(dim=1)
+        self.update_latch(context.dt)
+        tips = self._env.simulation.pose[:, self._env.contacts.tip_links, :3]
+        target = self._env.target_pose[:, :3]
+        context.extras["progress"] = progress(self.temperature().amax(dim=1), self.thermal)
+        context.extras["holding"] = (self.latched & self.touching).float()
+        context.extras["latched"] = self.latched.float()
+        context.extras["reach"] = (tips - target.unsqueeze(1)).norm(dim=2).amin(dim=1)
 
-    def judge(self, dt: float) -> None:
+    def update_latch(self, dt: float) -> None:
         """Advance latch and metric by a control step of dt (s)."""
         import torch
 
-        from robotics_bridge.envs.kernels.actuation import environment_kernels
+        from robotics_bridge.tasks.kernels.touching import find_touched
 
-        wp, state = warp(), self._env.world.state
+        wp, state = warp(), self._env.simulation.state
         self._touch.zero_()
         wp.launch(
-            environment_kernels().meets, dim=state.contact_env.shape[0],
+            find_touched, dim=state.contact_env.shape[0],
             inputs=[
                 state.contact_count, state.contact_geom, state.contact_env, state.contact_distance, self._roles,
                 self._touch,
             ],
-            device=self._env.world.warp_device,
+            device=self._env.simulation.warp_device,
         )  # fmt: skip
         self.age += dt
-        self.touching.copy_(self._touched.gather(1, self._env.target.unsqueeze(1))[:, 0] > 0)
+        self.touching.copy_(self._touched.gather(1, self._env.episode.target.unsqueeze(1))[:, 0] > 0)
         fires = (self.temperature().amax(dim=1) >= self.thermal.threshold) & ~self.latched
         self.latch_time.copy_(torch.where(fires, self.age, self.latch_time))
         self.latched |= fires
@@ -225,7 +225,7 @@ class Thermometers:
         """Make the target ball hot."""
         import torch
 
-        hot = self._env.target.unsqueeze(1) == self._numbers
+        hot = self._env.episode.target.unsqueeze(1) == self._numbers
         value = self.thermal.ambient + (self.thermal.hot - self.thermal.ambient) * hot
         known = self._heat[:, self._balls]
         self._heat[:, self._balls] = torch.where(mask.unsqueeze(1), value.to(known.dtype), known)

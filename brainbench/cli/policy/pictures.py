@@ -41,7 +41,7 @@ class Stage:
         from brainbench.stimuli.figures.camera import Camera
 
         self._env, self._number = env, number
-        self._scene = env.world.engine.scene
+        self._scene = env.simulation.engine.scene
         still = np.array([0.0, 0, 0, 0, 0, 0, 1])
         self._parts: list[tuple[int, Any]] = []
         focus = []
@@ -76,7 +76,7 @@ class Stage:
         return (255 * np.clip(image, 0, 1)).astype(np.uint8)
 
     def _pose(self) -> NDArray[np.float64]:
-        return self._env.world.state.pose_torch[self._number].cpu().numpy().astype(float)
+        return self._env.simulation.state.pose_torch[self._number].cpu().numpy().astype(float)
 
     def _placed(self, link: int, solid: Any, pose: NDArray[np.float64]) -> Any:
         from brainbench.cli.tactile.figures import _turn
@@ -87,7 +87,7 @@ class Stage:
 
     def _object_colors(self, link: str, solid: Any) -> NDArray[np.float64]:
         if len(self._env.model.objects) > 1:
-            hot = self._env.model.objects.index(link) == int(self._env.target[self._number])
+            hot = self._env.model.objects.index(link) == int(self._env.state.episode.target[self._number])
             return np.tile(np.array(HOT if hot else BALL), (len(solid.corners), 1))
         normal = np.cross(solid.corners[:, 1] - solid.corners[:, 0], solid.corners[:, 2] - solid.corners[:, 0])
         axis = np.abs(normal).argmax(axis=1)

@@ -1,1 +1,1 @@
-"""Warp kernels of the environments."""
+"""Warp kernels of the environment: torques of imperfect actuators, and net contact forces on links."""

@@ -276,7 +276,7 @@ def train(
     settings = settings or env.task.teacher
     total = iterations or settings.iterations
     trainer = Trainer(env, settings, seed=seed)
-    env.goals.practise()
+    env.goals.start_curriculum()
     origin = None
     if start_std is not None and (start is None or not start_std > 0):
         raise UsageError(f"start_std is a positive number and goes with a run to start from; received {start_std!r}.")

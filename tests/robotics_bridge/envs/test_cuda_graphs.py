@@ -25,7 +25,8 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import constant
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.envs.simulation import World
+from robotics_bridge.envs.simulation import Simulation
+from robotics_bridge.envs.step import apply_action, compute_step
 from robotics_bridge.tasks.step_context import StepContext
 from robotics_bridge.tasks.task import Reward
 
@@ -158,7 +159,7 @@ def _tape_recorder(native: bool) -> Recorder:
             patch.setattr(wp, "launch", tape.note(wp.launch))
             patch.setattr(wp.array, "zero_", tape.note(wp.array.zero_))
             for name in () if native else ("reset", "refresh", "apply_push"):
-                patch.setattr(World, name, tape.note(getattr(World, name)))
+                patch.setattr(Simulation, name, tape.note(getattr(Simulation, name)))
             result = work()
         return tape, result
 
@@ -166,13 +167,12 @@ def _tape_recorder(native: bool) -> Recorder:
 
 
 def _imitate(env: Env) -> tuple[CudaGraphStep, CudaGraphStep]:
-    kept = [env._extent] if env.touch is None else [env._extent, env.touch.reading]
-    record, generators = _tape_recorder(env.world.native), [env._generator]
+    record, generators = _tape_recorder(env.simulation.uses_warp), [env.state.generator]
     parts = (
-        CudaGraphStep(Env._aim, record, subject="It", generators=generators),
-        CudaGraphStep(Env._judge, record, subject="It", generators=generators, kept=kept),
+        CudaGraphStep(apply_action, record, subject="It", generators=generators),
+        CudaGraphStep(compute_step, record, subject="It", generators=generators, kept=env.lasting),
     )
-    env._aim_part, env._judge_part = parts
+    env.apply_action, env.compute_step = parts
     return parts
 
 
@@ -243,11 +243,11 @@ def test_an_environment_does_not_outlive_its_last_reference() -> None:
     _imitate(env)
     for _ in range(4):
         env.step(torch.zeros(3, 5))
-    seen = weakref.ref(env)
+    seen = weakref.ref(env), weakref.ref(env.state)
     gc.disable()
     try:
         del env
-        assert seen() is None
+        assert [reference() for reference in seen] == [None, None]
     finally:
         gc.enable()
 
@@ -274,7 +274,7 @@ def _waiting(m: StepContext) -> torch.Tensor:
 @pytest.mark.parametrize("task", [case[0] for case in CASES])
 def test_a_replayed_part_is_the_eager_part(task: str) -> None:
     env = _make(task, {}, num_envs=64, device="cuda", graphs=True)
-    part = env._judge_part
+    part = env.compute_step
     assert isinstance(part, CudaGraphStep)
     for _ in range(12):
         env.step(torch.randn(64, env.num_actions, device="cuda"))
@@ -282,9 +282,9 @@ def test_a_replayed_part_is_the_eager_part(task: str) -> None:
             continue
         state = env.state_dict()
         env.load_state_dict(state)
-        eager = _pytree.tree_map(torch.clone, env._judge())
+        eager = _pytree.tree_map(torch.clone, compute_step(env.state, env.reset_episodes))
         env.load_state_dict(state)
-        replayed = part(env)
+        replayed = part(env.state, env.reset_episodes)
         for (path, one), (_, two) in zip(
             _pytree.tree_leaves_with_path(eager), _pytree.tree_leaves_with_path(replayed), strict=True
         ):

@@ -21,16 +21,16 @@ def _pair() -> tuple[Env, Env]:
 @pytest.mark.slow
 def test_both_engines_run_the_same_task_and_contain_a_diverging_environment() -> None:
     one, two = _pair()
-    for name, value in one.world.fields.items():
+    for name, value in one.simulation.fields.items():
         # Single against double precision.
-        assert torch.allclose(value, two.world.fields[name], rtol=1e-5, atol=1e-6), name
+        assert torch.allclose(value, two.simulation.fields[name], rtol=1e-5, atol=1e-6), name
     generator = torch.Generator().manual_seed(0)
     for _ in range(10):
         action = 0.5 * torch.randn(3, one.num_actions, generator=generator)
         first, second = one.step(action), two.step(action)
         assert torch.allclose(first[0]["proprio"], second[0]["proprio"], atol=1e-3)
         assert torch.allclose(first[0]["priv_obj_state"][:, :3], second[0]["priv_obj_state"][:, :3], atol=3e-3)
-    two.world.qpos[1] = float("nan")
+    two.simulation.qpos[1] = float("nan")
     observations, reward, terminated, _, info = two.step(action)
     assert info["diverged"].tolist() == [False, True, False]
     assert terminated.tolist() == [False, True, False]

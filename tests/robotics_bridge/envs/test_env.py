@@ -11,8 +11,10 @@ import torch
 
 from brainbench.core.devices import mujoco_module, warp
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import to_matrices
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
+from robotics_bridge.envs.checkpoint import FORMER_NAMES
 from robotics_bridge.hands.observations import observe, sensors_for
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation
@@ -71,7 +73,7 @@ def test_an_environment_does_not_notice_how_many_others_there_are_in_its_physics
         env.step(action.expand(3, -1))
         alone.step(action)
     # Environment 0 holds the same block in both.
-    assert torch.equal(env.world.qpos[0], alone.world.qpos[0])
+    assert torch.equal(env.simulation.qpos[0], alone.simulation.qpos[0])
 
 
 def test_an_environment_that_diverges_is_reset_and_counted_and_the_others_are_unharmed() -> None:
@@ -79,7 +81,7 @@ def test_an_environment_that_diverges_is_reset_and_counted_and_the_others_are_un
     for env in (one, two):
         for a in _actions(env, 3):
             env.step(a)
-    two.world.engine.data[1].qpos[:] = np.nan
+    two.simulation.engine.data[1].qpos[:] = np.nan
     action = _actions(one, 1, seed=9)[0]
     _, _, _, _, _ = one.step(action)
     observations, reward, terminated, truncated, info = two.step(action)
@@ -89,20 +91,20 @@ def test_an_environment_that_diverges_is_reset_and_counted_and_the_others_are_un
     assert float(reward[1]) == 0.0
     assert all(value.isfinite().all() for value in observations.values())
     for env in (0, 2):
-        assert torch.equal(one.world.qpos[env], two.world.qpos[env])
+        assert torch.equal(one.simulation.qpos[env], two.simulation.qpos[env])
     assert two.statistics()["diverged"] == 1.0
     two.step(action)
-    assert two.world.qpos.isfinite().all()
+    assert two.simulation.qpos.isfinite().all()
 
 
 def test_a_mask_resets_only_its_environments() -> None:
     env = _make(3)
     for a in _actions(env, 4):
         env.step(a)
-    before, steps = env.world.qpos.clone(), env.episode_length_buf.clone()
+    before, steps = env.simulation.qpos.clone(), env.episode_length_buf.clone()
     env.reset(torch.tensor([False, True, False]))
-    assert torch.equal(env.world.qpos[[0, 2]], before[[0, 2]])
-    assert not torch.equal(env.world.qpos[1], before[1])
+    assert torch.equal(env.simulation.qpos[[0, 2]], before[[0, 2]])
+    assert not torch.equal(env.simulation.qpos[1], before[1])
     assert env.episode_length_buf.tolist() == [steps[0], 0, steps[2]]
 
 
@@ -119,20 +121,20 @@ def test_the_goal_narrows_when_enough_episodes_succeed_and_only_while_a_teacher_
     goal = SteppingRotation(start_threshold=0.4, narrowing=0.5, mastered=0.4)
     goals = _make(4, _calm(goal=goal)).goals
     assert float(goals.threshold) == pytest.approx(0.1)
-    goals.practise()
+    goals.start_curriculum()
     assert float(goals.threshold) == pytest.approx(0.4)
     some, all_of_them = torch.tensor([True, True, False, False]), torch.ones(4, dtype=torch.bool)
     goals.count.copy_(torch.tensor([1.0, 0.0, 2.0, 0.0]))
-    goals.account(some)
+    goals.count_episodes(some)
     assert float(goals.threshold) == pytest.approx(0.4)
-    goals.account(~some)
+    goals.count_episodes(~some)
     assert float(goals.threshold) == pytest.approx(0.2)
     goals.count.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
-    goals.account(all_of_them)
+    goals.count_episodes(all_of_them)
     assert float(goals.threshold) == pytest.approx(0.2)
     goals.count.fill_(1.0)
     for _ in range(3):
-        goals.account(all_of_them)
+        goals.count_episodes(all_of_them)
     assert float(goals.threshold) == pytest.approx(0.1)
     assert not _make(4, _calm(goal=SteppingRotation())).goals.curriculum()
 
@@ -142,7 +144,7 @@ def test_drives_reach_their_targets_and_held_joints_stay() -> None:
     action = torch.full((1, 5), 0.5)
     for _ in range(60):
         env.step(action)
-    reached = env.world.qpos[0, env.drives.positions].numpy()
+    reached = env.simulation.qpos[0, env.state.actuators.qpos_columns].numpy()
     wanted = env.action_map.targets(action[0].numpy())
     moved = [env.joint_names.index(name) for name in env.action_names]
     # Fingers press on the object and carry their own weight.
@@ -168,8 +170,8 @@ def test_an_action_beyond_the_limit_counts_as_the_limit_and_moves_the_same_joint
         env.step(torch.full((2, env.num_actions), -size))
     assert far.observations["proprio"][:, -5:].unique().tolist() == [-100.0]
     assert free.observations["proprio"][:, -5:].unique().tolist() == [-1e9]
-    assert torch.equal(far.world.qpos, near.world.qpos)
-    assert torch.equal(far.world.qpos, free.world.qpos)
+    assert torch.equal(far.simulation.qpos, near.simulation.qpos)
+    assert torch.equal(far.simulation.qpos, free.simulation.qpos)
     with pytest.raises(UsageError, match="action_limit of task 'in_palm_rotate' is positive; received 0"):
         _calm(action_limit=0.0)
 
@@ -178,16 +180,16 @@ def test_changed_masses_are_what_mujoco_derives_itself() -> None:
     mujoco = mujoco_module()
     env = _make(3, _calm(object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1))))
     for number in range(3):
-        model = env.world.engine.model_of(number)
+        model = env.simulation.engine.model_of(number)
         derived = {name: getattr(model, name).copy() for name in ("body_subtreemass", "body_invweight0", "dof_M0")}
         body = model.body("object").id
-        assert model.body_mass[body] == pytest.approx(float(env.mass[number]), rel=1e-6)
+        assert model.body_mass[body] == pytest.approx(float(env.state.episode.mass[number]), rel=1e-6)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         for name, value in derived.items():
             place = slice(model.body_dofadr[body], None) if name == "dof_M0" else body
             np.testing.assert_allclose(value[place], getattr(model, name)[place], rtol=2e-5)
         friction = model.geom_friction[model.geom("object_0").id, 0]
-        assert friction == pytest.approx(float(env.friction[number]), rel=1e-6)
+        assert friction == pytest.approx(float(env.state.episode.friction[number]), rel=1e-6)
 
 
 def test_heavy_and_light_objects_fall_alike() -> None:
@@ -202,7 +204,7 @@ def test_heavy_and_light_objects_fall_alike() -> None:
 
 def test_objects_of_different_kinds_share_one_batch() -> None:
     env = _make(17)
-    names = [env.model.shapes[number].name for number in env.world.shape_of]
+    names = [env.model.shapes[number].name for number in env.simulation.shape_of]
     assert sum(name.startswith("cylinder") for name in names) == 2
     assert env.observations["aux_obj_size"].tolist() == [pytest.approx(shape.extent) for shape in env.model.shapes]
 
@@ -214,16 +216,16 @@ def test_touch_is_what_the_sensors_of_the_hand_read(kind: str) -> None:
     env = _make(2, observe=kind, placement="hand", resolution="low")
     assert env.tactile is not None
     taxels = env.hand.layout("low", "hand")
-    suite = SensorSuite(env.world.engine.scene, sensors_for(kind, taxels, track=("object",)), num_envs=2)
+    suite = SensorSuite(env.simulation.engine.scene, sensors_for(kind, taxels, track=("object",)), num_envs=2)
     suite.reset()
     env.reset()
     for a in _actions(env, 8):
         env.step(a)
-    suite.update(env.world.state, 0.005)
+    suite.update(env.simulation.state, 0.005)
     # The last physics step of the control step is the state that is still there, but for the refreshed poses.
-    env.world.engine.forward()
-    suite.update(env.world.state, 0.005)
-    env.touch.update(env.world.state, 0.005, 4)  # type: ignore[union-attr]
+    env.simulation.engine.forward()
+    suite.update(env.simulation.state, 0.005)
+    env.touch.update(env.simulation.state, 0.005, 4)  # type: ignore[union-attr]
     expected = observe(kind, {name: suite.read(name) for name in taxels}, taxels)
     assert torch.allclose(env.observations["tactile"][:, -1].flatten(1), expected, atol=1e-6)
     assert env.observations["tactile"].shape[1:] == (5, len(env.tactile.link), env.tactile.channels)
@@ -251,11 +253,38 @@ def test_resting_poses_of_the_layout_are_those_of_the_links() -> None:
     np.testing.assert_allclose(np.linalg.norm(layout.base_normal, axis=1), 1.0, atol=1e-6)
 
 
-def test_a_saved_state_goes_on_exactly() -> None:
+def test_poses_of_links_and_objects_are_quaternions_with_the_scalar_first() -> None:
+    env = _make(2, observe="bool", placement="fingers", resolution="low", link_pose=True)
+    for a in _actions(env, 3):
+        env.step(a)
+    assert env.tactile is not None
+    pose = env.observations["link_pose"].numpy()
+    for number, data in enumerate(env.simulation.engine.data):
+        palm = data.body(env.hand.palm)
+        axes = palm.xmat.reshape(3, 3).T
+        for row, name in zip(pose[number], env.tactile.links, strict=True):
+            body = data.body(name)
+            np.testing.assert_allclose(row[:3], axes @ (body.xpos - palm.xpos), atol=1e-5, err_msg=name)
+            turn = axes @ body.xmat.reshape(3, 3)
+            np.testing.assert_allclose(to_matrices(row[3:]), turn, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(env.object_pose[number, 0, 3:], data.body("object").xquat, atol=1e-5)
+
+
+@pytest.mark.parametrize("former", [False, True])
+def test_a_saved_state_goes_on_exactly(former: bool) -> None:
     one = _make(3, seed=2)
     for a in _actions(one, 6):
         one.step(a)
     state = {name: value.clone() for name, value in one.state_dict().items()}
+    if former:
+        # As states were written before the parts of the environment had their names of today.
+        for old, new in FORMER_NAMES.items():
+            state = {
+                f"{old}{name.removeprefix(new)}" if name.partition(".")[0] == new else name: value
+                for name, value in state.items()
+            }
+        assert "_steps" in state
+        assert "world.qpos" in state
     two = _make(3, seed=7)
     two.load_state_dict(state)
     for a in _actions(one, 6, seed=4):
@@ -306,4 +335,4 @@ def test_actions_of_another_shape_are_refused() -> None:
 
 def test_device_memory_is_shared_with_warp() -> None:
     env = _make(2)
-    assert warp().from_torch(env.drives.target).ptr == env.drives.target.data_ptr()
+    assert warp().from_torch(env.state.actuators.target).ptr == env.state.actuators.target.data_ptr()

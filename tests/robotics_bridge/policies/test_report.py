@@ -8,6 +8,7 @@ from scipy import stats
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import read_json, write_json
+from brainbench.core.statistics import newcombe_interval
 from leaderboards import rank, read_record, write_record
 from robotics_bridge.policies.report import (
     COLUMNS,
@@ -16,7 +17,6 @@ from robotics_bridge.policies.report import (
     command,
     concise,
     draw,
-    newcombe_interval,
     read_agents,
     read_results,
     records,
@@ -77,13 +77,13 @@ def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
 
 
 def test_the_gain_of_a_single_student_has_an_interval_over_episodes(tmp_path) -> None:
-    published = newcombe_interval(56 / 70, 70, 48 / 80, 80)  # Newcombe 1998, table II, contrast (a), method 10
+    published = newcombe_interval(56, 70, 48, 80)  # Newcombe 1998, table II, contrast (a), method 10
     assert (published.low, published.high) == pytest.approx((0.0524, 0.3339), abs=5e-5)
     _write(tmp_path, [0.8] * 3, observe="force_torque")
     _write(tmp_path, [0.5] * 3, observe="none")
     felt, bare = read_results([tmp_path])
     assert felt.gain == pytest.approx(0.3)
-    expected = newcombe_interval(0.8, 60, 0.5, 60)
+    expected = newcombe_interval(48, 60, 30, 60)
     assert felt.difference is not None
     assert (felt.difference.low, felt.difference.high) == pytest.approx((expected.low, expected.high))
     assert bare.gain is None

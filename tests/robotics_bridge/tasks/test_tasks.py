@@ -13,6 +13,7 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import about, angle_of, conjugate, multiply
 from robotics_bridge import hands, tasks
+from robotics_bridge.envs.step import step_context
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import box, screwdriver, slots, with_sizes
@@ -137,12 +138,12 @@ def test_sampled_grasps_hold_without_any_action() -> None:
     env = tasks.make(task, num_envs=8, threads=1)
     start = env.object_pose[:, 0, :3].clone()
     # In published terms: three finger tips nearer than 2 cm, and the tool does not move by a centimetre.
-    assert ((env.surface_distance < 0.02).sum(dim=1) >= 3).all()
+    assert ((env.state.contacts.surface_distance < 0.02).sum(dim=1) >= 3).all()
     for _ in range(20):
         env.step(torch.zeros(8, env.num_actions))
     moved = (env.object_pose[:, 0, :3] - start).norm(dim=1)
     assert float(moved.quantile(0.8)) < 0.01
-    assert float(terms.alignment(env._moment(), (0.0, 1.0, 0.0)).median()) > 0.98
+    assert float(terms.alignment(step_context(env.state), (0.0, 1.0, 0.0)).median()) > 0.98
 
 
 def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
@@ -152,11 +153,11 @@ def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
     reading = torch.tensor([10.0, 22.0, 33.5, 42.3, 60.0])
     assert progress(reading, thermal).tolist() == pytest.approx([0.0, 0.0, 0.5, 0.8826, 1.0], abs=1e-4)
     env = tasks.make("hot_ball", num_envs=2, threads=1)
-    watch: Any = env.watch
-    assert (watch.temperature() == 22.0).all()
+    thermometers: Any = env.state.task_state
+    assert (thermometers.temperature() == 22.0).all()
     assert env.observations["thermal"].abs().max() < 1e-5
     env.step(torch.zeros(2, env.num_actions))
-    assert not watch.latched.any()
-    assert env.metric.tolist() == [0.0, 0.0]
+    assert not thermometers.latched.any()
+    assert env.state.episode.metric.tolist() == [0.0, 0.0]
     with pytest.raises(UsageError, match="hotter than the room"):
         ThermalSettings(hot=10.0)

@@ -1,0 +1,67 @@
+"""The options of an environment batch, stated once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from brainbench.core.devices import pick_device
+from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.hands.observations import observation_type
+
+ENGINES = ("mujoco", "warp")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvOptions:
+    """How a task is simulated, and what of it is observed.
+
+    Raises:
+        UsageError: a name or number is not valid.
+    """
+
+    num_envs: int = 1
+    """Environments B."""
+    device: str = "cpu"
+    """``cpu``, ``cuda`` or ``cuda:1``."""
+    engine: str | None = None
+    """``mujoco`` (C MuJoCo) or ``warp`` (MuJoCo Warp); by default the one for the device."""
+    observe: str = "none"
+    """Tactile observation type (table 4.3); ``none`` builds no tactile sensor."""
+    placement: str = "hand"
+    """Of the taxels: ``hand``, ``fingers``, ``tips`` or ``palm``."""
+    resolution: str = "med"
+    """Of the taxels: ``low``, ``med`` or ``high``."""
+    noisy: bool = False
+    """Tactile readings with the published imperfections."""
+    seed: int = 0
+    """Of all random numbers."""
+    link_pose: bool = False
+    """Also observe the poses of the tactile links in the palm's frame."""
+    keep_final: bool = False
+    """Return the last observations of episodes that ended as ``info["final_observations"]``."""
+    threads: int | None = None
+    """Of C MuJoCo; None takes all processors."""
+    knobs: Mapping[str, Any] = field(default_factory=dict)
+    """Further settings of the tactile sensors, e.g. ``{"points": 500}``."""
+    graphs: bool | None = None
+    """Replay what a control step does around physics as CUDA graphs, recorded in the third step; by default on CUDA.
+
+    A task whose terms cannot be recorded runs without, and says so; with ``True`` it is an error.
+    """
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise UsageError(f"There must be at least one environment; received {self.num_envs}.")
+        object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
+        if self.engine not in ENGINES:
+            raise unknown_name("engine", self.engine or "", ENGINES)
+        observation_type(self.observe)
+        if self.link_pose and self.observe == "none":
+            raise UsageError("Poses of tactile links belong to tactile sensors; choose an observation type.")
+        pick_device(self.device)
+        if self.graphs and not self.device.startswith("cuda"):
+            raise UsageError(
+                f"Graphs are recorded on CUDA only, and the environment is on {self.device}; leave it out."
+            )

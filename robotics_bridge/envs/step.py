@@ -1,0 +1,159 @@
+"""The parts of a control step, in their order: targets of the actuators, physics and senses, reward and resets.
+
+Letters: B environment, K object.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from robotics_bridge.envs.observations import observe
+from robotics_bridge.tasks.step_context import StepContext
+
+if TYPE_CHECKING:
+    import torch
+
+    from robotics_bridge.envs.reset import EpisodeReset
+    from robotics_bridge.envs.state import EnvState
+
+    StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
+
+_DIVERGED_SPEED = 1e4
+"""Speed (m/s or rad/s) beyond which an environment counts as diverged."""
+
+
+def apply_action(state: EnvState) -> None:
+    """Set the actuators' targets for the action, and what pushes the object."""
+    import torch
+
+    target, moved = state.actuators.target, state.moved
+    target.copy_(state.episode.rest_targets)
+    wanted = target[:, moved] + state.action_scale * state.episode.action
+    target[:, moved] = torch.clamp(wanted, state.low[moved], state.high[moved])
+    push, left = state.task.push, state.episode.push_left
+    if push is None:
+        return
+    left -= state.step_dt
+    now = (left <= 0).unsqueeze(1)
+    for axis, span in enumerate((push.x, push.y, push.z)):
+        force = state.draw(len(state.model.objects), *span) * now
+        state.simulation.push[:, state.object_bodies, axis] = force
+    left.copy_(left.where(~now[:, 0], state.draw(1, *push.interval)[:, 0]))
+    state.simulation.apply_push()
+
+
+def run_physics(state: EnvState) -> None:
+    """Run the physics steps of one control step, and sense after each."""
+    simulation = state.simulation
+    for substep in range(state.substeps):
+        state.actuators.launch(substep)
+        simulation.step()
+        if substep == 0 and state.task.push is not None:
+            simulation.push.index_fill_(1, state.object_bodies, 0.0)
+            simulation.apply_push()
+        if state.touch is not None:
+            state.touch.update(simulation.state, simulation.timestep, substep)
+        if state.task_state is not None:
+            state.task_state.after_physics_step(simulation.timestep)
+
+
+def compute_step(state: EnvState, reset: EpisodeReset) -> StepResult:
+    """Read the state after a control step, reward, begin new episodes, and return what ``Env.step`` returns."""
+    task, episode, goals = state.task, state.episode, state.goals
+    state.contacts.read()
+    diverged = isolate_diverged(state)
+    context = step_context(state)
+    endings = {n: e.condition(context, **e.params) for n, e in task.endings.items()}
+    if state.task_state is not None:
+        state.task_state.after_control_step(context)
+    context.endings = endings
+    reward, parts = _reward(state, context, diverged)
+    episode.age += 1
+    episode.steps += 1
+    terminated = diverged.clone()
+    for condition in endings.values():
+        terminated |= condition
+    truncated = (episode.age >= task.max_episode_length) & ~terminated
+    done = terminated | truncated
+    info = {"time_outs": truncated, "diverged": diverged, "log": _count_episodes(state, parts, done, diverged)}
+    info |= {"goals": goals.count.clone(), "turned": goals.turned_held.clone()}
+    info |= {"metric": episode.metric.clone(), "return": episode.returns.clone(), "steps": episode.steps.clone()}
+    goals.count_episodes(done)
+    goals.advance(state.target_pose[:, 3:], state.draw)
+    if state.options.keep_final:
+        info["final_observations"] = {k: v.clone() for k, v in observe(state).items()}
+    reset(state, done)
+    return observe(state), reward, terminated, truncated, info
+
+
+def isolate_diverged(state: EnvState) -> torch.Tensor:
+    """Return which environments [B] diverged, and put numbers back into them until they are reset."""
+    import torch
+
+    simulation = state.simulation
+    flaw = (simulation.qpos.sum(dim=1) * 0 + simulation.qvel.sum(dim=1) * 0).isnan()
+    diverged = flaw | (simulation.qvel.abs() > _DIVERGED_SPEED).any(dim=1)
+    column = diverged.unsqueeze(1)
+    simulation.qpos.copy_(torch.where(column, simulation.start, simulation.qpos))
+    simulation.qvel.masked_fill_(column, 0.0)
+    state.actuators.power.copy_(torch.nan_to_num(state.actuators.power) * ~column)
+    state.contacts.forces.masked_fill_(column.unsqueeze(2), 0.0)
+    return diverged
+
+
+def step_context(state: EnvState) -> StepContext:
+    """Return what reward terms see of a control step, and judge the goals."""
+    actuators, simulation, contacts = state.actuators, state.simulation, state.contacts
+    goals, episode = state.goals, state.episode
+    pose, (velocity, spin) = state.target_pose, state.target_velocity
+    force = contacts.on_object(state.rows, episode.target)
+    goals.update(pose[:, 3:], force > 0)
+    return StepContext(
+        dt=state.step_dt, joint_names=state.model.joints, joint_position=simulation.qpos[:, actuators.qpos_columns],
+        joint_velocity=simulation.qvel[:, actuators.qvel_columns], joint_low=state.low, joint_high=state.high,
+        start_joints=episode.start_joints, power=actuators.power.sum(dim=1), action=episode.action,
+        last_action=episode.last_action, object_position=pose[:, :3], object_quat=pose[:, 3:],
+        object_velocity=velocity, object_spin=spin, start_position=episode.start_position, object_force=force,
+        tip_force=contacts.tip_force, surface_distance=contacts.surface_distance, step_count=episode.steps,
+        goal_angle=goals.angle, previous_goal_angle=goals.angle_before, reached=goals.reached, missed=goals.missed,
+        goals_reached=goals.count, axis_rate=goals.rate, off_axis=goals.off_axis,
+        allowed_off_axis=goals.allowed_off_axis, turned=goals.turned, turned_before=goals.turned_before,
+    )  # fmt: skip
+
+
+def _reward(state: EnvState, context: StepContext, diverged: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the reward [B] and its terms [B, terms], zero where diverged."""
+    import torch
+
+    parts = [r.weight * r.term(context, **r.params) * state.step_dt for r in state.task.rewards.values()]
+    if not parts:
+        return torch.zeros(state.num_envs, device=state.device), state.episode.reward_sums
+    table = torch.stack(parts, dim=1).masked_fill(diverged.unsqueeze(1), 0.0)
+    return table.sum(dim=1), table
+
+
+def _count_episodes(
+    state: EnvState, parts: torch.Tensor, done: torch.Tensor, diverged: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Add rewards and metric to the running episodes and ended ones to the totals; return means over these."""
+    import torch
+
+    episode, success = state.episode, state.task.success
+    episode.reward_sums += parts
+    episode.returns += parts.sum(dim=1)
+    if success.metric == "goals":
+        episode.metric.copy_(state.goals.count)
+    elif success.metric == "turned":
+        episode.metric.copy_(state.goals.turned)
+    elif state.task_state is not None:
+        episode.metric.copy_(state.task_state.metric())
+    won = episode.metric >= success.threshold
+    columns = [torch.ones_like(episode.metric), won.float(), episode.metric, episode.returns, episode.steps.float()]
+    table = torch.cat((torch.stack([*columns, diverged.float()], dim=1), episode.reward_sums), dim=1)
+    episode.totals += (table * done.unsqueeze(1)).sum(dim=0)
+    episodes = episode.totals[0].clamp(min=1)
+    return {f"/episode/{name}": episode.totals[index + 1] / episodes for index, name in enumerate(STATISTICS)}
+
+
+STATISTICS = ("success", "metric", "return", "length", "diverged")
+"""Means over ended episodes, in the order of ``EpisodeState.totals`` after the number of episodes."""

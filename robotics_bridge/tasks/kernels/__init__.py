@@ -1,0 +1,1 @@
+"""Warp kernels of tasks that keep a state of their own."""
