@@ -14,11 +14,10 @@ from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.whiskers import C2
 
 pytestmark = pytest.mark.slow
 
-C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
 AT, PUSH, PEG = 0.007, 1e-3, 5e-4
 LONG_STEPS, SHORT_STEPS = (1e-5, 1e-4, 1e-3, 5e-3), (1e-6,)
 

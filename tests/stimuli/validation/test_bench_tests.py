@@ -10,9 +10,8 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.validation import bench_tests, references
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.whiskers import C2, RAT
 
-C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
-RAT = Whisker(0.040, 80e-6, 3e-6, young_modulus=3e9, density=1300.0, damping_ratio=0.15)
 POINTS = [(0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2)]
 
 

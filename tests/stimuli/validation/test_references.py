@@ -9,10 +9,7 @@ from scipy.integrate import quad
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.whiskers.whisker import Whisker
-
-C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
-H = Whisker(0.020, 50e-6, 5e-6, young_modulus=3e9, density=1300.0, damping_ratio=0.32)
+from tests.factories.whiskers import C2, H
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,7 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.validation.references import natural_frequencies
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
-
-C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
-NEEDLE = Whisker(0.0056, 31e-6, 1.5e-6, young_modulus=5e9, density=1300.0, damping_ratio=0.32)
+from tests.factories.whiskers import C2, NEEDLE
 
 
 @pytest.mark.parametrize("links", [3, 10, 25])

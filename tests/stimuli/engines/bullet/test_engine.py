@@ -23,10 +23,10 @@ from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.whiskers import C2
 
 needs_bullet = pytest.mark.skipif(find_spec("pybullet") is None, reason="PyBullet is made for Python below 3.12")
 
-C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
 CRITICAL = replace(C2, damping_ratio=1.0)
 COARSE = Fidelity(links=8, time_step=2e-4)
 FLAT = (math.pi / 2, 0.0, -math.pi / 2)

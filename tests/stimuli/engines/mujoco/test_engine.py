@@ -14,9 +14,8 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.whiskers import C2
 
-C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
 STIFF = replace(C2, young_modulus=5e13, damping_ratio=6.0)
 COARSE = Fidelity(links=8, time_step=1e-4)
 FLAT = (math.pi / 2, 0.0, -math.pi / 2)

@@ -19,11 +19,10 @@ from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.whiskers import C2
 
 pytest.importorskip("warp")
 
-C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
 COARSE = Fidelity(links=10, time_step=1e-3)
 
 
