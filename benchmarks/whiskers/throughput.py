@@ -80,7 +80,7 @@ def free(
     out = kernels.structs.ResultArrays()
     out.wrench = wp.zeros((1, 1, 1, 6), dtype=real, device=device)
     out.contact = wp.zeros((1, 1, 1), dtype=real, device=device)
-    out.points, out.pressed = (wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2))
+    out.points, out.contact_wrench = (wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2))
     out.depth, out.failed, out.miss, out.load = (wp.zeros(lanes, dtype=real, device=device) for _ in range(4))
     for name in ("status", "steps", "touching", "crowded", "unsolved"):
         setattr(out, name, wp.zeros(lanes, dtype=wp.int32, device=device))

@@ -112,7 +112,12 @@ def pick_device(name: Any) -> Any:
 
 
 def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:
-    """Fill a Warp structure of arrays; empty arrays become one unused element."""
+    """Fill a Warp structure of arrays; empty arrays become one unused element.
+
+    The fields of a record are the last axis of its array.
+    """
+    from numpy.lib.recfunctions import unstructured_to_structured
+
     wp = warp()
     struct = kind()
     for name, value in values.items():
@@ -120,5 +125,7 @@ def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:
         array = np.ascontiguousarray(value)
         if array.size == 0:
             array = np.zeros((1, *array.shape[1:]), dtype=array.dtype)
+        if hasattr(dtype, "numpy_dtype"):
+            array = unstructured_to_structured(array, dtype.numpy_dtype())
         setattr(struct, name, wp.array(array, dtype=dtype, device=device))
     return struct

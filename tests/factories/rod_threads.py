@@ -6,7 +6,6 @@ threads of the warp reach together is an error.
 
 from __future__ import annotations
 
-import importlib
 import re
 import sys
 import threading
@@ -15,11 +14,9 @@ from types import FunctionType, ModuleType, SimpleNamespace
 
 import numpy as np
 
+from brainbench.stimuli.engines.rod.kernels import specialize
+
 WARP = 32
-_MODULES = (
-    "algebra", "compliance", "contacts", "single_contact", "contact_memory", "thread_groups", "narrow_phase", "state",
-    "contact_solver", "mesh_search", "distances", "inputs", "motion",
-)  # fmt: skip
 
 
 class Memory:
@@ -77,22 +74,22 @@ class ThreadWarp:
             raise RuntimeError(f"threads of a warp shuffle at different places: {places}")
         return values
 
-    def groups(self, _real: type, lanes: int) -> SimpleNamespace:
-        """Stand for :func:`brainbench.stimuli.engines.rod.kernels.thread_groups.groups`."""
+    def groups(self, size: int) -> dict:
+        """Return what stands for the functions of :mod:`brainbench.stimuli.engines.rod.kernels.thread_groups`."""
 
         def mine(values):
-            begin = self._own.index // lanes * lanes
-            return values[begin : begin + lanes]
+            begin = self._own.index // size * size
+            return values[begin : begin + size]
 
-        return SimpleNamespace(
-            give=lambda value, source: mine(self._exchange(value))[source],
-            total=lambda value: sum(mine(self._exchange(value))),
-            greatest=lambda value: max(mine(self._exchange(value))),
-            least=lambda value: min(mine(self._exchange(value))),
-            first=lambda value: min(mine(self._exchange(value))),
-            joined=lambda value: int(np.bitwise_or.reduce([int(bits) for bits in mine(self._exchange(value))])),
-            most=lambda value: max(self._exchange(value)),
-        )
+        return {
+            "broadcast": lambda value, source: mine(self._exchange(value))[source],
+            "group_sum": lambda value: sum(mine(self._exchange(value))),
+            "group_max": lambda value: max(mine(self._exchange(value))),
+            "group_min": lambda value: min(mine(self._exchange(value))),
+            "group_min_int": lambda value: min(mine(self._exchange(value))),
+            "group_or": lambda value: int(np.bitwise_or.reduce([int(bits) for bits in mine(self._exchange(value))])),
+            "warp_max": lambda value: max(self._exchange(value)),
+        }
 
 
 def _language() -> ModuleType:
@@ -144,26 +141,27 @@ def _language() -> ModuleType:
 
 @contextmanager
 def thread_warp():
-    """Give a :class:`ThreadWarp` and the modules of the solver, made anew on it; the real ones come back after."""
-    package = "brainbench.stimuli.engines.rod.kernels."
-    kept = {name: module for name, module in sys.modules.items() if name == "warp" or name.startswith(package)}
+    """Give a :class:`ThreadWarp` and ``load(module, group_size=…, …)`` for kernel modules made anew on it.
+
+    The real modules come back after.
+    """
+    package = specialize.__module__
+    kept = {name: module for name, module in sys.modules.items() if name == "warp" or name.startswith(f"{package}_")}
     threads = ThreadWarp()
+
+    def load(module: str, **parameters: object) -> ModuleType:
+        given = specialize("parameters", **parameters)
+        groups = ModuleType(f"{given.__package__}.thread_groups")
+        vars(groups).update(threads.groups(given.group_size))
+        sys.modules[groups.__name__] = groups
+        return specialize(module, **parameters)
+
     try:
         for name in kept:
             del sys.modules[name]
         sys.modules["warp"] = _language()
-        made = {name: importlib.import_module(package + name) for name in _MODULES}
-        for module in made.values():
-            if hasattr(module, "groups"):
-                module.groups = threads.groups
-        for name in ("compliance", "contacts"):
-            made[name].structs = lambda _real: SimpleNamespace(Grips=object)
-        yield threads, SimpleNamespace(**made)
+        yield threads, load
     finally:
-        for name in [name for name in sys.modules if name == "warp" or name.startswith(package)]:
+        for name in [name for name in sys.modules if name == "warp" or name.startswith(f"{package}_")]:
             del sys.modules[name]
         sys.modules.update(kept)
-        parent = importlib.import_module("brainbench.stimuli.engines.rod.kernels")
-        for name, module in kept.items():
-            if name.startswith(package):
-                setattr(parent, name.rsplit(".", 1)[1], module)

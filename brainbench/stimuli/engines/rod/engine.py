@@ -27,7 +27,7 @@ from brainbench.stimuli.engines.rod.limits import (
     finer_steps,
 )
 from brainbench.stimuli.engines.rod.packing import KNOT, Chains, Shapes, Tracks, capacity_for, follicle_knots
-from brainbench.stimuli.engines.rod.scheduling import make_grips
+from brainbench.stimuli.engines.rod.scheduling import make_problems
 from brainbench.stimuli.engines.trust import MILLI, check_jobs, step_travel, strongest_force, too_strong
 from brainbench.stimuli.whiskers.chain import build_chain
 
@@ -252,14 +252,14 @@ def _simulate(
             options,
             wp.array(readings, dtype=real, device=device),
             out,
-            make_grips(kernels, real, capacity, count, device),
+            make_problems(kernels, capacity, count, device),
             kernels.structs.PausedWhiskers(),
         ],
         device=device,
     )
     spent = time.thread_time() - started
     results = {name: getattr(out, name).numpy() for name in (*_NUMBERS, *_COUNTS, "wrench", "contact")}
-    points, pressed = (out.points.numpy(), out.pressed.numpy()) if record_shape else (None, None)
+    points, pressed = (out.points.numpy(), out.contact_wrench.numpy()) if record_shape else (None, None)
     for lane, (index, job, chain, missed) in enumerate(lanes):
         shape = None if points is None else points[:, : chain.links + 1, lane].astype(float) / MILLI
         trace, mendable = _trace(results, lane, job, shape, missed, spent / count)
@@ -280,7 +280,7 @@ def _results(kernels: Any, real: Any, device: Any, sizes: tuple[int, int, int], 
     out.contact = wp.full((count, frames, 1), -1.0, dtype=real, device=device)
     points, pressed = ((frames, capacity + 1, count), (frames, 2, count)) if record_shape else ((1, 1, 1),) * 2
     out.points = wp.zeros(points, dtype=kernels.structs.vec3, device=device)
-    out.pressed = wp.zeros(pressed, dtype=kernels.structs.vec3, device=device)
+    out.contact_wrench = wp.zeros(pressed, dtype=kernels.structs.vec3, device=device)
     for names, kind in ((_NUMBERS, real), (_COUNTS, wp.int32)):
         for name in names:
             setattr(out, name, wp.zeros(count, dtype=kind, device=device))

@@ -5,7 +5,7 @@ CONTACTS = 8, 14
 more. A finely divided whisker that lies on a round face touches it with link after link."""
 SPARE = 4
 """Places of possible contact that are watched within a step beyond those; the nearest are kept when there are more."""
-ROUNDS = 4
+CONTACT_ROUNDS = 4
 """Times that contacts are added to a step because the others press the whisker onto them."""
 CLOSED = 1e-3
 """Overlap (mm) at the end of a step from which a place counts as pressed upon."""
@@ -53,12 +53,12 @@ GROUPS = (2, 2), (4, 4)
 of more have groups of eight, or sixteen."""
 DISTANCE_GROUP = 8
 """Threads of a GPU that find the distance of one link together: 1, 2, 4 or 8."""
-LOOK_BOUNDS = 128, 4
+DISTANCE_BOUNDS = 128, 4
 """CUDA launch bounds of that kernel."""
-GRIP_BOUNDS = 128, 4
+CONTACT_BOUNDS = 128, 4
 """CUDA launch bounds of these kernels."""
-AFTER_LOOK, AFTER_GRIP, ANYHOW = 0, 1, 2
-"""Queues of paused whiskers: those that looked, those whose contact forces were found, all others."""
+AFTER_DISTANCES, AFTER_CONTACTS, AFTER_OTHERS = 0, 1, 2
+"""Queues of paused whiskers: those whose distances were found, those whose contact forces were found, all others."""
 
 NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 """What whiskers may touch: a kernel holds only the code that its scenes need."""

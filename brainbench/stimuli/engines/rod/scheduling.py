@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.devices import warp
-from brainbench.stimuli.engines.rod.limits import ANYHOW, GRIP_BOUNDS, LOOK_BOUNDS, SPARE, WARP, contacts_for
+from brainbench.stimuli.engines.rod.limits import (
+    AFTER_OTHERS,
+    CONTACT_BOUNDS,
+    DISTANCE_BOUNDS,
+    SPARE,
+    WARP,
+    contacts_for,
+)
 
 BUDGET = 4
 """Steps of a whisker in one slice."""
@@ -46,27 +53,23 @@ class Slices:
         # Looks and contact forces of a slice need not wait for each other.
         self.streams = [wp.Stream(device) if self.recorded else None for _ in kernels.solve_contacts]
         self.looks = max(4 * lanes, capacity)
-        on = self.struct = kernels.structs.PausedWhiskers()
-
-        def empty(*shape: int, kind: Any = real) -> Any:
-            return wp.empty(shape, dtype=kind, device=device)
-
-        vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
+        queues, links, queries = (3, lanes), (capacity, lanes), self.looks
+        on = self.struct = allocate(
+            kernels.structs.PausedWhiskers,
+            device,
+            **dict.fromkeys(("queue", "next_queue", "problem_queue"), queues),
+            **dict.fromkeys(("queue_size", "problem_size", "next_queue_size", "next_problem_size"), 3),
+            **dict.fromkeys(("query_count", "next_query_count"), 1),
+            **dict.fromkeys(("state", "query_time", "query_margin"), lanes),
+            **dict.fromkeys(("joint", "proximity"), links),
+            **dict.fromkeys(("query", "answer"), queries),
+        )
         on.budget = budget or (1 if lanes < FEW else BUDGET)
-        queue = np.zeros((3, lanes), dtype=np.int32)
-        queue[ANYHOW] = np.arange(lanes)
-        on.queue = wp.array(queue, device=device)
-        on.after, on.grips = (empty(3, lanes, kind=wp.int32) for _ in range(2))
-        size = np.zeros(7, dtype=np.int32)
-        size[ANYHOW] = lanes
-        on.size = wp.array(size, device=device)
-        on.tally = wp.zeros(7, dtype=wp.int32, device=device)
-        on.joints, on.ways = empty(capacity, lanes, kind=vec4), empty(capacity, lanes, kind=vec2)
-        on.times = empty(9, lanes)
-        on.counts = wp.zeros((8, lanes), dtype=wp.int32, device=device)
-        on.look_lane, on.look_link = (wp.zeros(self.looks, dtype=wp.int32, device=device) for _ in range(2))
-        on.look_ends = empty(self.looks, 2, kind=vec3)
-        on.found = empty(self.looks, 3, kind=vec4)
+        queue = np.zeros(queues, dtype=np.int32)
+        queue[AFTER_OTHERS] = np.arange(lanes)
+        size = np.zeros(3, dtype=np.int32)
+        size[AFTER_OTHERS] = lanes
+        on.queue, on.queue_size = (wp.array(values, device=device) for values in (queue, size))
 
     def run(self, inputs: list[Any], block: int) -> int:
         """Take all whiskers to their end; return the number of slices.
@@ -88,49 +91,48 @@ class Slices:
                     graph, fits = capture.graph, left
                 wp.capture_launch(graph)
             rounds += ROUNDS
-            left = int(self.struct.size.numpy()[:3].sum())
+            left = int(self.struct.queue_size.numpy().sum())
         return rounds
 
     def _several(self, inputs: list[Any], left: int, block: int) -> None:
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
         for _ in range(ROUNDS):
             wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, block_dim=block)
-            on.queue, on.after = on.after, on.queue
+            on.queue, on.next_queue = on.next_queue, on.queue
             wp.launch(kernels.swap_queues, 1, [on], device=device)
             for (kernel, threads), stream in zip(kernels.solve_contacts, self.streams, strict=True):
                 # Whole warps: the threads of a group speak with each other.
                 many = -(-left * threads // WARP) * WARP
                 if stream is not None:
                     stream.wait_stream(device.stream)
-                wp.launch(kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=GRIP_BOUNDS[0])
+                wp.launch(kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=CONTACT_BOUNDS[0])
             looks = min(self.looks, self.capacity * left) * kernels.distance_group
             looks = min(-(-looks // WARP) * WARP, LOOKING)
             wp.launch(
-                kernels.measure_distances, looks, [*inputs[:4], on, looks], device=device, block_dim=LOOK_BOUNDS[0]
+                kernels.measure_distances, looks, [*inputs[:4], on, looks], device=device, block_dim=DISTANCE_BOUNDS[0]
             )
             for stream in self.streams:
                 if stream is not None:
                     device.stream.wait_stream(stream)
 
 
-def make_grips(kernels: Any, real: Any, capacity: int, lanes: int, device: Any) -> Any:
-    """Room for the contact problem of each lane."""
-    wp = warp()
-    held, seen = contacts_for(capacity), contacts_for(capacity) + SPARE
-    vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
-    gp = kernels.structs.ContactProblems()
+def allocate(kind: Any, device: Any, **shapes: int | tuple[int, ...]) -> Any:
+    """Return a Warp structure with zeroed arrays of these shapes."""
+    struct = kind()
+    for name, shape in shapes.items():
+        setattr(struct, name, warp().zeros(shape, dtype=kind.vars[name].type.dtype, device=device))
+    return struct
 
-    def empty(*shape: int, kind: Any = real) -> Any:
-        return wp.empty(shape, dtype=kind, device=device)
 
-    gp.counts = empty(lanes, 5, kind=wp.int32)
-    gp.plan = empty(lanes, kind=vec4)
-    gp.chain = empty(lanes * capacity, 9, kind=vec3)
-    gp.spot_link = empty(lanes * seen, kind=wp.int32)
-    gp.spot_size = empty(lanes * seen, kind=vec4)
-    gp.spot = empty(lanes * seen, 4, kind=vec3)
-    gp.ahead = empty(lanes * seen)
-    gp.held = empty(lanes, held, kind=vec4)
-    gp.push, gp.mend = (empty(lanes, capacity, kind=vec2) for _ in range(2))
-    gp.answer = empty(lanes, 7, kind=vec3)
-    return gp
+def make_problems(kernels: Any, capacity: int, lanes: int, device: Any) -> Any:
+    """Return room for the contact problem of each lane."""
+    held, candidates = contacts_for(capacity), contacts_for(capacity) + SPARE
+    return allocate(
+        kernels.structs.ContactProblems,
+        device,
+        **dict.fromkeys(("size", "step", "solution"), lanes),
+        joint=lanes * capacity,
+        **dict.fromkeys(("candidate_link", "candidate_size", "candidate", "predicted_gap"), lanes * candidates),
+        held=(lanes, held),
+        **dict.fromkeys(("free_acceleration", "added_acceleration"), (lanes, capacity)),
+    )

@@ -29,7 +29,7 @@ from brainbench.stimuli.engines.rod.packing import (
     quaternions,
     still_knots,
 )
-from brainbench.stimuli.engines.rod.scheduling import Slices, make_grips
+from brainbench.stimuli.engines.rod.scheduling import Slices, make_problems
 from brainbench.stimuli.engines.trust import MILLI
 from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -182,7 +182,9 @@ class SweepLauncher:
         frames, real = len(self.readings), self.real
         out.wrench = wp.zeros((count, frames, whiskers, 6), dtype=real, device=device)
         out.contact = wp.full((count, frames, whiskers), -1.0, dtype=real, device=device)
-        out.points, out.pressed = (wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2))
+        out.points, out.contact_wrench = (
+            wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2)
+        )
         out.depth, out.failed, out.miss, out.load = (wp.zeros(len(row), dtype=real, device=device) for _ in range(4))
         names = ("status", "steps", "touching", "crowded", "unsolved")
         for name in names:
@@ -198,7 +200,7 @@ class SweepLauncher:
             options,
             wp.array(self.readings, dtype=real, device=device),
             out,
-            make_grips(kernels, real, self.capacity, len(row), device),
+            make_problems(kernels, self.capacity, len(row), device),
         ]
         wp.synchronize_device(device)
         clock.append(time.perf_counter())

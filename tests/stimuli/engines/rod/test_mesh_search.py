@@ -5,8 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from brainbench.core.devices import to_struct
+from brainbench.stimuli.engines.rod.kernels import specialize
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, spatial_order, tree_boxes
-from brainbench.stimuli.engines.rod.packing import Surface
+from brainbench.stimuli.engines.rod.packing import Shapes, Surface
 from brainbench.stimuli.objects.obstacle import TriangleMesh
 from tests.factories.rod_threads import WARP, Memory, thread_warp
 
@@ -52,17 +54,14 @@ def test_every_aligned_run_of_triangles_is_a_box_that_holds_them():
 
 def _ask(surface, starts, stops, radius, within, leaf):
     """Squared distances [segment, 3] of the kernel's search from the segments, their ends and their starts."""
-    from brainbench.core.devices import to_struct
-    from brainbench.stimuli.engines.rod.kernels.inputs import structs
-    from brainbench.stimuli.engines.rod.kernels.mesh_search import searches
-
     wp.init()
-    nearest, kinds = searches(wp.float64, 1).nearest, structs(wp.float64)
-    filled = to_struct(kinds.Bodies, _bodies(surface), "cpu")
+    search = specialize("mesh_bvh", real=wp.float64)
+    nearest_triangles, ShapeArrays = search.nearest_triangles, search.ShapeArrays
+    filled = to_struct(ShapeArrays, _shapes(surface), "cpu")
 
     @wp.kernel(enable_backward=False, module="unique")
     def ask(
-        bodies: kinds.Bodies,
+        shapes: ShapeArrays,
         a: wp.array(dtype=wp.vec3d),
         b: wp.array(dtype=wp.vec3d),
         radius: wp.float64,
@@ -72,7 +71,7 @@ def _ask(surface, starts, stops, radius, within, leaf):
         opened: wp.array(dtype=wp.int32),
     ):
         k = wp.tid()
-        got = nearest(bodies, 0, a[k], b[k], radius, within, leaf[k], 0, 1)
+        got = nearest_triangles(shapes, 0, a[k], b[k], radius, within, leaf[k], 0, 1)
         out[k] = wp.vec3d(got.side, got.end, got.start)
         opened[k] = got.boxes
 
@@ -82,9 +81,7 @@ def _ask(surface, starts, stops, radius, within, leaf):
     return out.numpy(), opened.numpy()
 
 
-def _bodies(surface):
-    from brainbench.stimuli.engines.rod.packing import Shapes
-
+def _shapes(surface):
     shapes = Shapes()
     one, still = np.ones(1), np.array([[1.0, 0, 0, 0]])
     prepared = Surface.of(surface.vertices, surface.faces)
@@ -152,18 +149,14 @@ def _inside(surface, points):
 
 
 def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begins():
-    from brainbench.core.devices import to_struct
-    from brainbench.stimuli.engines.rod.kernels.inputs import structs
-    from brainbench.stimuli.engines.rod.kernels.motion import tracks
-    from brainbench.stimuli.engines.rod.kernels.narrow_phase import looks
-    from brainbench.stimuli.engines.rod.limits import MESHES
-
     wp.init()
-    look_at, bodies, pose = looks(wp.float64, MESHES).look_at, structs(wp.float64).Bodies, tracks(wp.float64).Pose
+    phase = specialize("narrow_phase", real=wp.float64)
+    link_shape_distance, ShapeArrays, BodyMotion = phase.link_shape_distance, phase.ShapeArrays, phase.BodyMotion
+    LinkTaper = phase.LinkTaper
 
     @wp.kernel(enable_backward=False, module="unique")
     def ask(
-        bodies: bodies,
+        shapes: ShapeArrays,
         a: wp.array(dtype=wp.vec3d),
         b: wp.array(dtype=wp.vec3d),
         margin: wp.float64,
@@ -171,12 +164,12 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
         out: wp.array2d(dtype=wp.float64),
     ):
         k = wp.tid()
-        body = pose()
+        body = BodyMotion()
         body.turn = wp.vec4d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
-        thin = wp.vec4d(wp.float64(1e-3), wp.float64(1e-3), wp.float64(0.0), wp.float64(1.0))
-        touch = look_at(bodies, 0, body, a[k], b[k], thin, margin, leaf[k], 0, 1)
-        out[k, 0] = wp.where(touch.between == 1, touch.gap, wp.float64(1e30))
-        out[k, 1] = wp.where(touch.end == 1, touch.end_gap, wp.float64(1e30))
+        thin = LinkTaper(wp.float64(1e-3), wp.float64(1e-3), wp.float64(0.0), wp.float64(1.0))
+        found = link_shape_distance(shapes, 0, body, a[k], b[k], thin, margin, leaf[k], 0, 1)
+        out[k, 0] = wp.where(found.between == 1, found.gap, wp.float64(1e30))
+        out[k, 1] = wp.where(found.end == 1, found.end_gap, wp.float64(1e30))
 
     # So small that every triangle is within sight.
     surface = _surface()
@@ -198,7 +191,7 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
     leaf = np.random.default_rng(1).integers(1, -(-len(surface.faces) // WIDE), size=len(starts))
     out = wp.zeros((len(starts), 2), dtype=wp.float64)
     inputs = [
-        to_struct(bodies, _bodies(surface), "cpu"),
+        to_struct(ShapeArrays, _shapes(surface), "cpu"),
         wp.array(starts, dtype=wp.vec3d),
         wp.array(stops, dtype=wp.vec3d),
     ]
@@ -225,9 +218,9 @@ def test_threads_that_search_together_find_what_one_finds(lanes):
     # The single kernel may look at more than it must, but only within what matters.
     counts = (alone <= within**2) & (np.arange(3) < 2)
     alone = np.where((alone == alone.min(axis=1, keepdims=True)) | counts, alone, np.nan)
-    arrays = _bodies(surface)
-    with thread_warp() as (threads, modules):
-        nearest = modules.mesh_search.searches(np.float64, lanes).nearest
+    arrays = _shapes(surface)
+    with thread_warp() as (threads, load):
+        nearest = load("mesh_bvh", group_size=lanes).nearest_triangles
         bodies = SimpleNamespace(**{name: Memory(values) for name, values in arrays.items()})
         for begin in range(0, len(starts), count):
             found = {}

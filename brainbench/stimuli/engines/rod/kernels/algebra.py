@@ -44,8 +44,7 @@ def sine(x: real) -> real:
         y = x * x
         return x * (
             real(1.0)
-            + y
-            * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
+            + y * (real(-1.0 / 6.0) + y * (real(1.0 / 120.0) + y * (real(-1.0 / 5040.0) + y * real(1.0 / 362880.0))))
         )
     return wp.sin(x)
 
@@ -56,8 +55,7 @@ def cosine(x: real) -> real:
         y = x * x
         return real(1.0) + y * (
             real(-0.5)
-            + y
-            * (real(1.0 / 24.0) + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0))))
+            + y * (real(1.0 / 24.0) + y * (real(-1.0 / 720.0) + y * (real(1.0 / 40320.0) + y * real(-1.0 / 3628800.0))))
         )
     return wp.cos(x)
 

@@ -1,7 +1,4 @@
-"""The passes over a chain within a step.
-"""
-
-from typing import Any
+"""The passes over a chain within a step."""
 
 import warp as wp
 
@@ -10,12 +7,30 @@ from brainbench.stimuli.engines.rod.limits import BENT, FOLD, LARGEST_BEND, LOST
 from .algebra import cosine, first_axis, mat33, rotate, sine, symmetric_outer, symmetric_times, vec2, vec3, vec6
 from .motion import BodyMotion
 from .parameters import real
-from .state import ChainArrays, ChainState, ContactCandidates, JobArrays, ProximityState, StepOptions, Twist, WhiskerJob, WhiskerState, row
+from .state import (
+    ChainArrays,
+    ChainState,
+    ContactCandidates,
+    JobArrays,
+    ProximityState,
+    SpatialAcceleration,
+    StepOptions,
+    Twist,
+    WhiskerJob,
+    WhiskerState,
+    Wrench,
+    row,
+)
 
 
 @wp.func(inline=True)
 def forward_kinematics(
-    chains: ChainArrays, job: WhiskerJob, pose: BodyMotion, chain: wp.ref[ChainState], proximity: wp.ref[ProximityState], state: wp.ref[WhiskerState]
+    chains: ChainArrays,
+    job: WhiskerJob,
+    pose: BodyMotion,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    state: wp.ref[WhiskerState],
 ) -> Twist:
     """Down the chain: where the links are and how they move; returned is the motion of the last one."""
     zero = real(0.0)
@@ -28,9 +43,9 @@ def forward_kinematics(
     speed = wp.length_sq(vv)
     fastest = speed
     for i in range(job.links):
-        b4 = chains.build[i, job.whisker]
-        turned = x * b4[1] + y * b4[2]
-        y = y * b4[1] - x * b4[2]
+        link = chains.build[i, job.whisker]
+        turned = x * link.bend_cosine + y * link.bend_sine
+        y = y * link.bend_cosine - x * link.bend_sine
         angle = row(chain.angle, i)
         rate = row(chain.rate, i)
         ca = cosine(angle[0])
@@ -46,7 +61,7 @@ def forward_kinematics(
         turned = x * cb + y * sb
         y = y * cb - x * sb
         x = turned
-        at = at + x * b4[0]
+        at = at + x * link.length
         end_speed = wp.length_sq(vv + wp.cross(vw, at))
         proximity.end_speed[i] = wp.sqrt(wp.max(speed, end_speed))
         fastest = wp.max(fastest, end_speed)
@@ -54,8 +69,8 @@ def forward_kinematics(
     chain.node[job.links] = at
     state.top_speed = wp.sqrt(fastest)
     last = Twist()
-    last.w = vw
-    last.v = vv
+    last.angular = vw
+    last.linear = vv
     return last
 
 
@@ -67,11 +82,11 @@ def articulated_inertia(
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     last: Twist,
-    base: Twist,
+    base: SpatialAcceleration,
     now: real,
     h: real,
     seen: int,
-) -> Twist:
+) -> Wrench:
     """Up the chain: articulated inertia, bias and what each joint does with them.
 
     ``last`` is the motion of the last link, ``base`` the acceleration of the base; returned is what the base feels.
@@ -79,8 +94,8 @@ def articulated_inertia(
     zero = real(0.0)
     one = real(1.0)
     step_damping = wp.max(job.beta - h, zero)
-    vw = last.w
-    vv = last.v
+    vw = last.angular
+    vv = last.linear
     ia = vec6(zero, zero, zero, zero, zero, zero)
     ib = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
     ic = vec6(zero, zero, zero, zero, zero, zero)
@@ -88,14 +103,14 @@ def articulated_inertia(
     pv = vec3(zero, zero, zero)
     for back in range(job.links):
         i = job.links - 1 - back
-        b4 = chains.build[i, job.whisker]
-        i4 = chains.inertia[i, job.whisker]
+        link = chains.build[i, job.whisker]
+        inertia = chains.inertia[i, job.whisker]
         at = row(chain.node, i)
-        xa = (row(chain.node, i + 1) - at) / b4[0]
-        com = at + xa * i4[0]
-        m = b4[3]
-        thin = i4[1] - i4[2]
-        common = m * wp.dot(com, com) + i4[2]
+        xa = (row(chain.node, i + 1) - at) / link.length
+        com = at + xa * inertia.centre
+        m = link.mass
+        thin = inertia.axial - inertia.transverse
+        common = m * wp.dot(com, com) + inertia.transverse
         mc = com * m
         ia = ia + vec6(
             common + thin * xa[0] * xa[0] - mc[0] * com[0],
@@ -108,14 +123,14 @@ def articulated_inertia(
         ib = ib + mat33(zero, -mc[2], mc[1], mc[2], zero, -mc[0], -mc[1], mc[0], zero)
         ic = ic + vec6(m, m, m, zero, zero, zero)
         momentum = vv * m + wp.cross(vw, mc)
-        spin = wp.cross(com, momentum) + vw * i4[2] + xa * (thin * wp.dot(xa, vw))
+        spin = wp.cross(com, momentum) + vw * inertia.transverse + xa * (thin * wp.dot(xa, vw))
         pw = pw + wp.cross(vw, spin) + wp.cross(vv, momentum)
         pv = pv + wp.cross(vw, momentum)
         if job.end_load > job.first_load:
             for given in range(job.first_load, job.end_load):
                 if jobs.load_link[given] == i and now < jobs.load_stop[given]:
                     pull = jobs.load_force[given]
-                    pw = pw - wp.cross(at + xa * (b4[0] * jobs.load_share[given]), pull)
+                    pw = pw - wp.cross(at + xa * (link.length * jobs.load_share[given]), pull)
                     pv = pv - pull
         angle = row(chain.angle, i)
         s2 = row(chain.axis2, i)
@@ -126,7 +141,7 @@ def articulated_inertia(
         u1v = s1 * ib + symmetric_times(ic, m1)
         u2w = symmetric_times(ia, s2) + ib * m2
         u2v = s2 * ib + symmetric_times(ic, m2)
-        k = i4[3]
+        k = inertia.stiffness
         lag = h + step_damping
         soft = h * k * lag
         rate = row(chain.rate, i)
@@ -179,14 +194,16 @@ def articulated_inertia(
         ib = ib - wp.outer(u1w, g1v) - wp.outer(u2w, g2v)
         pw = pw + symmetric_times(ia, cw) + ib * cv + u1w * f1 + u2w * f2
         pv = pv + cw * ib + symmetric_times(ic, cv) + u1v * f1 + u2v * f2
-    felt = Twist()
-    felt.w = symmetric_times(ia, base.w) + ib * base.v + pw
-    felt.v = base.w * ib + symmetric_times(ic, base.v) + pv
-    return felt
+    base_wrench = Wrench()
+    base_wrench.moment = symmetric_times(ia, base.angular) + ib * base.linear + pw
+    base_wrench.force = base.angular * ib + symmetric_times(ic, base.linear) + pv
+    return base_wrench
 
 
 @wp.func(inline=True)
-def integrate_joint(chain: wp.ref[ChainState], state: wp.ref[WhiskerState], i: int, a: vec2, h: real, end: real, quasistatic: int):
+def integrate_joint(
+    chain: wp.ref[ChainState], state: wp.ref[WhiskerState], i: int, a: vec2, h: real, end: real, quasistatic: int
+):
     """Move a joint by its accelerations to the end of the step."""
     rate = row(chain.rate, i) + a * h
     angle = row(chain.angle, i) + rate * h
@@ -213,7 +230,7 @@ def joint_accelerations(
     candidates: wp.ref[ContactCandidates],
     state: wp.ref[WhiskerState],
     moving: Twist,
-    base: Twist,
+    base: SpatialAcceleration,
     now: real,
     h: real,
     seen: int,
@@ -222,10 +239,10 @@ def joint_accelerations(
 
     ``moving`` is the velocity of the base, ``base`` its acceleration; returned is the acceleration of the tip.
     """
-    aw = base.w
-    av = base.v
-    vw = moving.w
-    vv = moving.v
+    aw = base.angular
+    av = base.linear
+    vw = moving.angular
+    vv = moving.linear
     for i in range(job.links):
         at = row(chain.node, i)
         s2 = row(chain.axis2, i)
@@ -253,6 +270,10 @@ def joint_accelerations(
             if row(candidates.link, j) == i:
                 # Gravity was added to the base's acceleration; it moves nothing by itself.
                 candidates.free_velocity[j] = (
-                    vv + av * h + options.gravity * h + wp.cross(vw + aw * h, row(candidates.point, j)) - row(candidates.object_velocity, j)
+                    vv
+                    + av * h
+                    + options.gravity * h
+                    + wp.cross(vw + aw * h, row(candidates.point, j))
+                    - row(candidates.object_velocity, j)
                 )
     return av + wp.cross(aw, row(chain.node, job.links))

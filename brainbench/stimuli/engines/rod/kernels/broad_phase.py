@@ -1,7 +1,4 @@
-"""Which links may touch something within a step, and where.
-"""
-
-from typing import Any
+"""Which links may found something within a step, and where."""
 
 import warp as wp
 
@@ -9,9 +6,25 @@ from brainbench.stimuli.engines.rod.limits import WIDEST
 
 from .algebra import first_axis, rotate, vec3
 from .motion import BodyMotion, pose_at
-from .narrow_phase import LinkDistance, link_shape_distance
+from .narrow_phase import link_shape_distance
 from .parameters import real, sliced
-from .state import ChainArrays, ChainState, ContactCandidates, MotionArrays, PausedWhiskers, ProximityState, ShapeArrays, StepOptions, WhiskerJob, WhiskerState, most_candidates, row
+from .state import (
+    WAIT_DISTANCES,
+    WAIT_SLICE,
+    ChainArrays,
+    ChainState,
+    ContactCandidates,
+    LinkDistance,
+    MotionArrays,
+    PausedWhiskers,
+    ProximityState,
+    ShapeArrays,
+    StepOptions,
+    WhiskerJob,
+    WhiskerState,
+    most_candidates,
+    row,
+)
 
 
 @wp.struct
@@ -41,14 +54,21 @@ def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerSta
 
 
 @wp.func(inline=True)
-def may_be_near(chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange, i: int) -> bool:
+def may_be_near(
+    chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange, i: int
+) -> bool:
     """Whether a link may be so near, for all that is known without a look."""
     taper = chains.taper[i, job.whisker]
-    return row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed) <= reach.margin + taper[0]
+    return (
+        row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
+        <= reach.margin + taper.start_radius
+    )
 
 
 @wp.func(inline=True)
-def count_near_links(chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange) -> int:
+def count_near_links(
+    chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange
+) -> int:
     """Number of links that must look."""
     near_count = int(0)
     for i in range(job.links):
@@ -71,44 +91,26 @@ def query_distances(
     near_count: int,
 ) -> int:
     """Ask for looks; returned is what to wait for. When there is no room for more, try again."""
-    state.first_query = wp.atomic_add(paused.tally, 6, near_count)
-    if state.first_query + near_count > paused.query_job.shape[0]:
-        return 2
+    state.first_query = wp.atomic_add(paused.next_query_count, 0, near_count)
+    if state.first_query + near_count > paused.query.shape[0]:
+        return WAIT_SLICE
     place = state.first_query
     for i in range(job.links):
         if may_be_near(chains, job, proximity, reach, i):
-            paused.query_job[place] = job.index
-            paused.query_link[place] = i
-            paused.query_ends[place, 0] = row(chain.node, i) + origin
-            paused.query_ends[place, 1] = row(chain.node, i + 1) + origin
+            paused.query[place].job = job.index
+            paused.query[place].link = i
+            paused.query[place].start = row(chain.node, i) + origin
+            paused.query[place].stop = row(chain.node, i + 1) + origin
             place = place + 1
-    paused.times[5, job.index] = now
-    paused.times[6, job.index] = reach.margin
-    return 1
+    paused.query_time[job.index] = now
+    paused.query_margin[job.index] = reach.margin
+    return WAIT_DISTANCES
 
 
 @wp.func(inline=True)
-def stored_distance(paused: PausedWhiskers, place: int) -> LinkDistance:
-    """What a look found."""
-    f0 = paused.found[place, 0]
-    f1 = paused.found[place, 1]
-    f2 = paused.found[place, 2]
-    what = int(f2[2])
-    touch = LinkDistance()
-    touch.normal = vec3(f0[0], f0[1], f0[2])
-    touch.gap = f0[3]
-    touch.end_normal = vec3(f1[0], f1[1], f1[2])
-    touch.end_gap = f1[3]
-    touch.share = f2[0]
-    touch.clear = f2[1]
-    touch.between = what % 2
-    touch.end = what // 2
-    touch.leaf = int(f2[3])
-    return touch
-
-
-@wp.func(inline=True)
-def candidate_slot(candidates: wp.ref[ContactCandidates], seen: int, point: vec3, normal: vec3, ahead: real, link: vec3) -> int:
+def candidate_slot(
+    candidates: wp.ref[ContactCandidates], seen: int, point: vec3, normal: vec3, ahead: real, link: vec3
+) -> int:
     """Where to keep a place of possible contact (``seen``: a further one; −1: nowhere)."""
     slot = seen
     # The same contact seen from two links, or from both ends of a short gap.
@@ -164,35 +166,35 @@ def find_candidates(
         cvw = cvw + spun
         cvv = cvv + wp.cross(joint, spun)
         taper = chains.taper[i, job.whisker]
-        if row(proximity.clearance, i) <= margin + taper[0]:
+        if row(proximity.clearance, i) <= margin + taper.start_radius:
             closest = real(1e20)
             for s in range(job.first_shape, job.end_shape):
                 body = pose_at(motions, shapes.track[s], now)
                 turn_s = shapes.turn[s]
-                touch = LinkDistance()
+                found = LinkDistance()
                 if wp.static(sliced):
-                    touch = stored_distance(paused, asked)
+                    found = paused.answer[asked]
                     asked = asked + 1
                 else:
                     a = joint + origin
                     b = row(chain.node, i + 1) + origin
-                    touch = link_shape_distance(shapes, s, body, a, b, taper, margin, row(proximity.leaf, i), 0, 1)
-                proximity.leaf[i] = touch.leaf
-                closest = wp.min(closest, touch.clear)
+                    found = link_shape_distance(shapes, s, body, a, b, taper, margin, row(proximity.leaf, i), 0, 1)
+                proximity.leaf[i] = found.leaf
+                closest = wp.min(closest, found.clearance)
                 for which in range(sides):
-                    offered = touch.between
-                    share = touch.share
-                    gap = touch.gap
-                    way = touch.normal
+                    offered = found.between
+                    share = found.share
+                    gap = found.gap
+                    way = found.normal
                     if which == 1:
-                        offered = touch.end
+                        offered = found.end
                         share = real(1.0)
-                        gap = touch.end_gap
-                        way = touch.end_normal
+                        gap = found.end_gap
+                        way = found.end_normal
                     if offered == 1 and gap < margin:
                         state.depth = wp.max(state.depth, -gap)
                         normal = rotate(body.turn, rotate(turn_s, way))
-                        radius = taper[0] + (taper[1] - taper[0]) * share
+                        radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         point = joint + link * share - normal * radius
                         half = pose_at(motions, shapes.track[s], now + real(0.5) * h)
                         carried = half.velocity + wp.cross(half.spin, point + origin - half.place)
@@ -211,7 +213,7 @@ def find_candidates(
                             candidates.predicted_gap[slot] = ahead
                             candidates.friction[slot] = mu
                             candidates.point[slot] = point
-                            candidates.arc[slot] = taper[2] + taper[3] * share
+                            candidates.arc[slot] = taper.arc + taper.arc_length * share
                             candidates.object_velocity[slot] = carried
                             candidates.normal[slot] = normal
             proximity.clearance[i] = closest

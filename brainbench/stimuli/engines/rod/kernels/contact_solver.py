@@ -1,14 +1,23 @@
-"""CONTACT SOLVER
-"""
-
-from typing import Any
+"""CONTACT SOLVER"""
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CLOSED, ROUNDS, SWEEPS
+from brainbench.stimuli.engines.rod.limits import CLOSED, CONTACT_ROUNDS, SWEEPS
 
-from .algebra import vec2, vec3, vec4, vec6
-from .delassus import DelassusRows, NormalMatrix, PerContact1, SolverState, ThreadContacts, build_delassus, own_contacts, row, rows, select_contacts, tall
+from .algebra import vec2, vec3, vec6
+from .delassus import (
+    DelassusRows,
+    NormalMatrix,
+    PerContact1,
+    SolverState,
+    ThreadContacts,
+    build_delassus,
+    own_contacts,
+    row,
+    rows,
+    select_contacts,
+    tall,
+)
 from .parameters import capacity, contacts, group_size, real
 from .state import ContactProblems, PerLink2, most_candidates
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
@@ -94,7 +103,9 @@ def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], tabl
 
 
 @wp.func(inline=True)
-def gauss_seidel_sweep(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], tries: int):
+def gauss_seidel_sweep(
+    solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], tries: int
+):
     """One contact at a time."""
     zero = real(0.0)
     far_off = zero
@@ -352,7 +363,8 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
         if solver.thread + k < solver.contacts and solver.live == 1:
             pull = contact_force(own, k)
             arc = row(own.arc, k)
-            problems.held[solver.job, solver.thread + k] = vec4(arc, pull[0], pull[1], pull[2])
+            problems.held[solver.job, solver.thread + k].arc = arc
+            problems.held[solver.job, solver.thread + k].force = pull
             pressed = pressed + pull
             twisted = twisted + wp.cross(row(own.point, k), pull)
             fn = row(own.force, 3 * k)
@@ -364,13 +376,21 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
     pressed = vec3(group_sum(pressed[0]), group_sum(pressed[1]), group_sum(pressed[2]))
     twisted = vec3(group_sum(twisted[0]), group_sum(twisted[1]), group_sum(twisted[2]))
     if solver.thread == 0 and solver.live == 1:
-        problems.answer[solver.job, 4] = vec3(heavy, arm, zero)
-        problems.answer[solver.job, 5] = pressed
-        problems.answer[solver.job, 6] = twisted
+        problems.solution[solver.job].normal_sum = heavy
+        problems.solution[solver.job].arc_sum = arm
+        problems.solution[solver.job].contact_force = pressed
+        problems.solution[solver.job].contact_moment = twisted
 
 
 @wp.func(inline=True)
-def apply_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], lift: wp.ref[PerLink2], last: int, doing: int) -> int:
+def apply_forces(
+    problems: ContactProblems,
+    solver: wp.ref[SolverState],
+    own: wp.ref[ThreadContacts],
+    lift: wp.ref[PerLink2],
+    last: int,
+    doing: int,
+) -> int:
     """Forces up the chain, then the change of acceleration down.
 
     ``last`` says that there will be no further round. Returned is whether the forces press the whisker onto places
@@ -392,14 +412,14 @@ def apply_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
         u1 = zero
         u2 = zero
         if i < solver.links:
-            u1 = wp.dot(problems.joint[link0 + i, 0], tw) + wp.dot(problems.joint[link0 + i, 2], tv)
-            u2 = wp.dot(problems.joint[link0 + i, 1], tw) + wp.dot(problems.joint[link0 + i, 3], tv)
-            tw = tw - problems.joint[link0 + i, 4] * u1 - problems.joint[link0 + i, 6] * u2
-            tv = tv - problems.joint[link0 + i, 5] * u1 - problems.joint[link0 + i, 7] * u2
+            u1 = wp.dot(problems.joint[link0 + i].axis1, tw) + wp.dot(problems.joint[link0 + i].moment1, tv)
+            u2 = wp.dot(problems.joint[link0 + i].axis2, tw) + wp.dot(problems.joint[link0 + i].moment2, tv)
+            tw = tw - problems.joint[link0 + i].gain1_w * u1 - problems.joint[link0 + i].gain2_w * u2
+            tv = tv - problems.joint[link0 + i].gain1_v * u1 - problems.joint[link0 + i].gain2_v * u2
         u1 = group_sum(u1)
         u2 = group_sum(u2)
         if i < solver.links:
-            inv = problems.joint[link0 + i, 8]
+            inv = problems.joint[link0 + i].inverse_inertia
             lift[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
     tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
     tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
@@ -411,17 +431,26 @@ def apply_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
             extra = vec2(zero, zero)
             if i <= solver.last_link:
                 extra = row(lift, i)
-            a1 = extra[0] - wp.dot(problems.joint[link0 + i, 4], aw) - wp.dot(problems.joint[link0 + i, 5], av)
-            a2 = extra[1] - wp.dot(problems.joint[link0 + i, 6], aw) - wp.dot(problems.joint[link0 + i, 7], av)
-            aw = aw + problems.joint[link0 + i, 0] * a1 + problems.joint[link0 + i, 1] * a2
-            av = av + problems.joint[link0 + i, 2] * a1 + problems.joint[link0 + i, 3] * a2
+            a1 = (
+                extra[0] - wp.dot(problems.joint[link0 + i].gain1_w, aw) - wp.dot(problems.joint[link0 + i].gain1_v, av)
+            )
+            a2 = (
+                extra[1] - wp.dot(problems.joint[link0 + i].gain2_w, aw) - wp.dot(problems.joint[link0 + i].gain2_v, av)
+            )
+            aw = aw + problems.joint[link0 + i].axis1 * a1 + problems.joint[link0 + i].axis2 * a2
+            av = av + problems.joint[link0 + i].moment1 * a1 + problems.joint[link0 + i].moment2 * a2
             if solver.thread == 0:
                 problems.added_acceleration[solver.job, i] = vec2(a1, a2)
             if solver.contacts < solver.candidates:
                 for j in range(solver.candidates):
                     if problems.candidate_link[spot0 + j] == i and (solver.selected >> j) % 2 == 0:
-                        moved = problems.spot[spot0 + j, 2] + (av + wp.cross(aw, problems.spot[spot0 + j, 0])) * solver.step
-                        ahead = problems.spot_size[spot0 + j][0] + solver.step * wp.dot(problems.spot[spot0 + j, 1], moved)
+                        moved = (
+                            problems.candidate[spot0 + j].free_velocity
+                            + (av + wp.cross(aw, problems.candidate[spot0 + j].point)) * solver.step
+                        )
+                        ahead = problems.candidate_size[spot0 + j].gap + solver.step * wp.dot(
+                            problems.candidate[spot0 + j].normal, moved
+                        )
                         problems.predicted_gap[spot0 + j] = ahead
                         if ahead < real(-wp.static(CLOSED)):
                             more = int(1)
@@ -432,18 +461,24 @@ def apply_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
         if more == 0 and solver.thread == 0:
             unsolved = int(0)
             miss = zero
-            if solver.converged == 0 and solver.gap_error > real(1e-2) and solver.force_change > real(1e-2) * solver.force_sum:
+            if (
+                solver.converged == 0
+                and solver.gap_error > real(1e-2)
+                and solver.force_change > real(1e-2) * solver.force_sum
+            ):
                 unsolved = int(1)
                 miss = solver.force_change * solver.force_change
             index = solver.job
-            plan = problems.plan[index]
-            problems.counts[index, 2] = solver.contacts
-            problems.counts[index, 3] = crowded
-            problems.counts[index, 4] = unsolved
-            problems.answer[index, 0] = problems.answer[index, 0] - tw
-            problems.answer[index, 1] = problems.answer[index, 1] - tv
-            problems.answer[index, 2] = problems.answer[index, 2] + av + wp.cross(aw, vec3(plan[1], plan[2], plan[3]))
-            problems.answer[index, 3] = vec3(miss, solver.force_sum * solver.force_sum, zero)
+            problems.size[index].contacts = solver.contacts
+            problems.size[index].crowded = crowded
+            problems.size[index].unsolved = unsolved
+            problems.solution[index].base_moment = problems.solution[index].base_moment - tw
+            problems.solution[index].base_force = problems.solution[index].base_force - tv
+            problems.solution[index].tip_acceleration = (
+                problems.solution[index].tip_acceleration + av + wp.cross(aw, problems.step[index].tip)
+            )
+            problems.solution[index].miss = miss
+            problems.solution[index].load = solver.force_sum * solver.force_sum
     return more
 
 
@@ -453,10 +488,10 @@ def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
     solver.job = index
     solver.thread = part
     solver.live = live
-    solver.links = problems.counts[index, 0]
-    solver.candidates = problems.counts[index, 1]
-    solver.previous_contacts = problems.counts[index, 2]
-    solver.step = problems.plan[index][0]
+    solver.links = problems.size[index].links
+    solver.candidates = problems.size[index].candidates
+    solver.previous_contacts = problems.size[index].contacts
+    solver.step = problems.step[index].length
     solver.unknown_zero = wp.min(0, index)
     solver.own_count = int(wp.static(own_contacts)) + wp.static(tall) * solver.unknown_zero
     own = ThreadContacts()
@@ -464,7 +499,7 @@ def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
     square = NormalMatrix()
     work = NormalMatrix()
     lift = PerLink2()
-    rounds_most = int(wp.static(ROUNDS)) + solver.unknown_zero
+    rounds_most = int(wp.static(CONTACT_ROUNDS)) + solver.unknown_zero
     more = live
     for round_ in range(rounds_most):
         doing = more
@@ -473,7 +508,7 @@ def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
             build_delassus(problems, solver, own, table)
             iterate_forces(solver, own, table, square, work, doing)
             last = int(0)
-            if round_ == wp.static(ROUNDS - 1):
+            if round_ == wp.static(CONTACT_ROUNDS - 1):
                 last = 1
             more = apply_forces(problems, solver, own, lift, last, doing)
     store_forces(problems, solver, own)

@@ -1,5 +1,4 @@
-"""DELASSUS
-"""
+"""DELASSUS"""
 
 from typing import Any
 
@@ -78,6 +77,7 @@ class SolverState:
     """What it changed in the forces, and their sum."""
     force_sum: real
 
+
 kinds = (
     (PerLink2, vec2),
     (PerContact1, real),
@@ -87,8 +87,9 @@ kinds = (
     (PerRow3, vec3),
     (DelassusRows, real),
     (NormalMatrix, real),
+    (PerContactInt, wp.int32),
 )
-row = reader(*dict.fromkeys((*kinds, (PerContactInt, wp.int32))))
+row = reader(*kinds)
 
 
 @wp.func(inline=True)
@@ -99,31 +100,31 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     link0 = index * wp.static(capacity)
     spot = index * wp.static(most_candidates) + slot
     i = problems.candidate_link[spot]
-    size4 = problems.spot_size[spot]
-    normal = problems.spot[spot, 1]
-    moving = problems.spot[spot, 2]
+    size = problems.candidate_size[spot]
+    normal = problems.candidate[spot].normal
+    moving = problems.candidate[spot].free_velocity
     # One tangent along the whisker, where it tends to slide.
-    along = problems.spot[spot, 3]
+    along = problems.candidate[spot].along
     tangent = along - normal * wp.dot(along, normal)
     if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
-        e2 = problems.joint[link0 + i, 1]
+        e2 = problems.joint[link0 + i].axis2
         tangent = e2 - normal * wp.dot(e2, normal)
     tangent = wp.normalize(tangent)
     own.link[k] = i
-    own.arc[k] = size4[1]
-    own.friction[k] = size4[2]
-    own.point[k] = problems.spot[spot, 0]
+    own.arc[k] = size.arc
+    own.friction[k] = size.friction
+    own.point[k] = problems.candidate[spot].point
     # A deep overlap is undone over several steps.
-    own.closing_rate[k] = wp.min(-size4[0], real(wp.static(CREVICE))) / solver.step
+    own.closing_rate[k] = wp.min(-size.gap, real(wp.static(CREVICE))) / solver.step
     own.axis[3 * k] = normal
     own.axis[3 * k + 1] = tangent
     own.axis[3 * k + 2] = wp.cross(normal, tangent)
     # The forces of the last step are a good first guess.
     guess = vec3(zero, zero, zero)
     for e in range(solver.previous_contacts):
-        grip = problems.held[index, e]
-        if wp.abs(grip[0] - size4[1]) < real(0.3) * size4[3]:
-            guess = vec3(grip[1], grip[2], grip[3])
+        held = problems.held[index, e]
+        if wp.abs(held.arc - size.arc) < real(0.3) * size.link_arc:
+            guess = held.force
     for a in range(3):
         own.free_rate[3 * k + a] = wp.dot(row(own.axis, 3 * k + a), moving)
         own.force[3 * k + a] = wp.dot(guess, row(own.axis, 3 * k + a))
@@ -156,7 +157,9 @@ def select_contacts(problems: ContactProblems, solver: wp.ref[SolverState], own:
 
 
 @wp.func(inline=True)
-def build_delassus(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows]):
+def build_delassus(
+    problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows]
+):
     """Up the chain: what a unit force at one contact does at the others."""
     zero = real(0.0)
     none = vec3(zero, zero, zero)
@@ -183,11 +186,11 @@ def build_delassus(problems: ContactProblems, solver: wp.ref[SolverState], own: 
             m2 = none
             inv = none
             if reached:
-                s1 = problems.joint[link0 + i, 0]
-                s2 = problems.joint[link0 + i, 1]
-                m1 = problems.joint[link0 + i, 2]
-                m2 = problems.joint[link0 + i, 3]
-                inv = problems.joint[link0 + i, 8]
+                s1 = problems.joint[link0 + i].axis1
+                s2 = problems.joint[link0 + i].axis2
+                m1 = problems.joint[link0 + i].moment1
+                m2 = problems.joint[link0 + i].moment2
+                inv = problems.joint[link0 + i].inverse_inertia
             for a in range(3):
                 r = 3 * k + a
                 u1 = zero
@@ -200,8 +203,8 @@ def build_delassus(problems: ContactProblems, solver: wp.ref[SolverState], own: 
                         w = wp.cross(row(own.point, k), v)
                     u1 = wp.dot(s1, w) + wp.dot(m1, v)
                     u2 = wp.dot(s2, w) + wp.dot(m2, v)
-                    fw[r] = w - problems.joint[link0 + i, 4] * u1 - problems.joint[link0 + i, 6] * u2
-                    fv[r] = v - problems.joint[link0 + i, 5] * u1 - problems.joint[link0 + i, 7] * u2
+                    fw[r] = w - problems.joint[link0 + i].gain1_w * u1 - problems.joint[link0 + i].gain2_w * u2
+                    fv[r] = v - problems.joint[link0 + i].gain1_v * u1 - problems.joint[link0 + i].gain2_v * u2
                 ju1[r] = u1
                 ju2[r] = u2
                 wu1[r] = solver.step * (inv[0] * u1 + inv[1] * u2)

@@ -3,16 +3,16 @@
 Lengths in mm, in the frame of the shape. A link is a segment with a radius that varies linearly along it.
 """
 
-from typing import Any
-
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import BOX, CAPSULE, CYLINDER, SPHERE
+from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE
 
 from .algebra import maximum, minimum, vec2, vec3, vec4, vec5
 from .parameters import real
+
 halvings = 20 if real is wp.float32 else 44
 tiny = 1e-12 if real is wp.float32 else 1e-24
+
 
 @wp.func
 def primitive(kind: int, size: vec3, x: vec3) -> vec4:

@@ -1,5 +1,4 @@
-"""How near a segment comes to a triangle surface: the nearest triangles first, by a group of threads.
-"""
+"""How near a segment comes to a triangle surface: the nearest triangles first, by a group of threads."""
 
 from typing import Any
 
@@ -12,10 +11,12 @@ from .distances import point_triangle, segment_triangle
 from .parameters import group_size, real
 from .state import ShapeArrays
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
+
 own = WIDE // group_size
 Kept: Any = wp.types.matrix((LEVELS, own), real)
 beyond = 1e30
 none_left = 2**31 - 1
+
 
 @wp.struct
 class NearestTriangles:
@@ -176,9 +177,7 @@ def nearest_triangles(
                         t = minimum(maximum(wp.dot(centre - a, axis), zero), length)
                         off = centre - a - axis * t
                         square = wp.length_sq(off)
-                        over = (
-                            square - wp.abs(off[0]) * wide[0] - wp.abs(off[1]) * wide[1] - wp.abs(off[2]) * wide[2]
-                        )
+                        over = square - wp.abs(off[0]) * wide[0] - wp.abs(off[1]) * wide[1] - wp.abs(off[2]) * wide[2]
                         if over > zero:
                             bound = maximum(bound, over * over / square)
                         side_kept[level, k] = bound

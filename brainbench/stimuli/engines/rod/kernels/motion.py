@@ -3,8 +3,6 @@
 A track with one knot stands still or moves straight at the knot's velocity. Units: mm, ms, rad.
 """
 
-from typing import Any
-
 import warp as wp
 
 from .algebra import vec3, vec4

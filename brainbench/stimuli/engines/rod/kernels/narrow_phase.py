@@ -1,7 +1,4 @@
-"""How near a link comes to a shape.
-"""
-
-from typing import Any
+"""How near a link comes to a shape."""
 
 import warp as wp
 
@@ -13,7 +10,7 @@ from .distances import primitive, segment_primitive
 from .mesh_bvh import NearestTriangles, nearest_triangles
 from .motion import BodyMotion
 from .parameters import against, real
-from .state import ShapeArrays
+from .state import LinkDistance, LinkTaper, ShapeArrays
 
 
 @wp.func
@@ -40,25 +37,6 @@ def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
     return shapes.outward[face, slot]
 
 
-@wp.struct
-class LinkDistance:
-    """How near a link comes to a shape: between its ends, and at its far end."""
-
-    between: wp.int32
-    """Whether something between the ends is near."""
-    share: real
-    gap: real
-    normal: vec3
-    end: wp.int32
-    """Whether the far end is near."""
-    end_gap: real
-    end_normal: vec3
-    clear: real
-    """Lower bound of the distance of the link's axis from the surface."""
-    leaf: wp.int32
-    """Leaf of the search tree (+ 1) where the nearest triangle is; 0 without."""
-
-
 @wp.func
 def surface_point(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
     p = shapes.corner[face, 0]
@@ -79,15 +57,17 @@ def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
 
 
 @wp.func
-def mesh_distance(shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: real, within: real, got: NearestTriangles) -> LinkDistance:
+def mesh_distance(
+    shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: real, within: real, got: NearestTriangles
+) -> LinkDistance:
     """What a search found: contacts no further than ``within`` from the axis, or that the link lies far inside."""
-    touch = LinkDistance()
-    touch.between = 0
-    touch.end = 0
-    touch.leaf = 0
+    found = LinkDistance()
+    found.between = 0
+    found.end = 0
+    found.leaf = 0
     first = shapes.face[s]
     square = wp.min(got.side, wp.min(got.end, got.start))
-    touch.clear = wp.sqrt(square)
+    found.clearance = wp.sqrt(square)
     # The nearest of all, with where it is on the axis.
     face = got.face
     share = got.share
@@ -104,18 +84,18 @@ def mesh_distance(shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: r
         v = got.start_v
         w = got.start_w
     if face >= 0:
-        touch.leaf = face // wp.static(WIDE) + 1
-        if touch.clear > within:
+        found.leaf = face // wp.static(WIDE) + 1
+        if found.clearance > within:
             away = a + (b - a) * share - surface_point(shapes, first + face, v, w)
             radius = ra + (rb - ra) * share
-            out = direction(away, touch.clear, pseudo_normal(shapes, first + face, v, w), radius)
+            out = direction(away, found.clearance, pseudo_normal(shapes, first + face, v, w), radius)
             if out[3] < real(0.0):
-                touch.between = 1
-                touch.share = share
-                touch.gap = out[3] - radius
-                touch.normal = vec3(out[0], out[1], out[2])
-                touch.clear = real(0.0)
-            return touch
+                found.between = 1
+                found.share = share
+                found.gap = out[3] - radius
+                found.normal = vec3(out[0], out[1], out[2])
+                found.clearance = real(0.0)
+            return found
     # Further away a search need not have found the nearest.
     if got.face >= 0 and got.side <= within * within:
         face = first + got.face
@@ -126,18 +106,18 @@ def mesh_distance(shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: r
             radius = ra + (rb - ra) * got.share
             away = a + (b - a) * got.share - surface_point(shapes, face, got.v, got.w)
             out = direction(away, wp.sqrt(got.side), out_here, radius)
-            touch.between = 1
-            touch.share = got.share
-            touch.gap = out[3] - radius
-            touch.normal = vec3(out[0], out[1], out[2])
+            found.between = 1
+            found.share = got.share
+            found.gap = out[3] - radius
+            found.normal = vec3(out[0], out[1], out[2])
     if got.end_face >= 0 and got.end <= within * within:
         face = first + got.end_face
         away = b - surface_point(shapes, face, got.end_v, got.end_w)
         out = direction(away, wp.sqrt(got.end), pseudo_normal(shapes, face, got.end_v, got.end_w), rb)
-        touch.end = 1
-        touch.end_gap = out[3] - rb
-        touch.end_normal = vec3(out[0], out[1], out[2])
-    return touch
+        found.end = 1
+        found.end_gap = out[3] - rb
+        found.end_normal = vec3(out[0], out[1], out[2])
+    return found
 
 
 @wp.func
@@ -147,7 +127,7 @@ def link_shape_distance(
     body: BodyMotion,
     a_world: vec3,
     b_world: vec3,
-    taper: vec4,
+    taper: LinkTaper,
     margin: real,
     leaf: int,
     part: int,
@@ -163,37 +143,37 @@ def link_shape_distance(
     a = unrotate(turn_s, local) / scale
     local = unrotate(body.turn, b_world - body.place) - shapes.place[s]
     b = unrotate(turn_s, local) / scale
-    ra = taper[0] / scale
-    rb = taper[1] / scale
-    touch = LinkDistance()
+    ra = taper.start_radius / scale
+    rb = taper.end_radius / scale
+    found = LinkDistance()
     meshed = int(0)
     if wp.static(against == MESHES):
         asks = int(0)
         if shapes.kind[s] == wp.static(MESH):
             meshed = 1
             asks = live
-        within = (wp.max(taper[0], taper[1]) + margin) / scale
+        within = (wp.max(taper.start_radius, taper.end_radius) + margin) / scale
         radius = wp.max(within, real(wp.static(FAR)) / scale)
         if margin < real(0.0):
             within = real(0.0)
             radius = -margin / scale
         got = nearest_triangles(shapes, s, a, b, radius, within, leaf - 1, part, asks)
-        touch = mesh_distance(shapes, s, a, b, ra, rb, within, got)
+        found = mesh_distance(shapes, s, a, b, ra, rb, within, got)
     if meshed == 0:
-        found = segment_primitive(shapes.kind[s], shapes.size[s] / scale, a, b, ra, rb)
-        touch.clear = found[1] + wp.min(ra, rb)
-        touch.share = found[0]
-        touch.gap = found[1]
-        touch.normal = vec3(found[2], found[3], found[4])
-        touch.between = 0
-        if found[0] > real(1e-3) and found[0] < real(1.0 - 1e-3):
-            touch.between = 1
+        nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, a, b, ra, rb)
+        found.clearance = nearest[1] + wp.min(ra, rb)
+        found.share = nearest[0]
+        found.gap = nearest[1]
+        found.normal = vec3(nearest[2], nearest[3], nearest[4])
+        found.between = 0
+        if nearest[0] > real(1e-3) and nearest[0] < real(1.0 - 1e-3):
+            found.between = 1
         tip = primitive(shapes.kind[s], shapes.size[s] / scale, b)
-        touch.end = 1
-        touch.end_gap = tip[3] - rb
-        touch.end_normal = vec3(tip[0], tip[1], tip[2])
-        touch.leaf = leaf
-    touch.clear = touch.clear * scale
-    touch.gap = touch.gap * scale
-    touch.end_gap = touch.end_gap * scale
-    return touch
+        found.end = 1
+        found.end_gap = tip[3] - rb
+        found.end_normal = vec3(tip[0], tip[1], tip[2])
+        found.leaf = leaf
+    found.clearance = found.clearance * scale
+    found.gap = found.gap * scale
+    found.end_gap = found.end_gap * scale
+    return found

@@ -1,7 +1,4 @@
-"""Whiskers at rest: straight out of a base that stands still, until an object may come near.
-"""
-
-from typing import Any
+"""Whiskers at rest: straight out of a base that stands still, until an object may come near."""
 
 import warp as wp
 
@@ -11,24 +8,42 @@ from .algebra import rotate, vec2, vec3
 from .motion import pose_at
 from .narrow_phase import link_shape_distance
 from .parameters import against, real, sliced
-from .state import ChainArrays, ChainState, MotionArrays, PausedWhiskers, ProximityState, ShapeArrays, WhiskerJob, WhiskerState, row
+from .state import (
+    WAIT_REST,
+    WAIT_SLICE,
+    ChainArrays,
+    ChainState,
+    MotionArrays,
+    PausedWhiskers,
+    ProximityState,
+    ShapeArrays,
+    WhiskerJob,
+    WhiskerState,
+    row,
+)
 
 
 @wp.func(inline=True)
 def query_rest_distances(
-    paused: PausedWhiskers, job: WhiskerJob, proximity: wp.ref[ProximityState], state: wp.ref[WhiskerState], fresh: int, upto: real, look: real
+    paused: PausedWhiskers,
+    job: WhiskerJob,
+    proximity: wp.ref[ProximityState],
+    state: wp.ref[WhiskerState],
+    fresh: int,
+    upto: real,
+    look: real,
 ) -> int:
     """Ask for these distances like for all others; returned is what to wait for."""
     near_count = int(0)
     for i in range(job.links):
         if fresh == 1 or row(proximity.clearance, i) < upto:
             near_count = near_count + 1
-    state.first_query = wp.atomic_add(paused.tally, 6, near_count)
-    if state.first_query + near_count > paused.query_job.shape[0]:
-        return 2
-    paused.times[5, job.index] = state.reading_time
-    paused.times[6, job.index] = -look
-    return 4
+    state.first_query = wp.atomic_add(paused.next_query_count, 0, near_count)
+    if state.first_query + near_count > paused.query.shape[0]:
+        return WAIT_SLICE
+    paused.query_time[job.index] = state.reading_time
+    paused.query_margin[job.index] = -look
+    return WAIT_REST
 
 
 @wp.func(inline=True)
@@ -63,39 +78,40 @@ def check_rest(
             fresh = 1
         wait = int(0)
         if wp.static(sliced):
-            if state.waiting_for != 4:
+            if state.waiting_for != WAIT_REST:
                 wait = query_rest_distances(paused, job, proximity, state, fresh, upto, look)
         place = state.first_query
         links = job.links
-        if wait == 2:
+        if wait == WAIT_SLICE:
             links = int(0)
         for i in range(links):
-            b4 = chains.build[i, job.whisker]
-            turned = x * b4[1] + y * b4[2]
-            y = y * b4[1] - x * b4[2]
+            link = chains.build[i, job.whisker]
+            turned = x * link.bend_cosine + y * link.bend_sine
+            y = y * link.bend_cosine - x * link.bend_sine
             x = turned
-            ahead_at = at + x * b4[0]
+            ahead_at = at + x * link.length
             proximity.safe_until[i] = row(proximity.clearance, i)
             if fresh == 1 or row(proximity.clearance, i) < upto:
-                if wp.static(sliced) and wait == 4:
-                    paused.query_job[place] = job.index
-                    paused.query_link[place] = i
-                    paused.query_ends[place, 0] = at
-                    paused.query_ends[place, 1] = ahead_at
+                if wp.static(sliced) and wait == WAIT_REST:
+                    paused.query[place].job = job.index
+                    paused.query[place].link = i
+                    paused.query[place].start = at
+                    paused.query[place].stop = ahead_at
                 else:
                     slack = real(1e30)
                     taper = chains.taper[i, job.whisker]
                     if wp.static(sliced):
-                        answer4 = paused.found[place, 2]
-                        slack = answer4[1]
-                        proximity.leaf[i] = int(answer4[3])
+                        slack = paused.answer[place].clearance
+                        proximity.leaf[i] = paused.answer[place].leaf
                     else:
                         for s in range(job.first_shape, job.end_shape):
                             body = pose_at(motions, shapes.track[s], before)
-                            touch = link_shape_distance(shapes, s, body, at, ahead_at, taper, -look, row(proximity.leaf, i), 0, 1)
-                            slack = wp.min(slack, touch.clear)
-                            proximity.leaf[i] = touch.leaf
-                    slack = slack - taper[0] - real(0.05)
+                            found = link_shape_distance(
+                                shapes, s, body, at, ahead_at, taper, -look, row(proximity.leaf, i), 0, 1
+                            )
+                            slack = wp.min(slack, found.clearance)
+                            proximity.leaf[i] = found.leaf
+                    slack = slack - taper.start_radius - real(0.05)
                     proximity.safe_until[i] = real(1e30)
                     if slack <= zero:
                         proximity.safe_until[i] = before
@@ -115,7 +131,11 @@ def check_rest(
                 bound = zero
                 until = row(proximity.safe_until, i)
                 if until > before:
-                    bound = (until - before) * real(1.02) * job.object_speed + chains.taper[i, job.whisker][0] + real(0.04)
+                    bound = (
+                        (until - before) * real(1.02) * job.object_speed
+                        + chains.taper[i, job.whisker].start_radius
+                        + real(0.04)
+                    )
                 if fresh == 1:
                     bound = wp.max(bound, row(proximity.clearance, i))
                 proximity.safe_until[i] = bound

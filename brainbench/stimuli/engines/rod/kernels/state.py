@@ -1,4 +1,10 @@
-"""STATE
+"""State of the whisker solver: the arrays that kernels take, what a thread keeps of its whisker, and paused whiskers.
+
+Letters of shapes: whisker, link, shape, scene, triangle, box; *job* is one whisker in one scene, the work of one
+thread. Units: mg, mm, ms, mN, µN·m, rad. Records have the order in which neighbouring threads read them.
+
+A thread's own memory is vectors and matrices, not arrays: arrays in a kernel carry addresses that the compiler loses.
+They are handed on by reference, and an element of one is read with ``row``: Warp would copy the whole to index it.
 """
 
 from typing import Any
@@ -9,6 +15,9 @@ from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
 
 from .algebra import mat33, vec2, vec3, vec4
 from .parameters import capacity, real
+
+WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST = 1, 2, 3, 4
+"""What a paused whisker waits for: distances of near links, its next slice, contact forces, distances at rest."""
 
 most_candidates = contacts_for(capacity) + SPARE
 PerLink1: Any = wp.types.vector(capacity, real)
@@ -23,7 +32,7 @@ PerCandidateInt: Any = wp.types.vector(most_candidates, wp.int32)
 
 def reader(*kinds: tuple[Any, Any]) -> Any:
     """Return ``row(memory, index)`` for references to memory of each of these (type, type of its elements)."""
-    for memory, element in kinds:
+    for memory, element in dict.fromkeys(kinds):
 
         @wp.func_native("return wp::extract(memory, index);")
         def row(memory: wp.ref[memory], index: int) -> element: ...
@@ -31,8 +40,57 @@ def reader(*kinds: tuple[Any, Any]) -> Any:
     return row
 
 
+row = reader(
+    (PerLink2, vec2),
+    (PerLink3, vec3),
+    (PerNode3, vec3),
+    (PerCandidate3, vec3),
+    (PerLink1, real),
+    (PerCandidate1, real),
+    (PerLinkInt, wp.int32),
+    (PerCandidateInt, wp.int32),
+)
+
+
+# Arrays that a launch is given
+
+
+@wp.struct
+class LinkBuild:
+    """Geometry and mass of a link."""
+
+    length: real
+    bend_cosine: real
+    """Of the angle at rest to the link before."""
+    bend_sine: real
+    mass: real
+
+
+@wp.struct
+class LinkInertia:
+    """Inertia of a link about its centre, and stiffness of its joint."""
+
+    centre: real
+    """Distance of the centre of mass from the joint."""
+    axial: real
+    transverse: real
+    stiffness: real
+
+
+@wp.struct
+class LinkTaper:
+    """Surface of a link: radius at both ends, arc length at its joint and along it."""
+
+    start_radius: real
+    end_radius: real
+    arc: real
+    arc_length: real
+
+
 @wp.struct
 class ChainArrays:
+    """Whiskers as chains of rigid links with universal joints."""
+
     links: wp.array(dtype=wp.int32)
     """[whisker]"""
     beta: wp.array(dtype=real)
@@ -41,16 +99,18 @@ class ChainArrays:
     """[whisker]"""
     length: wp.array(dtype=real)
     """[whisker] arc length."""
-    build: wp.array2d(dtype=vec4)
-    """[link, whisker] length, cosine and sine of the rest bend, mass."""
-    inertia: wp.array2d(dtype=vec4)
-    """[link, whisker] centre of mass, axial and transverse inertia, hinge stiffness."""
-    taper: wp.array2d(dtype=vec4)
-    """[link, whisker] radius at both ends, arc at the joint, arc of the link."""
+    build: wp.array2d(dtype=LinkBuild)
+    """[link, whisker]"""
+    inertia: wp.array2d(dtype=LinkInertia)
+    """[link, whisker]"""
+    taper: wp.array2d(dtype=LinkTaper)
+    """[link, whisker]"""
 
 
 @wp.struct
 class MotionArrays:
+    """Motions of bases and objects, see ``motion``: knots of all tracks one behind the other."""
+
     first: wp.array(dtype=wp.int32)
     """[track] index of the first knot."""
     count: wp.array(dtype=wp.int32)
@@ -73,6 +133,8 @@ class MotionArrays:
 
 @wp.struct
 class ShapeArrays:
+    """What whiskers may touch: shapes of all scenes, and the triangles of the surfaces among them."""
+
     first: wp.array(dtype=wp.int32)
     """[scene + 1] first shape of each scene."""
     kind: wp.array(dtype=wp.int32)
@@ -96,11 +158,11 @@ class ShapeArrays:
     face: wp.array(dtype=wp.int32)
     """[shape] first of its triangles below."""
     faces: wp.array(dtype=wp.int32)
-    """[shape] how many it has."""
+    """[shape] number of its triangles."""
     box: wp.array(dtype=wp.int32)
     """[shape] first of its boxes below."""
     low: wp.array(dtype=vec3)
-    """[box] lowest corner; boxes as in :mod:`._tree`."""
+    """[box] lowest corner; boxes as in ``brainbench.stimuli.engines.rod.mesh_bvh``."""
     high: wp.array(dtype=vec3)
     """[box] highest corner."""
     corner: wp.array2d(dtype=vec3)
@@ -111,32 +173,36 @@ class ShapeArrays:
 
 @wp.struct
 class JobArrays:
+    """Jobs, and the forces that act on them besides contact."""
+
     whisker: wp.array(dtype=wp.int32)
-    """[index]"""
+    """[job]"""
     scene: wp.array(dtype=wp.int32)
-    """[index]"""
+    """[job]"""
     base: wp.array(dtype=wp.int32)
-    """[index] motion of the base."""
+    """[job] motion of the base."""
     step: wp.array(dtype=real)
-    """[index] longest time step."""
+    """[job] longest time step."""
     row: wp.array(dtype=wp.int32)
-    """[index] first index of its results."""
+    """[job] first index of its results."""
     column: wp.array(dtype=wp.int32)
-    """[index] third index of its results."""
+    """[job] third index of its results."""
     load_first: wp.array(dtype=wp.int32)
-    """[index + 1] first load of each index."""
+    """[job + 1] first load of each job."""
     load_link: wp.array(dtype=wp.int32)
     """[load]"""
     load_share: wp.array(dtype=real)
-    """[load] where on its link."""
+    """[load] place along its link, 0 to 1."""
     load_force: wp.array(dtype=vec3)
     """[load]"""
     load_stop: wp.array(dtype=real)
-    """[load]"""
+    """[load] time at which it ends."""
 
 
 @wp.struct
 class StepOptions:
+    """Options that all jobs of a launch share."""
+
     start: real
     gravity: vec3
     axes: mat33
@@ -144,163 +210,71 @@ class StepOptions:
     quasistatic: wp.int32
     """Whether rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
     shape: wp.int32
+    """Whether shapes and contact wrenches are recorded."""
 
 
 @wp.struct
 class ResultArrays:
+    """Results of all jobs."""
+
     wrench: wp.array4d(dtype=real)
     """[row, reading, column, 6] action of the whisker on its base (N, N m)."""
     contact: wp.array3d(dtype=real)
     """[row, reading, column] arc of the contact (m), negative without."""
     points: wp.array3d(dtype=vec3)
-    """[reading, node, index] when shapes are recorded."""
-    pressed: wp.array3d(dtype=vec3)
-    """[reading, 2, index] force and moment about the base point of all contacts, when shapes are recorded."""
+    """[reading, node, job] when shapes are recorded."""
+    contact_wrench: wp.array3d(dtype=vec3)
+    """[reading, 2, job] force and moment about the base point of all contacts, when shapes are recorded."""
     depth: wp.array(dtype=real)
-    """[index] deepest overlap."""
+    """[job] deepest overlap."""
     status: wp.array(dtype=wp.int32)
-    """[index]"""
+    """[job] 0, or why it ended early."""
     failed: wp.array(dtype=real)
-    """[index] when it failed."""
+    """[job] time at which it failed."""
     steps: wp.array(dtype=wp.int32)
-    """[index] steps computed."""
+    """[job] steps computed."""
     touching: wp.array(dtype=wp.int32)
-    """[index] steps with contact."""
+    """[job] steps with contact."""
     crowded: wp.array(dtype=wp.int32)
-    """[index] steps in which a contact found no place."""
+    """[job] steps in which a contact found no place."""
     unsolved: wp.array(dtype=wp.int32)
-    """[index] steps whose contact forces did not converge."""
+    """[job] steps whose contact forces did not converge."""
     miss: wp.array(dtype=real)
-    """[index] sum over the steps of the square of what the last iteration changed in the forces (mN²)."""
+    """[job] sum over the steps of the square of what the last iteration changed in the forces (mN²)."""
     load: wp.array(dtype=real)
-    """[index] sum over the steps of the square of the contact forces (mN²)."""
+    """[job] sum over the steps of the square of the contact forces (mN²)."""
+
+
+# What a thread keeps of its whisker
 
 
 @wp.struct
-class PausedWhiskers:
-    """Whiskers between two slices, and the looks that they wait for."""
+class Twist:
+    """Angular velocity, and velocity of the point of the body that is at the base point."""
 
-    budget: wp.int32
-    """Steps of one slice."""
-    queue: wp.array2d(dtype=wp.int32)
-    """[3, index] whiskers to go on with: after looks, after contact forces, all others."""
-    after: wp.array2d(dtype=wp.int32)
-    """[3, index] the same for the next slice."""
-    problems: wp.array2d(dtype=wp.int32)
-    """[3, index] whiskers whose contact forces are to be found: of few, some and many possible contacts."""
-    size: wp.array(dtype=wp.int32)
-    """[7] whiskers in the queues, in the queues of contact forces; looks."""
-    tally: wp.array(dtype=wp.int32)
-    """[7] the same for the next slice."""
-    joints: wp.array2d(dtype=vec4)
-    """[link, index] angles and rates."""
-    ways: wp.array2d(dtype=vec2)
-    """[link, index] minimum bound of the distance, and at which leaf of the search tree the last look ended (+ 1)."""
-    times: wp.array2d(dtype=real)
-    """[9, index] last reading, rest of the frame, end of rest, jump, quickest, moment and margin of the look (how
-    far to look, negative, at rest), quickest in the step whose forces are awaited, and the last step."""
-    counts: wp.array2d(dtype=wp.int32)
-    """[8, index] reading, reading to write, held contacts, near, resting, waiting, first look, and near in the step
-    whose forces are awaited."""
-    query_job: wp.array(dtype=wp.int32)
-    """[look]"""
-    query_link: wp.array(dtype=wp.int32)
-    """[look]"""
-    query_ends: wp.array2d(dtype=vec3)
-    """[look, 2]"""
-    found: wp.array2d(dtype=vec4)
-    """[look, 3] direction and gap between the ends; at the far end; share, bound, what there was, leaf."""
+    angular: vec3
+    linear: vec3
 
 
 @wp.struct
-class ContactProblems:
-    """The contact problem of each index's step, and its answer. Its links and places lie one behind the other."""
+class SpatialAcceleration:
+    """Angular acceleration, and rate of the linear part of a twist."""
 
-    counts: wp.array2d(dtype=wp.int32)
-    """[index, 5] links, places of possible contact, contacts of the last step; answered with contacts, steps without
-    room for one, and steps not converged."""
-    plan: wp.array(dtype=vec4)
-    """[index] time step, tip."""
-    joint: wp.array2d(dtype=vec3)
-    """[link, 9] both axes of the joint, their moments about the base point, what a joint passes on of a force (both
-    gains, rotation and translation), inverse inertia (11, 12, 22)."""
-    candidate_link: wp.array(dtype=wp.int32)
-    """[place]"""
-    spot_size: wp.array(dtype=vec4)
-    """[place] gap, arc, friction, arc of the link."""
-    spot: wp.array2d(dtype=vec3)
-    """[place, 4] point, normal, velocity against the object without contact forces, direction of the link."""
-    predicted_gap: wp.array(dtype=real)
-    """[place] gap at the end of the step."""
-    held: wp.array2d(dtype=vec4)
-    """[index, contact] arc and force of the last step; answered with those of this step."""
-    free_acceleration: wp.array2d(dtype=vec2)
-    """[index, link] acceleration of the joint without contact forces."""
-    added_acceleration: wp.array2d(dtype=vec2)
-    """[index, link] what they add to it."""
-    answer: wp.array2d(dtype=vec3)
-    """[index, 7] reaction (moment, force) and acceleration of the tip, completed by the contacts; squares of what
-    was missed and of the forces; sum of the normal forces and of these times arc; force and moment of all of
-    them."""
+    angular: vec3
+    linear: vec3
 
 
 @wp.struct
-class ChainState:
-    """WhiskerState of the joints, and what one step keeps of each link between its passes."""
+class Wrench:
+    """Moment about the base point, and force."""
 
-    angle: PerLink2
-    """Angles."""
-    rate: PerLink2
-    """Rates."""
-    axis2: PerLink3
-    """Second axis of the joint."""
-    node: PerNode3
-    """Joints and tip, from the base point."""
-    gain1_w: PerLink3
-    """What the joint passes on of a force, for each axis: rotation and translation."""
-    gain1_v: PerLink3
-    gain2_w: PerLink3
-    gain2_v: PerLink3
-    acceleration: PerLink2
-    """Forces of the joint over its inertia, then its accelerations."""
-
-
-@wp.struct
-class ProximityState:
-    """The same of what only contact needs: without objects a kernel writes it, if at all, and leaves it out."""
-
-    inverse_inertia: PerLink3
-    """Inverse inertia of the joint (11, 12, 22)."""
-    clearance: PerLink1
-    """Lower bound of the distance from all objects; at rest, until when nothing can come near."""
-    leaf: PerLinkInt
-    """Where the last search for what is near ended (+ 1)."""
-    safe_until: PerLink1
-    end_speed: PerLink1
-    """Speed of its faster end."""
-
-
-@wp.struct
-class ContactCandidates:
-    """Where contact is possible within one step."""
-
-    link: PerCandidateInt
-    arc: PerCandidate1
-    predicted_gap: PerCandidate1
-    """Gap at the end of the step."""
-    gap: PerCandidate1
-    friction: PerCandidate1
-    point: PerCandidate3
-    object_velocity: PerCandidate3
-    """Velocity of the object."""
-    normal: PerCandidate3
-    free_velocity: PerCandidate3
-    """Velocity against the object without contact forces."""
+    moment: vec3
+    force: vec3
 
 
 @wp.struct
 class WhiskerJob:
-    """What does not change of a whisker."""
+    """Constants of a job."""
 
     index: wp.int32
     whisker: wp.int32
@@ -308,7 +282,6 @@ class WhiskerJob:
     links: wp.int32
     beta: real
     longest_step: real
-    """Longest time step."""
     first_shape: wp.int32
     end_shape: wp.int32
     object_speed: real
@@ -321,32 +294,36 @@ class WhiskerJob:
 
 @wp.struct
 class WhiskerState:
-    """How far a whisker has come."""
+    """How far a whisker has come, and totals of its steps."""
 
     reading: wp.int32
-    """The reading that the whisker is on its way to."""
+    """Reading that the whisker is on its way to."""
     pending_reading: wp.int32
-    """The reading that the next step writes: it takes the wrench of the step that begins at its time."""
+    """Reading that the next step writes: it takes the wrench of the step that begins at its time."""
     reading_time: real
     """Time of the last reading."""
     time_left: real
-    """What is left of the time to the next one, when the whisker paused."""
+    """Time left to the next reading, when the whisker paused."""
     contacts: wp.int32
     """Contacts of the last step."""
     is_near: wp.int32
+    """Whether any link may be near an object."""
     top_speed: real
     """Speed of the fastest point."""
     velocity_jump: real
     """By how much contact can change that in a step."""
     last_step: real
-    """The last step."""
+    """Length of the last step."""
     at_rest: wp.int32
     safe_until: real
-    """Until when nothing can come near the resting whisker."""
+    """Time until which nothing can come near the resting whisker."""
     waiting_for: wp.int32
-    """For what it paused: 1 looks, 3 contact forces, 4 looks at rest, 2 anything else."""
+    """One of the ``WAIT_`` constants; 0 before the whisker first pauses and once it has what it waited for."""
     first_query: wp.int32
-    """The first of the looks that it asked for."""
+    """First of its distance queries."""
+    step_is_near: wp.int32
+    """``is_near`` and ``top_speed`` in the step whose contact forces are awaited."""
+    step_top_speed: real
     largest_change: real
     """Largest bend or rate in a step."""
     status: wp.int32
@@ -361,11 +338,251 @@ class WhiskerState:
 
 
 @wp.struct
-class Twist:
-    """Rate of rotation and of the point of the link at the base point, or accelerations, or moment and force."""
+class ChainState:
+    """State of the joints, and what one step keeps of each link between its passes."""
 
-    w: vec3
-    v: vec3
+    angle: PerLink2
+    rate: PerLink2
+    axis2: PerLink3
+    """Second axis of the joint."""
+    node: PerNode3
+    """Joints and tip, from the base point."""
+    gain1_w: PerLink3
+    """U D⁻¹ of each axis (``articulated_body``), rotation and translation."""
+    gain1_v: PerLink3
+    gain2_w: PerLink3
+    gain2_v: PerLink3
+    acceleration: PerLink2
+    """D⁻¹u of the joint, then its accelerations."""
 
-kinds = (PerLink2, vec2), (PerLink3, vec3), (PerNode3, vec3), (PerCandidate3, vec3), (PerLink1, real), (PerCandidate1, real)
-row = reader(*dict.fromkeys((*kinds, (PerLinkInt, wp.int32), (PerCandidateInt, wp.int32))))
+
+@wp.struct
+class ProximityState:
+    """What only contact needs of each link; without objects a kernel leaves it out."""
+
+    inverse_inertia: PerLink3
+    """Inverse inertia D⁻¹ of the joint (11, 12, 22)."""
+    clearance: PerLink1
+    """Lower bound of the distance from all objects; at rest, the time until which nothing can come near."""
+    leaf: PerLinkInt
+    """Leaf of the search tree where the last search ended (+ 1)."""
+    safe_until: PerLink1
+    end_speed: PerLink1
+    """Speed of the faster end."""
+
+
+@wp.struct
+class ContactCandidates:
+    """Places where contact is possible within one step."""
+
+    link: PerCandidateInt
+    arc: PerCandidate1
+    predicted_gap: PerCandidate1
+    """Gap at the end of the step."""
+    gap: PerCandidate1
+    friction: PerCandidate1
+    point: PerCandidate3
+    object_velocity: PerCandidate3
+    normal: PerCandidate3
+    free_velocity: PerCandidate3
+    """Velocity against the object without contact forces."""
+
+
+@wp.struct
+class LinkDistance:
+    """How near a link comes to a shape: between its ends, and at its far end."""
+
+    between: wp.int32
+    """Whether something between the ends is near."""
+    share: real
+    """Place along the link, 0 to 1."""
+    gap: real
+    normal: vec3
+    end: wp.int32
+    """Whether the far end is near."""
+    end_gap: real
+    end_normal: vec3
+    clearance: real
+    """Lower bound of the distance of the link's axis from the surface."""
+    leaf: wp.int32
+    """Leaf of the search tree (+ 1) where the nearest triangle is; 0 without."""
+
+
+# Contact problems and paused whiskers
+
+
+@wp.struct
+class ProblemSize:
+    """Counts of a contact problem; the last three are of its solution."""
+
+    links: wp.int32
+    candidates: wp.int32
+    contacts: wp.int32
+    """Contacts of the last step; then of this one."""
+    crowded: wp.int32
+    """1: there was no room for a contact."""
+    unsolved: wp.int32
+    """1: the forces did not converge."""
+
+
+@wp.struct
+class ProblemStep:
+    """Time step, and the tip of the whisker from the base point."""
+
+    length: real
+    tip: vec3
+
+
+@wp.struct
+class JointRecord:
+    """A joint after the pass of the articulated inertia."""
+
+    axis1: vec3
+    axis2: vec3
+    moment1: vec3
+    """Moments of the axes about the base point: velocity there of a unit rate."""
+    moment2: vec3
+    gain1_w: vec3
+    gain1_v: vec3
+    gain2_w: vec3
+    gain2_v: vec3
+    inverse_inertia: vec3
+
+
+@wp.struct
+class CandidateSize:
+    """Numbers of a contact candidate."""
+
+    gap: real
+    arc: real
+    friction: real
+    link_arc: real
+    """Arc length of its link."""
+
+
+@wp.struct
+class CandidatePlace:
+    """Vectors of a contact candidate."""
+
+    point: vec3
+    normal: vec3
+    free_velocity: vec3
+    along: vec3
+    """Direction of the link."""
+
+
+@wp.struct
+class HeldContact:
+    """A contact of the last step: arc and force."""
+
+    arc: real
+    force: vec3
+
+
+@wp.struct
+class ContactSolution:
+    """Reaction of the base and acceleration of the tip, completed by the contacts, and what these do together."""
+
+    base_moment: vec3
+    base_force: vec3
+    tip_acceleration: vec3
+    miss: real
+    """Squares of what the last iteration changed in the forces, and of the forces."""
+    load: real
+    normal_sum: real
+    """Sum of the normal forces, and of these times arc."""
+    arc_sum: real
+    contact_force: vec3
+    contact_moment: vec3
+
+
+@wp.struct
+class ContactProblems:
+    """Contact problem of each job's step, and its solution. Links and candidates of jobs lie one behind the other."""
+
+    size: wp.array(dtype=ProblemSize)
+    """[job]"""
+    step: wp.array(dtype=ProblemStep)
+    """[job]"""
+    joint: wp.array(dtype=JointRecord)
+    """[job · link]"""
+    candidate_link: wp.array(dtype=wp.int32)
+    """[job · candidate]"""
+    candidate_size: wp.array(dtype=CandidateSize)
+    """[job · candidate]"""
+    candidate: wp.array(dtype=CandidatePlace)
+    """[job · candidate]"""
+    predicted_gap: wp.array(dtype=real)
+    """[job · candidate] gap at the end of the step."""
+    held: wp.array2d(dtype=HeldContact)
+    """[job, contact] of the last step; then of this one."""
+    free_acceleration: wp.array2d(dtype=vec2)
+    """[job, link] acceleration of the joint without contact forces."""
+    added_acceleration: wp.array2d(dtype=vec2)
+    """[job, link] acceleration that they add."""
+    solution: wp.array(dtype=ContactSolution)
+    """[job]"""
+
+
+@wp.struct
+class PausedJoint:
+    """Angles and rates of a joint."""
+
+    angle: vec2
+    rate: vec2
+
+
+@wp.struct
+class PausedProximity:
+    """Clearance and leaf of a link, see :class:`ProximityState`."""
+
+    clearance: real
+    leaf: wp.int32
+
+
+@wp.struct
+class DistanceQuery:
+    """A link whose distance is asked for."""
+
+    job: wp.int32
+    link: wp.int32
+    start: vec3
+    stop: vec3
+
+
+@wp.struct
+class PausedWhiskers:
+    """Whiskers between two slices, the queues they stand in, and the distances they wait for."""
+
+    budget: wp.int32
+    """Steps of one slice."""
+    queue: wp.array2d(dtype=wp.int32)
+    """[3, job] whiskers to go on with: after distances, after contact forces, all others."""
+    next_queue: wp.array2d(dtype=wp.int32)
+    """[3, job] the same for the next slice."""
+    problem_queue: wp.array2d(dtype=wp.int32)
+    """[3, job] whiskers whose contact forces are to be found: of few, some and many candidates."""
+    queue_size: wp.array(dtype=wp.int32)
+    """[3]"""
+    problem_size: wp.array(dtype=wp.int32)
+    """[3]"""
+    query_count: wp.array(dtype=wp.int32)
+    """[1]"""
+    next_queue_size: wp.array(dtype=wp.int32)
+    """[3] the same three for the next slice."""
+    next_problem_size: wp.array(dtype=wp.int32)
+    next_query_count: wp.array(dtype=wp.int32)
+    state: wp.array(dtype=WhiskerState)
+    """[job]"""
+    joint: wp.array2d(dtype=PausedJoint)
+    """[link, job]"""
+    proximity: wp.array2d(dtype=PausedProximity)
+    """[link, job]"""
+    query_time: wp.array(dtype=real)
+    """[job] time for which distances are asked."""
+    query_margin: wp.array(dtype=real)
+    """[job] gap up to which a contact takes part; at rest negative: how far to search."""
+    query: wp.array(dtype=DistanceQuery)
+    """[query]"""
+    answer: wp.array(dtype=LinkDistance)
+    """[query]"""

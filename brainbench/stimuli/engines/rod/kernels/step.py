@@ -1,7 +1,4 @@
-"""STEP
-"""
-
-from typing import Any
+"""STEP"""
 
 import warp as wp
 
@@ -16,11 +13,34 @@ from .motion import pose_at
 from .parameters import against, bounds, module_options, real, sliced
 from .scheduling import next_job, pause, resume
 from .sleeping import check_rest
-from .state import ChainArrays, ChainState, ContactCandidates, ContactProblems, JobArrays, MotionArrays, PausedWhiskers, ProximityState, ResultArrays, ShapeArrays, StepOptions, Twist, WhiskerJob, WhiskerState, row
+from .state import (
+    WAIT_DISTANCES,
+    WAIT_FORCES,
+    WAIT_SLICE,
+    ChainArrays,
+    ChainState,
+    ContactCandidates,
+    ContactProblems,
+    JobArrays,
+    MotionArrays,
+    PausedWhiskers,
+    ProximityState,
+    ResultArrays,
+    ShapeArrays,
+    SpatialAcceleration,
+    StepOptions,
+    Twist,
+    WhiskerJob,
+    WhiskerState,
+    Wrench,
+    row,
+)
 
 
 @wp.func(inline=True)
-def load_job(chains: ChainArrays, motions: MotionArrays, shapes: ShapeArrays, jobs: JobArrays, options: StepOptions, index: int) -> WhiskerJob:
+def load_job(
+    chains: ChainArrays, motions: MotionArrays, shapes: ShapeArrays, jobs: JobArrays, options: StepOptions, index: int
+) -> WhiskerJob:
     zero = real(0.0)
     job = WhiskerJob()
     job.index = index
@@ -62,7 +82,7 @@ def write_reading(
     chain: wp.ref[ChainState],
     reading: int,
     origin: vec3,
-    felt: Twist,
+    base_wrench: Wrench,
     force_sum: real,
     arc_sum: real,
     solved: int,
@@ -72,8 +92,8 @@ def write_reading(
     index = job.index
     first = jobs.row[index]
     column = jobs.column[index]
-    acting = options.axes * felt.v * real(-1e-3)
-    turning = options.axes * felt.w * real(-1e-6)
+    acting = options.axes * base_wrench.force * real(-1e-3)
+    turning = options.axes * base_wrench.moment * real(-1e-6)
     for d in range(3):
         results.wrench[first, reading, column, d] = acting[d]
         results.wrench[first, reading, column, 3 + d] = turning[d]
@@ -82,11 +102,11 @@ def write_reading(
     if options.shape == 1:
         for i in range(job.links + 1):
             results.points[reading, i, index] = origin + row(chain.node, i)
-        results.pressed[reading, 0, index] = none
-        results.pressed[reading, 1, index] = none
+        results.contact_wrench[reading, 0, index] = none
+        results.contact_wrench[reading, 1, index] = none
         if solved == 1:
-            results.pressed[reading, 0, index] = problems.answer[index, 5] * real(1e-3)
-            results.pressed[reading, 1, index] = problems.answer[index, 6] * real(1e-6)
+            results.contact_wrench[reading, 0, index] = problems.solution[index].contact_force * real(1e-3)
+            results.contact_wrench[reading, 1, index] = problems.solution[index].contact_moment * real(1e-6)
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=module_options(), launch_bounds=bounds)
@@ -113,21 +133,16 @@ def run(
     proximity = ProximityState()
     candidates = ContactCandidates()
     state = WhiskerState()
-    state.depth = results.depth[index]
-    state.steps = results.steps[index]
-    state.touching = results.touching[index]
-    state.crowded = results.crowded[index]
-    state.unsolved = results.unsolved[index]
-    state.miss = results.miss[index]
-    state.load = results.load[index]
-    state.reading_time = options.start
-    state.safe_until = options.start
-    state.at_rest = job.can_rest
-    # A reading takes the wrench of the step that begins at its time, so one more step follows the last.
-    state.pending_reading = int(-1)
-    used = int(0)
     if wp.static(sliced):
-        resume(paused, index, job.links, chain, proximity, state)
+        state = paused.state[index]
+        resume(paused, index, job.links, chain, proximity)
+    if state.waiting_for == 0:
+        state.reading_time = options.start
+        state.safe_until = options.start
+        state.at_rest = job.can_rest
+        # A reading takes the wrench of the step that begins at its time, so one more step follows the last.
+        state.pending_reading = int(-1)
+    used = int(0)
     wait = int(0)
     first_reading = state.reading
     for reading in range(first_reading, readings.shape[0] + 1):
@@ -160,7 +175,7 @@ def run(
             if wp.static(sliced):
                 state.time_left = left
                 if used >= paused.budget:
-                    wait = 2
+                    wait = WAIT_SLICE
                     break
                 used = used + 1
             now = upto - left
@@ -176,14 +191,14 @@ def run(
             seen = int(0)
             solved = int(0)
             origin = none
-            felt = Twist()
+            base_wrench = Wrench()
             tip_acceleration = none
-            if wp.static(sliced) and state.waiting_for == 3:
+            if wp.static(sliced) and state.waiting_for == WAIT_FORCES:
                 # The forces of this step have been found meanwhile.
                 state.waiting_for = 0
                 state.time_left = zero
-                state.is_near = paused.counts[7, index]
-                state.top_speed = paused.times[7, index]
+                state.is_near = state.step_is_near
+                state.top_speed = state.step_top_speed
                 seen = 1
                 solved = 1
             else:
@@ -191,11 +206,13 @@ def run(
                 later = pose_at(motions, job.base, now + h)
                 origin = pose.place
                 moving = Twist()
-                moving.w = pose.spin
-                moving.v = pose.velocity
-                base = Twist()
-                base.w = (later.spin - moving.w) / h
-                base.v = (later.velocity - moving.v) / h - wp.cross(moving.w, moving.v) - options.gravity
+                moving.angular = pose.spin
+                moving.linear = pose.velocity
+                base = SpatialAcceleration()
+                base.angular = (later.spin - moving.angular) / h
+                base.linear = (
+                    (later.velocity - moving.linear) / h - wp.cross(moving.angular, moving.linear) - options.gravity
+                )
                 was_near = state.is_near
                 was_quickest = state.top_speed
                 tip = forward_kinematics(chains, job, pose, chain, proximity, state)
@@ -205,29 +222,61 @@ def run(
                     near_count = count_near_links(chains, job, proximity, reach)
                     state.is_near = wp.min(near_count, 1)
                     if wp.static(sliced):
-                        if near_count > 0 and state.waiting_for != 1:
-                            wait = query_distances(chains, job, paused, chain, proximity, state, reach, origin, now, near_count)
+                        if near_count > 0 and state.waiting_for != WAIT_DISTANCES:
+                            wait = query_distances(
+                                chains, job, paused, chain, proximity, state, reach, origin, now, near_count
+                            )
                             state.is_near = was_near
                             state.top_speed = was_quickest
                             break
                     for i in range(job.links):
-                        proximity.clearance[i] = row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
+                        proximity.clearance[i] = row(proximity.clearance, i) - reach.time * (
+                            row(proximity.end_speed, i) + reach.unknown_speed
+                        )
                     state.last_step = h
                     if near_count > 0:
-                        seen = find_candidates(chains, motions, shapes, job, paused, chain, proximity, candidates, state, pose, reach.margin, now, h)
+                        seen = find_candidates(
+                            chains,
+                            motions,
+                            shapes,
+                            job,
+                            paused,
+                            chain,
+                            proximity,
+                            candidates,
+                            state,
+                            pose,
+                            reach.margin,
+                            now,
+                            h,
+                        )
                 if wp.static(sliced):
                     state.waiting_for = 0
                     state.time_left = zero
-                felt = articulated_inertia(chains, jobs, job, chain, proximity, tip, base, now, h, seen)
-                tip_acceleration = joint_accelerations(job, options, chain, candidates, state, moving, base, now, h, seen)
+                base_wrench = articulated_inertia(chains, jobs, job, chain, proximity, tip, base, now, h, seen)
+                tip_acceleration = joint_accelerations(
+                    job, options, chain, candidates, state, moving, base, now, h, seen
+                )
                 if wp.static(against > NOTHING) and seen > 0:
                     solved = any_gap_closes(candidates, seen, h)
                     if solved == 1:
-                        write_problem(problems, chains, job, chain, proximity, candidates, state, felt, tip_acceleration, h, seen)
+                        write_problem(
+                            problems,
+                            chains,
+                            job,
+                            chain,
+                            proximity,
+                            candidates,
+                            state,
+                            base_wrench,
+                            tip_acceleration,
+                            h,
+                            seen,
+                        )
                         if wp.static(sliced):
-                            wait = 3
-                            paused.counts[7, index] = state.is_near
-                            paused.times[7, index] = state.top_speed
+                            wait = WAIT_FORCES
+                            state.step_is_near = state.is_near
+                            state.step_top_speed = state.top_speed
                             state.is_near = was_near
                             state.top_speed = was_quickest
                             state.time_left = left_whole
@@ -241,18 +290,30 @@ def run(
             force_sum = zero
             if wp.static(against > NOTHING) and solved == 1:
                 read_solution(problems, job, chain, state)
-                felt.w = problems.answer[index, 0]
-                felt.v = problems.answer[index, 1]
-                tip_acceleration = problems.answer[index, 2]
-                sums = problems.answer[index, 4]
-                force_sum = sums[0]
-                arc_sum = sums[1]
+                base_wrench.moment = problems.solution[index].base_moment
+                base_wrench.force = problems.solution[index].base_force
+                tip_acceleration = problems.solution[index].tip_acceleration
+                force_sum = problems.solution[index].normal_sum
+                arc_sum = problems.solution[index].arc_sum
                 if force_sum > zero:
                     touched = 1
             state.velocity_jump = wp.max(h * wp.length(tip_acceleration), real(0.5) * state.velocity_jump)
             state.touching = state.touching + touched
             if state.pending_reading >= 0:
-                write_reading(results, jobs, options, problems, job, chain, state.pending_reading, origin, felt, force_sum, arc_sum, solved)
+                write_reading(
+                    results,
+                    jobs,
+                    options,
+                    problems,
+                    job,
+                    chain,
+                    state.pending_reading,
+                    origin,
+                    base_wrench,
+                    force_sum,
+                    arc_sum,
+                    solved,
+                )
                 state.pending_reading = int(-1)
             state.steps = state.steps + 1
             if seen > 0:
@@ -274,7 +335,8 @@ def run(
             break
     if wp.static(sliced):
         if wait != 0:
-            pause(paused, index, job.links, chain, proximity, state, wait)
+            state.waiting_for = wait
+            pause(paused, index, job.links, chain, proximity, state)
     results.depth[index] = state.depth
     results.status[index] = state.status
     results.failed[index] = state.failed_at
