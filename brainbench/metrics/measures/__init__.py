@@ -7,7 +7,7 @@ mean responses (``animal_patterns``). Ours are registered here, in the order in 
 from __future__ import annotations
 
 from brainbench.metrics.measures.decoding import LabelDecoding
-from brainbench.metrics.measures.partial_rsa import PartialRSA
+from brainbench.metrics.measures.nuisance import PartialRSA
 from brainbench.metrics.measures.procrustes import Procrustes
 from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.measures.ridge import RidgeEncoding

@@ -29,7 +29,10 @@ class AnimalPatterns:
     units: int = 0
     trials: int = 0
     problem: str | None = None
+    """Why the animal cannot be used."""
     notes: tuple[str, ...] = ()
+    nuisances: Mapping[str, Floats] = field(default_factory=dict, repr=False)
+    """Name → RDM [P] of what else was measured in the trials; see :mod:`brainbench.metrics.measures.nuisance`."""
 
     @property
     def reliability(self) -> float:

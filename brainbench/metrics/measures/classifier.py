@@ -141,18 +141,17 @@ def _correct(fold: _Fold, codes: Ints, rows: Ints, penalty: float) -> float:
 def _fit(features: Floats, target: Ints, classes: int, penalty: float) -> tuple[Floats, Floats]:
     """Return weights [D, C] and biases [C] of multinomial logistic regression, Σ loss + ‖w‖²/2C, bias free."""
     from scipy.optimize import minimize
+    from scipy.special import log_softmax
 
-    count, width = features.shape
-    wanted = np.eye(classes)[target]
+    width = features.shape[1]
+    wanted = np.eye(classes, dtype=bool)[target]
 
     def loss(flat: Floats) -> tuple[float, Floats]:
         both = flat.reshape(width + 1, classes)
         weight, bias = both[:-1], both[-1]
-        score = features @ weight + bias
-        score -= score.max(axis=1, keepdims=True)
-        log_sum = np.log(np.exp(score).sum(axis=1, keepdims=True))
-        rest = np.exp(score - log_sum) - wanted
-        value = float((log_sum[:, 0] - score[np.arange(count), target]).sum() + (weight**2).sum() / (2 * penalty))
+        log_p = log_softmax(features @ weight + bias, axis=1)
+        rest = np.exp(log_p) - wanted
+        value = float(-log_p[wanted].sum() + (weight**2).sum() / (2 * penalty))
         gradient = np.concatenate([features.T @ rest + weight / penalty, rest.sum(axis=0, keepdims=True)])
         return value, gradient.ravel()
 

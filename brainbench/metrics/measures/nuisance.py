@@ -1,22 +1,28 @@
-"""What else could explain the animals' geometry: nuisance RDMs, partial correlation, shared variance.
+"""What else could explain the animals' geometry: nuisance RDMs, partial correlation, shared variance, partial RSA.
 
-Stimuli also differ in how often they were touched, licked for or chosen. An RDM of such a quantity is
-a rival model: :func:`variance_partition` says how much of each animal's RDM the model explains that the
-nuisances do not.
+Stimuli also differ in how often they were touched, licked for or chosen. An animal's mean of each over a stimulus
+makes an RDM, which is a rival model. :func:`variance_partition` says how much of each animal's RDM the model explains
+that the nuisances do not; the metric :class:`PartialRSA` correlates the model's RDM with the animal's, both without
+what the nuisances explain linearly.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
-from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, rdm_stack, stimulus_count, upper
+from brainbench.metrics.measures.animal_patterns import AnimalPatterns, animal_patterns
+from brainbench.metrics.measures.patterns import PatternMetric
+from brainbench.metrics.rdms.dissimilarity import rdm
+from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count, upper
 from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
 
 
@@ -83,7 +89,7 @@ def variance_partition(
         raise UsageError("There are no nuisances; give the RDM of at least one, or use permutation_test.")
     model = rdm_stack(model_rdm, "model_rdm")
     brain = np.atleast_2d(rdm_stack(brain_rdms, "brain_rdms"))
-    rivals = np.stack([rdm_stack(rdm, f"The nuisance {name!r}") for name, rdm in nuisance_rdms.items()])
+    rivals = np.stack([rdm_stack(given, f"The nuisance {name!r}") for name, given in nuisance_rdms.items()])
     pairs = brain.shape[1]
     if model.shape != (pairs,) or rivals.shape[1:] != (pairs,):
         raise UsageError(
@@ -163,3 +169,66 @@ def _partial(models: Floats, rest: Floats, residual: Floats, scale: Floats) -> t
     size = np.where(size > 1e-20 * (models**2).sum(axis=1)[:, None], size, np.nan)
     product = left @ residual.T
     return product / np.sqrt(size * (residual**2).sum(axis=1)), product**2 / size / scale
+
+
+class PartialRSA(PatternMetric):
+    """Partial correlation between RDMs of correlation distances, given nuisance RDMs."""
+
+    name = "rsa-partial"
+    title = "correlation between RDMs without what contacts, licks and choices explain"
+
+    def animal(
+        self,
+        subject: str,
+        blocks: Sequence[Trials],
+        n_stimuli: int,
+        *,
+        stimuli: Sequence[str] | None = None,
+        seed: int = 0,
+        draws: int = 0,
+    ) -> AnimalPatterns:
+        """Return the animal's mean responses with its nuisance RDMs; without any the animal cannot be used."""
+        found = animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)
+        nuisances, lacking = _nuisances(blocks, n_stimuli)
+        if found.problem is None and not nuisances:
+            told = f" ({', '.join(lacking)} do not)" if lacking else ""
+            return replace(found, problem=f"no contacts, licks or choices that differ between stimuli{told}")
+        return replace(found, nuisances=nuisances)
+
+    def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
+        """Return values [N, A] with the model's stimuli in each order [N, K]."""
+        permuted = rdm(model)[permuted_pairs(orders)]
+        values = np.full((len(orders), len(animals)), np.nan)
+        for column, animal in enumerate(animals):
+            brain = rdm(animal.patterns)
+            # Nothing is known of what else animals felt whose units were joined.
+            if animal.nuisances and np.isfinite(brain).all():
+                values[:, column] = partial_correlations(permuted, np.stack(list(animal.nuisances.values())), brain)
+        return values
+
+    def statistics(self, model: Floats, animals: Sequence[Any], seed: int) -> dict[str, Any]:
+        """Return the shares of variance of the chosen layer, averaged over animals."""
+        parts = [
+            variance_partition(rdm(model), animal.nuisances, rdm(animal.patterns), seed=seed) for animal in animals
+        ]
+        names = ("total", "unique_model", "unique_nuisance", "shared", "chance")
+        nuisances = sorted({name for part in parts for name in part.nuisances})
+        shares = {name: float(np.mean([getattr(part, name) for part in parts])) for name in names}
+        return {"variance_partition": {**shares, "nuisances": nuisances}}
+
+
+def _nuisances(blocks: Sequence[Trials], count: int) -> tuple[dict[str, Floats], list[str]]:
+    """Return the RDM of every covariate with a value for all stimuli and a difference between some, and the others."""
+    labels = [stimulus_codes(block.labels, count)[0] for block in blocks]
+    found, lacking = {}, []
+    for name in dict.fromkeys(name for block in blocks for name in block.covariates):
+        values = [
+            np.asarray(block.covariates.get(name, np.full(len(codes), math.nan)), dtype=np.float64)
+            for block, codes in zip(blocks, labels, strict=True)
+        ]
+        means = stimulus_means(np.concatenate(values)[:, None], np.concatenate(labels), count)[:, 0]
+        if np.isfinite(means).all() and np.ptp(means) > 0:
+            found[name] = upper(np.abs(means[:, None] - means))
+        else:
+            lacking.append(name)
+    return found, lacking
