@@ -405,8 +405,8 @@ def equivalence(simulations: int) -> Result:
 
 
 def faults(simulations: int) -> Result:
-    from brainbench.datasets.synthetic.animals import Design as Recordings
-    from brainbench.datasets.synthetic.animals import ResponseGeometry, simulate
+    from brainbench.datasets.synthetic import Design as Recordings
+    from brainbench.datasets.synthetic import ResponseGeometry, simulate
 
     rows = []
     for imbalance in (0.0, 0.5):

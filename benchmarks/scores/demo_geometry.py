@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.datasets import open_recordings, trials_by_subject
-from brainbench.datasets.synthetic.demo import ensure_demo, read_truth
+from brainbench.datasets.synthetic import ensure_demo, read_truth
 from brainbench.metrics import Trials, rdm, score_animals, subject_rdm
 from brainbench.stimuli import load_stimuli
 

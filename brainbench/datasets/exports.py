@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,16 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
-from brainbench.core.files import atomic_path
 from brainbench.datasets.hdf5 import write_recordings
+from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, decode, ragged
-from brainbench.datasets.synthetic.nwb_writer import NwbWriter
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, decode, ragged
 from brainbench.datasets.trials.counting import has_units, read_spikes, recorded_span
 from brainbench.datasets.trials.covariates import LICKS, lick_times
 from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally
-
-_NO_START = "1970-01-01T00:00:00+00:00"
 
 
 def export(source: Source, target: str | os.PathLike[str], *, select: Selection | str | None = None) -> list[Path]:
@@ -105,39 +101,6 @@ def subset(session: Session, selection: Selection = EVERYTHING, table: str = "tr
     return replace(session, units=SessionTable("units", columns, units.where), tables=tables, series={})
 
 
-def write_nwb(path: str | os.PathLike[str], session: Session) -> Path:
-    """Write one session as NWB 2.x, atomically.
-
-    Raises:
-        DataError: ids are no integers or a table has no ``stop_time``, which NWB needs.
-    """
-    import h5py
-
-    if session.units is None:
-        raise DataError(f"{session.source} has no units table; there are no spikes to write.")
-    made = "SYNTHETIC session" if session.synthetic else "Session"
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        writer = NwbWriter(
-            file,
-            identifier=session.identifier or f"{session.subject}-{session.session}",
-            description=f"{made} copied by brainbench: spike times and tables without raw data.",
-            start=session.start or _NO_START,
-            general={"session_id": session.session, "keywords": ["synthetic"] * session.synthetic + ["brainbench"]},
-            subject={"subject_id": session.subject},
-        )
-        writer.table("units", "Units", "Units with their spike times.", _ids(session.units), _columns(session.units))
-        for name, table in session.tables.items():
-            for column in ("start_time", "stop_time"):
-                if column not in table:
-                    raise DataError(f"{table.label} has no {column}, which NWB needs; export to .h5 instead.")
-            module, slash, rest = name.partition("/")
-            if slash and f"processing/{module}" not in file:
-                writer.module(module, f"Tables of the module {module}.")
-            place = f"processing/{module}/{rest}" if slash else f"intervals/{name}"
-            writer.table(place, "TimeIntervals", f"Table {name}.", _ids(table), _columns(table))
-    return Path(path)
-
-
 def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
     """Columns that mean something outside their file, of the rows kept; references do not."""
     made: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
@@ -162,25 +125,6 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
         made[name] = np.concatenate(parts) if parts else values[:0]
         made[f"{name}_index"] = np.cumsum([len(part) for part in parts], dtype=np.int64)
     return made
-
-
-def _columns(table: SessionTable) -> Mapping[str, tuple[str, Any]]:
-    columns: dict[str, tuple[str, Any]] = {}
-    for name in table.columns:
-        values = np.asarray(table.data[name])
-        if f"{name}_index" not in table.data:
-            columns[name] = (name, values)
-        elif len(table):
-            columns[name] = (name, np.split(values, table.ends(name)[:-1]))
-    return columns
-
-
-def _ids(table: SessionTable) -> NDArray[np.int64]:
-    ids = as_labels(table.ids())
-    try:
-        return ids.astype(np.int64)
-    except ValueError as error:
-        raise DataError(f"{table.label} has ids that are no integers, which NWB needs; export to .h5.") from error
 
 
 def _entity(name: str) -> str:

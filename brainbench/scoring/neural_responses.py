@@ -85,7 +85,7 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
 
 def demo_recordings(*, progress: Progress | None = None) -> Path:
     """Return the folder of the demo recordings, made once per machine from the ``rodgers`` stimuli."""
-    from brainbench.datasets.synthetic.demo import ensure_demo
+    from brainbench.datasets.synthetic import ensure_demo
     from brainbench.stimuli import get_recipe, simulate
 
     return ensure_demo(simulate(get_recipe(DEMO_STIMULI).scenes, progress=progress), progress=progress)

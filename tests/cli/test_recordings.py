@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, write_files
+from brainbench.datasets.synthetic import Design, ResponseGeometry, write_files
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from brainbench.datasets import (
     write_recordings,
 )
 from brainbench.datasets.sessions import SessionTable
-from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, as_recordings, simulate
+from brainbench.datasets.synthetic import Design, ResponseGeometry, as_recordings, simulate
 from brainbench.metrics import Trials, subject_rdm
 from tests.factories.recordings import make_simple_session
 

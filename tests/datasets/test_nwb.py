@@ -7,7 +7,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import inspect, make_session, open_recordings, trials_by_subject
 from brainbench.datasets.nwb import read_nwb
-from brainbench.datasets.synthetic.nwb_writer import NwbWriter
+from brainbench.datasets.nwb_writer import NwbWriter
 
 HUMAN = "pynapple_sub-4_ses-4_ecephys+image.nwb"
 INTRACELLULAR = {
@@ -37,7 +37,6 @@ def write_nwb(path, *, subject="m1", session="s1", keywords=("touch",), units=Tr
             "tags": ("list", [np.array([1.0, 2.0])] * 6),
         }
         writer.table("intervals/trials", "TimeIntervals", "trials", np.arange(6) * 2, columns)
-        writer.module("behavior", "b")
         side = {**columns, "side": ("s", np.resize(np.array([1, 2]), 6))}
         writer.table("processing/behavior/pokes", "TimeIntervals", "pokes", np.arange(6), side)
         if units:

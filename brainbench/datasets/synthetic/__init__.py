@@ -1,4 +1,9 @@
-"""Synthetic recordings whose truth is known: geometry, neurons, sessions, files, and the demo recordings."""
+"""Synthetic recordings whose truth is known, as arrays, data sets, sessions of spike times, or files.
+
+Expected rates come from a geometry (``geometry``, ``design``) or from whisker wrenches (``wrench_encoding``). Trials
+and spikes are drawn around them (``sessions``; for the default recordings of ``demo``, ``rodgers_task``), and
+``truth`` writes the files of both.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,11 @@ from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from brainbench.datasets.synthetic.animals import FAULTS, SyntheticAnimal, calibrate, measure_ceiling, simulate
-    from brainbench.datasets.synthetic.demo import ensure_demo
+    from brainbench.datasets.synthetic.demo import ensure_demo, make_demo
     from brainbench.datasets.synthetic.design import Design, stimulus_means
     from brainbench.datasets.synthetic.geometry import ResponseGeometry
     from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
+    from brainbench.datasets.synthetic.truth import read_truth
 
 __all__ = [
     "FAULTS",
@@ -21,27 +27,21 @@ __all__ = [
     "as_recordings",
     "calibrate",
     "ensure_demo",
+    "make_demo",
     "make_sessions",
     "measure_ceiling",
+    "read_truth",
     "simulate",
     "stimulus_means",
     "write_files",
 ]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    {
-        "Design": ".design",
-        "FAULTS": ".animals",
-        "ResponseGeometry": ".geometry",
-        "SyntheticAnimal": ".animals",
-        "as_recordings": ".sessions",
-        "calibrate": ".animals",
-        "ensure_demo": ".demo",
-        "make_sessions": ".sessions",
-        "measure_ceiling": ".animals",
-        "simulate": ".animals",
-        "stimulus_means": ".design",
-        "write_files": ".sessions",
-    },
-)
+_MODULES = {
+    ".animals": ("FAULTS", "SyntheticAnimal", "calibrate", "measure_ceiling", "simulate"),
+    ".demo": ("ensure_demo", "make_demo"),
+    ".design": ("Design", "stimulus_means"),
+    ".geometry": ("ResponseGeometry",),
+    ".sessions": ("as_recordings", "make_sessions", "write_files"),
+    ".truth": ("read_truth",),
+}
+__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

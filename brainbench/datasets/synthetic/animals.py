@@ -10,42 +10,27 @@ proportional to 1 − x_k·x_l, so RDMs compared by any correlation have the geo
 Counts are Poisson around that rate, times a gamma gain per unit and trial (``dispersion`` φ: variance =
 mean + φ mean², the negative binomial), times one gain common to all units of a trial (``shared_gain``).
 
-:func:`simulate` gives arrays, :func:`as_recordings` a recordings data set, :func:`write_files` real NWB or
-HDF5 files whose counts are the same numbers. Letters: K stimulus, R trial, U unit, P pair.
+:func:`simulate` gives arrays; ``as_recordings`` a recordings data set and ``write_files`` real NWB or HDF5 files
+whose counts are the same numbers. Letters: K stimulus, R trial, U unit, P pair.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.trials import Trials
-from brainbench.datasets.synthetic.design import MODULATION, Design, draw_session, entropy, stimulus_means, subject_name
+from brainbench.datasets.synthetic.design import MODULATION, Design, draw_sessions, entropy, stimulus_means
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
-from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
 from brainbench.datasets.synthetic.truth import correlation_rdm
 
-__all__ = [
-    "FAULTS",
-    "Design",
-    "ResponseGeometry",
-    "SyntheticAnimal",
-    "as_recordings",
-    "calibrate",
-    "make_sessions",
-    "measure_ceiling",
-    "simulate",
-    "stimulus_means",
-    "write_files",
-]
-
-_STEPS = 20
-_EXACT = 0.001
-"""Calibration stops this close to the ceiling asked for, on the studies it draws."""
+_EXACT = 2e-4
+"""Largest error of the modulation that calibration leaves, on the studies it draws."""
 
 
 @dataclass(frozen=True)
@@ -81,19 +66,18 @@ def simulate(
     Raises:
         UsageError: an unknown fault, or a missing stimulus that does not exist.
     """
-    design = design or Design()
     for name in faults:
         if name not in FAULTS:
             raise unknown_name("fault", name, FAULTS)
     animals = []
-    for index in range(design.animals):
-        drawn = [draw_session(geometry, design, index, number, seed) for number in range(design.sessions)]
-        blocks = [item.block for item in drawn]
+    for subject, group in groupby(draw_sessions(geometry, design, seed), key=lambda item: item.subject):
+        drawn = list(group)
+        sessions = [item.trials for item in drawn]
         # The order of the stimuli goes wrong before trials are filled up.
         for name in sorted(faults):
-            blocks = [FAULTS[name](block, len(geometry.labels)) for block in blocks]
+            sessions = [FAULTS[name](trials, len(geometry.labels)) for trials in sessions]
         truth = correlation_rdm(np.concatenate([item.expected for item in drawn], axis=1))
-        animals.append(SyntheticAnimal(subject_name(index), tuple(blocks), truth))
+        animals.append(SyntheticAnimal(subject, tuple(sessions), truth))
     return tuple(animals)
 
 
@@ -139,7 +123,7 @@ def calibrate(
 ) -> Design:
     """Return the design with the modulation at which it has a given noise ceiling.
 
-    Found by false position with common random numbers: the same animals are drawn at every step.
+    Found by Brent's method with common random numbers: the same animals are drawn at every step.
 
     Args:
         geometry: the shared truth.
@@ -152,29 +136,24 @@ def calibrate(
         UsageError: even the largest modulation stays below the ceiling; what is reached is said.
     """
 
+    from scipy.optimize import root_scalar
+
     def excess(modulation: float) -> float:
         tried = replace(design, modulation=modulation)
         return measure_ceiling(geometry, tried, simulations=simulations, seed=seed)[0] - ceiling
 
-    # Without modulation the expected comparison is zero, so it need not be simulated.
-    low, below, high, above = 0.0, -ceiling, MODULATION, excess(MODULATION)
-    if not (ceiling > 0 and above >= 0):
+    highest = excess(MODULATION)
+    if not (ceiling > 0 and highest >= 0):
         raise UsageError(
-            f"A noise ceiling of {ceiling:g} is out of reach: this design has up to {above + ceiling:.3f}. More units "
-            f"or trials, a higher rate, less dispersion or a smaller individual share raise it."
+            f"A noise ceiling of {ceiling:g} is out of reach: this design has up to {highest + ceiling:.3f}. "
+            f"More units or trials, a higher rate, less dispersion or a smaller individual share raise it."
         )
-    middle = high
-    for _ in range(_STEPS):
-        middle = low + (high - low) * below / (below - above)
-        found = excess(middle)
-        if abs(found) < _EXACT:
-            break
-        # Halving the value at the end that stays makes false position converge fast on both sides.
-        if found < 0:
-            low, below, above = middle, found, above / 2
-        else:
-            high, above, below = middle, found, below / 2
-    return replace(design, modulation=middle)
+    # Both ends are known: without modulation the expected comparison is zero.
+    known = {0.0: -ceiling, MODULATION: highest}
+    found = root_scalar(
+        lambda modulation: known.get(modulation) or excess(modulation), bracket=(0.0, MODULATION), xtol=_EXACT
+    )
+    return replace(design, modulation=float(found.root))
 
 
 def _zero_fill(block: Trials, stimuli: int) -> Trials:

@@ -9,11 +9,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import shutil
-import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,30 +21,16 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, listing
-from brainbench.core.files import cache_dir, content_hash, file_hash, read_json, write_json
+from brainbench.core.files import cache_dir, content_hash, read_json
 from brainbench.core.progress import Progress
 from brainbench.datasets.layouts import rodgers
-from brainbench.datasets.synthetic.demo_neurons import (
-    Afferents,
-    draw_population,
-    make_afferents,
-    window_rates,
-)
-from brainbench.datasets.synthetic.demo_session import (
-    CHOICE,
-    SessionPlan,
-    draw_behaviour,
-    draw_contacts,
-    draw_spikes,
-    tracked_runs,
-    write_session,
-)
-from brainbench.datasets.synthetic.truth import TRUTH, correlation_rdm, read_truth
+from brainbench.datasets.nwb_writer import write_nwb
+from brainbench.datasets.synthetic.rodgers_task import CHOICE, COLUMNS, SessionPlan, draw_session, tracked_contacts
+from brainbench.datasets.synthetic.truth import TRUTH, SyntheticSession, correlation_rdm, write_with_truth
+from brainbench.datasets.synthetic.wrench_encoding import Afferents, draw_population, make_afferents, window_rates
 
 if TYPE_CHECKING:
     import xarray as xr
-
-__all__ = ["TRUTH", "VERSION", "demo_folder", "ensure_demo", "make_demo", "read_truth"]
 
 VERSION = 2
 """Raised when the same stimuli give other spikes, so that old caches are not reused."""
@@ -62,6 +47,26 @@ _INDIVIDUAL = 0.4
 _MANY = 4000
 """Units that stand for the shared geometry in the truth."""
 _ABANDONED = 24 * 3600.0
+_SUFFIX = "_behavior+ecephys.nwb"
+
+_WRITE = partial(
+    write_nwb,
+    description="simulated contacts encoded by simulated neurons, made by brainbench.",
+    general={
+        "experimenter": ["Simulation, A"],
+        "institution": "none (synthetic data)",
+        "lab": "none (synthetic data)",
+        "experiment_description": "SYNTHETIC demo recordings; ranks on them say nothing about brains.",
+        "keywords": ["synthetic", "whisker", "barrel cortex", "demo"],
+    },
+    subject={
+        "species": "Mus musculus",
+        "sex": "U",
+        "age": "P90D",
+        "description": "SYNTHETIC subject: no animal was recorded.",
+    },
+    columns=COLUMNS,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -95,50 +100,45 @@ def make_demo(
     if animals < 1:
         raise UsageError(f"The demo needs at least one animal; received {animals}.")
     stimuli = _in_vocabulary_order(check_stimulus_set(stimuli))
-    labels = tuple(str(label) for label in stimuli["stimulus"].values)
     afferents = make_afferents(stimuli)
     contact = stimuli["contact"].transpose("stimulus", "time", "whisker").values.astype(bool)
-    runs = tracked_runs(afferents.whiskers, contact, afferents.frame)
-    plans = [_animal(index) for index in range(animals)]
-    total = sum(map(len, plans))
-    first = {plan: _first_contacts(labels, runs, plan.lost_whisker) for sessions in plans for plan in sessions}
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    rdms: dict[str, NDArray[np.float64]] = {}
-    paths: list[Path] = []
-    for index, sessions in enumerate(plans):
-        own = np.random.default_rng([seed, VERSION, index])
-        emphasis = np.exp(_INDIVIDUAL * own.standard_normal(afferents.values.shape[2:]))
-        expected = []
-        for number, plan in enumerate(sessions):
-            random = np.random.default_rng([seed, VERSION, index, number])
-            population = draw_population(random, afferents, plan.units, emphasis, plan.depth)
-            rates = population.rates(afferents)
-            expected.append(_expected(rates, afferents, first[plan]))
-            behaviour = draw_behaviour(random, plan, labels)
-            spikes = draw_spikes(random, behaviour, rates, population.baseline, afferents.frame)
-            contacts = draw_contacts(random, behaviour, runs)
-            path = folder / f"sub-{plan.subject}_ses-{plan.session}_behavior+ecephys.nwb"
-            write_session(path, random, plan, behaviour, spikes, contacts)
-            paths.append(path)
-            if progress is not None:
-                progress(len(paths), total, f"demo recordings {plan.subject}")
-        rdms[sessions[0].subject] = correlation_rdm(np.concatenate(expected, axis=1))
-    write_json(
-        folder / TRUTH,
-        {
-            "note": "SYNTHETIC recordings: ranks of models on them say nothing about brains.",
-            "synthetic": True,
-            "version": VERSION,
-            "seed": seed,
-            "stimuli": str(stimuli.attrs["content_hash"]),
-            "labels": labels,
-            "shared": _shared(afferents, _first_contacts(labels, runs), seed),
-            "subjects": rdms,
-            "files": {path.name: {"bytes": path.stat().st_size, "hash": file_hash(path)} for path in paths},
-        },
+    contacts = tracked_contacts(afferents.whiskers, contact, afferents.frame)
+    plans = [
+        [replace(plan, subject=f"demo{index + 1:02d}") for plan in _ANIMALS[index % len(_ANIMALS)]]
+        for index in range(animals)
+    ]
+    # Stimuli that do not suit are told before a folder is made.
+    lost = dict.fromkeys([None, *(plan.lost_whisker for own in plans for plan in own)])
+    first = {whisker: _first_contacts(contacts, whisker) for whisker in lost}
+
+    def draw() -> Iterator[SyntheticSession]:
+        done, total = 0, sum(map(len, plans))
+        for index, own in enumerate(plans):
+            random = np.random.default_rng([seed, VERSION, index])
+            emphasis = np.exp(_INDIVIDUAL * random.standard_normal(afferents.values.shape[2:]))
+            for number, plan in enumerate(own):
+                random = np.random.default_rng([seed, VERSION, index, number])
+                population = draw_population(random, afferents, plan.units, emphasis, plan.depth)
+                rates = population.rates(afferents)
+                session = draw_session(
+                    random, plan, rodgers.LABELS, rates, population.baseline, contacts, afferents.frame
+                )
+                yield SyntheticSession(session, _expected(rates, afferents, first[plan.lost_whisker]))
+                done += 1
+                if progress is not None:
+                    progress(done, total, f"demo recordings {plan.subject}")
+
+    return write_with_truth(
+        folder,
+        draw(),
+        write=_WRITE,
+        suffix=_SUFFIX,
+        version=VERSION,
+        seed=seed,
+        stimuli=str(stimuli.attrs["content_hash"]),
+        labels=rodgers.LABELS,
+        shared=_shared(afferents, first[None], seed),
     )
-    return paths
 
 
 def demo_folder(stimuli: str, *, seed: int = 0, animals: int = 4) -> Path:
@@ -156,13 +156,15 @@ def ensure_demo(
 ) -> Path:
     """Return the folder of the demo recordings, making them if this machine has none.
 
-    Two processes may ask at once and either may be killed: a folder appears under its name only when
-    it is complete, and one whose files are missing or of the wrong size is made again.
+    Two processes may ask at once and either may be killed: every file is written whole, the truth comes last, and
+    a folder without it, or with files missing or of another size, is made again.
 
     Args:
         stimuli: the stimulus set, or a function that makes it and is called only if needed.
-        key: name of the stimuli (such as a hash of the recipe), needed with a function.
-        seed, animals, progress: as in :func:`make_demo`.
+        key: name of the stimuli (such as a hash of what they were made from), needed with a function.
+        seed: as in :func:`make_demo`.
+        animals: as in :func:`make_demo`.
+        progress: as in :func:`make_demo`.
 
     Raises:
         UsageError: a function without a ``key``.
@@ -173,55 +175,40 @@ def ensure_demo(
             raise UsageError("ensure_demo needs a key beside a function that makes the stimuli; pass key='…'.")
         key = str(check_stimulus_set(stimuli).attrs["content_hash"])
     target = demo_folder(key, seed=seed, animals=animals)
-    if _complete(target):
-        return target
-    dataset = stimuli() if callable(stimuli) else stimuli
-    _remove_abandoned(target.parent)
-    # The dot hides a half-made folder from searches for recordings.
-    scratch = Path(tempfile.mkdtemp(prefix=".demo-", dir=target.parent))
-    try:
-        make_demo(scratch, dataset, seed=seed, animals=animals, progress=progress)
-        scratch.chmod(0o755)
-        _install(scratch, target)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    if not _complete(target):
+        if (target / TRUTH).exists():
+            _log.warning("The demo recordings in %s are damaged and are replaced.", target)
+        make_demo(target, stimuli() if callable(stimuli) else stimuli, seed=seed, animals=animals, progress=progress)
+        # What a killed process left; a younger file may be one that is being written.
+        for item in target.glob(".*"):
+            with contextlib.suppress(OSError):
+                if time.time() - item.stat().st_mtime > _ABANDONED:
+                    item.unlink()
     return target
 
 
-def _animal(index: int) -> list[SessionPlan]:
-    plans = _ANIMALS[index % len(_ANIMALS)]
-    return [replace(plan, subject=f"demo{index + 1:02d}") for plan in plans]
-
-
 def _in_vocabulary_order(stimuli: xr.Dataset) -> xr.Dataset:
-    wanted = [f"{shape}-{place}" for shape in rodgers.ORDERS["stimulus"] for place in rodgers.ORDERS["servo_position"]]
     have = [str(label) for label in stimuli["stimulus"].values]
-    if sorted(have) != sorted(wanted):
-        raise DataError(f"The demo recordings need the stimuli {listing(wanted)}; these are {listing(have)}.")
+    if sorted(have) != sorted(rodgers.LABELS):
+        raise DataError(f"The demo recordings need the stimuli {listing(rodgers.LABELS)}; these are {listing(have)}.")
     if "contact" not in stimuli:
         raise DataError("The demo recordings need the stimuli's contact [stimulus, time, whisker]; these have none.")
-    return stimuli.isel(stimulus=[have.index(label) for label in wanted])
+    return stimuli.isel(stimulus=[have.index(label) for label in rodgers.LABELS])
 
 
-def _first_contacts(
-    labels: tuple[str, ...], runs: dict[str, list[NDArray[np.float64]]], lost: str | None = None
-) -> NDArray[np.float64]:
-    """First contact [K] (s after onset) of each stimulus with the whiskers whose contacts are known."""
-    known = {name: items for name, items in runs.items() if name != lost}
-    first = np.array(
-        [
-            min((items[stimulus][0, 0] for items in known.values() if len(items[stimulus])), default=np.inf)
-            for stimulus in range(len(labels))
-        ]
-    )
-    for label, onset in zip(labels, first, strict=True):
-        if onset >= CHOICE[0]:
+def _first_contacts(contacts: dict[str, list[NDArray[np.float64]]], lost: str | None) -> NDArray[np.float64]:
+    """Return the first contact [K] (s after onset) of each stimulus with the whiskers whose contacts are known."""
+    known = {name: items for name, items in contacts.items() if name != lost}
+    first = np.full(len(rodgers.LABELS), np.inf)
+    for stimulus, label in enumerate(rodgers.LABELS):
+        first[stimulus] = min((runs[stimulus][0, 0] for runs in known.values() if len(runs[stimulus])), default=np.inf)
+        if first[stimulus] >= CHOICE[0]:
             raise DataError(f"The stimulus {label!r} touches none of {listing(known)} in time for the demo's choices.")
     return first
 
 
 def _expected(rates: NDArray[np.float64], afferents: Afferents, first: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected response [K, U] in the layout's window, first contact to choice."""
+    """Return the expected response [K, U] in the layout's window, first contact to choice."""
     return window_rates(rates, afferents.frame, first, np.linspace(*CHOICE, 18))
 
 
@@ -239,24 +226,3 @@ def _complete(folder: Path) -> bool:
         return all((folder / name).stat().st_size == item["bytes"] for name, item in files.items())
     except (DataError, OSError, KeyError, TypeError, AttributeError):
         return False
-
-
-def _install(scratch: Path, target: Path) -> None:
-    """Give a finished folder its name; another process may have been first."""
-    try:
-        scratch.rename(target)
-    except OSError:
-        if _complete(target):
-            return
-        _log.warning("The demo recordings in %s are damaged and are replaced.", target)
-        with contextlib.suppress(FileNotFoundError):
-            target.rename(Path(tempfile.mkdtemp(prefix=".demo-", dir=target.parent)) / "damaged")
-        scratch.rename(target)
-
-
-def _remove_abandoned(folder: Path) -> None:
-    """Remove what a killed process left; a younger folder may belong to one that still runs."""
-    for item in folder.glob(".demo-*"):
-        with contextlib.suppress(OSError):
-            if time.time() - item.stat().st_mtime > _ABANDONED:
-                shutil.rmtree(item, ignore_errors=True)

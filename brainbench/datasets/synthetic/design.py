@@ -1,8 +1,8 @@
-"""Draw one synthetic session: expected rates from a geometry, trials, and spike counts around them."""
+"""Sessions of synthetic animals: expected rates from a geometry, trials, and spike counts around them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ MODULATION = 0.4
 
 @dataclass(frozen=True)
 class Design:
-    """What is recorded, and how noisy it is."""
+    """Size of synthetic recordings, and how noisy they are."""
 
     animals: int = 11
     sessions: int = 1
@@ -70,27 +70,51 @@ class Design:
 
 @dataclass(frozen=True)
 class DrawnSession:
-    """One session as drawn."""
+    """One session as drawn: counts around expected rates."""
 
+    subject: str
+    session: str
+    stream: tuple[int, ...]
+    """Seed of this session's random numbers."""
     counts: NDArray[np.int64]
     """[R, U] spikes in the window."""
     labels: NDArray[np.int64]
     """[R] stimulus of each trial."""
     expected: NDArray[np.float64]
     """[K, U] expected rate, Hz."""
-    block: Trials
+    window: float
+    """Duration in which spikes are counted, s."""
+
+    @property
+    def trials(self) -> Trials:
+        """Firing rates [R, 1, U] in Hz, with their labels and keys."""
+        keys = tuple(f"{self.subject}/{self.session}/{row}" for row in range(len(self.labels)))
+        return Trials(self.counts[:, None] / self.window, self.labels, keys)
 
 
-def draw_session(
-    geometry: ResponseGeometry, design: Design, animal: int, session: int, seed: int | Sequence[int]
+def draw_sessions(
+    geometry: ResponseGeometry, design: Design | None, seed: int | Sequence[int]
+) -> Iterator[DrawnSession]:
+    """Draw the sessions of every animal; each is a pure function of geometry, design, seed, animal and session.
+
+    Raises:
+        UsageError: a missing stimulus does not exist.
+    """
+    design = design or Design()
+    for animal in range(design.animals):
+        for session in range(design.sessions):
+            yield _draw_session(geometry, design, animal, session, entropy(seed))
+
+
+def _draw_session(
+    geometry: ResponseGeometry, design: Design, animal: int, session: int, seed: tuple[int, ...]
 ) -> DrawnSession:
-    """Draw one session's trials and counts; a pure function of its arguments."""
     stimuli = len(geometry.labels)
     absent = [which for owner, which in design.missing if owner == animal]
     if any(not 0 <= which < stimuli for which in absent):
         raise UsageError(f"Missing stimuli are numbered 0 to {stimuli - 1}; received {absent} for animal {animal}.")
-    own = np.random.default_rng([*entropy(seed), animal])
-    random = np.random.default_rng([*entropy(seed), animal, session])
+    own = np.random.default_rng([*seed, animal])
+    random = np.random.default_rng([*seed, animal, session])
     tuning = np.sqrt(1 - design.individual) * _project(geometry.directions, design.units, random)
     if design.individual:
         private = own.standard_normal((stimuli, stimuli + 1))
@@ -108,12 +132,19 @@ def draw_session(
     if design.dispersion:
         rates *= random.gamma(1 / design.dispersion, design.dispersion, rates.shape)
     counts = random.poisson(rates * design.window)
-    keys = tuple(f"{subject_name(animal)}/{session_name(session)}/{row}" for row in range(len(labels)))
-    return DrawnSession(counts, labels, expected, Trials(counts[:, None] / design.window, labels, keys))
+    return DrawnSession(
+        subject=f"synthetic{animal + 1:02d}",
+        session=f"{session + 1:02d}",
+        stream=(*seed, animal, session),
+        counts=counts,
+        labels=labels,
+        expected=expected,
+        window=design.window,
+    )
 
 
 def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
-    """Mean response [K, U] to every stimulus; NaN where there is no trial."""
+    """Return the mean response [K, U] to every stimulus; NaN where there is no trial."""
     member = np.zeros((stimuli, len(block.labels)))
     member[block.labels, np.arange(len(block.labels))] = 1.0
     number = member.sum(axis=1, keepdims=True)
@@ -121,18 +152,8 @@ def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
     return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
 
 
-def subject_name(animal: int) -> str:
-    """Name of an animal."""
-    return f"synthetic{animal + 1:02d}"
-
-
-def session_name(session: int) -> str:
-    """Name of a session."""
-    return f"{session + 1:02d}"
-
-
 def _project(directions: NDArray[np.float64], units: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Tuning [K, U] of units with random preferred directions: normal, covariance over units = cosines."""
+    """Return the tuning [K, U] of units with random preferred directions: normal, covariance over units = cosines."""
     return directions @ random.standard_normal((directions.shape[1], units))
 
 
@@ -148,5 +169,5 @@ def _labels(design: Design, stimuli: int, absent: list[int], random: np.random.G
 
 
 def entropy(seed: int | Sequence[int]) -> tuple[int, ...]:
-    """A seed as the beginning of a list of integers."""
+    """Return a seed as the beginning of a list of integers."""
     return (seed,) if isinstance(seed, (int, np.integer)) else tuple(seed)

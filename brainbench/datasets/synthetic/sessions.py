@@ -1,12 +1,12 @@
 """Synthetic recordings as a data set, as sessions of spike times, and as NWB or HDF5 files.
 
-All three hold the same counts as :func:`brainbench.datasets.synthetic.animals.simulate` with the same seed.
+All three hold the same counts as ``simulate`` with the same seed.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import unknown_name
-from brainbench.core.files import write_json
-from brainbench.datasets.exports import write_nwb
 from brainbench.datasets.hdf5 import write_recordings
+from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.sessions import Session, make_session
-from brainbench.datasets.synthetic.design import Design, draw_session, entropy, session_name, subject_name
+from brainbench.datasets.synthetic.design import Design, DrawnSession, draw_sessions
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
-from brainbench.datasets.synthetic.truth import TRUTH, correlation_rdm
+from brainbench.datasets.synthetic.truth import SyntheticSession, write_with_truth
 from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts
+from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
 from brainbench.datasets.trials.joining import join_sessions
 from brainbench.datasets.trials.selection import EVERYTHING, Tally
 from brainbench.datasets.trials.windows import Window
@@ -56,41 +55,33 @@ def as_recordings(
     Raises:
         DataError: the design leaves no trial or one condition only.
     """
-    design = design or Design()
-    plan = ReadingOptions(
-        CONDITIONS, geometry.labels, EVERYTHING, Window("choice", offset=-design.window, length=design.window), None
-    )
-    parts = []
-    for animal in range(design.animals):
-        for number in range(design.sessions):
-            drawn = draw_session(geometry, design, animal, number, seed)
-            begin, _ = _times(design, len(drawn.labels), (*entropy(seed), animal, number))
-            labels = tuple(geometry.labels[index] for index in drawn.labels)
-            parts.append(
-                SessionCounts(
-                    subject=subject_name(animal),
-                    session=session_name(number),
-                    source=f"{subject_name(animal)}-{session_name(number)}",
-                    values=tuple((label,) for label in labels),
-                    labels=labels,
-                    trial_ids=tuple(map(str, range(len(labels)))),
-                    unit_ids=tuple(map(str, range(drawn.counts.shape[1]))),
-                    edges=np.stack([begin, begin + design.window], axis=1),
-                    counts=drawn.counts[:, None].astype(np.float32),
-                    duration=np.full((len(labels), 1), design.window),
-                    columns={
-                        "depth": np.full(drawn.counts.shape[1], np.nan),
-                        "layer": np.full(drawn.counts.shape[1], "", dtype="U1"),
-                        "inhibitory": np.full(drawn.counts.shape[1], np.nan),
-                    },
-                    covariates={},
-                    tally=Tally(),
-                    trials=len(labels),
-                    units=drawn.counts.shape[1],
-                    synthetic=True,
-                )
+    counted, length = [], (design or Design()).window
+    for drawn in draw_sessions(geometry, design, seed):
+        trials, units = drawn.counts.shape
+        labels = tuple(geometry.labels[index] for index in drawn.labels)
+        begin, _ = _times(drawn)
+        counted.append(
+            SessionCounts(
+                subject=drawn.subject,
+                session=drawn.session,
+                source=f"{drawn.subject}-{drawn.session}",
+                values=tuple((label,) for label in labels),
+                labels=labels,
+                trial_ids=tuple(map(str, range(trials))),
+                unit_ids=tuple(map(str, range(units))),
+                edges=np.stack([begin, begin + length], axis=1),
+                counts=drawn.counts[:, None].astype(np.float32),
+                duration=np.full((trials, 1), length),
+                columns={name: missing_column(kind, units) for name, kind in UNIT_COLUMNS.items()},
+                covariates={},
+                tally=Tally(),
+                trials=trials,
+                units=units,
+                synthetic=True,
             )
-    return join_sessions(parts, plan, source="synthetic", layout="", notes=[])
+        )
+    options = ReadingOptions(CONDITIONS, geometry.labels, EVERYTHING, Window("choice", offset=-length, length=length))
+    return join_sessions(counted, options, source="synthetic", layout="", notes=[])
 
 
 def make_sessions(
@@ -103,12 +94,7 @@ def make_sessions(
     windows units fire at half their mean rate, and never twice within 2 ms (less at rates above
     250 Hz). The window is ``first-contact..choice``.
     """
-    design = design or Design()
-    return [
-        _session(geometry, design, animal, number, seed)
-        for animal in range(design.animals)
-        for number in range(design.sessions)
-    ]
+    return [_session(geometry, drawn) for drawn in draw_sessions(geometry, design, seed)]
 
 
 def write_files(
@@ -122,37 +108,27 @@ def write_files(
     """Write synthetic animals as files, one per session, with ``truth.json`` beside them.
 
     Opened with ``conditions="trials:stimulus", window="first-contact..choice"`` they give the counts of
-    :func:`~brainbench.datasets.synthetic.animals.simulate`; ``read_truth`` of the demo reads the truth.
+    :func:`~brainbench.datasets.synthetic.simulate`; ``read_truth`` reads the truth.
 
     Raises:
         UsageError: a format other than ``nwb`` and ``h5``.
     """
-    if format not in ("nwb", "h5"):
-        raise unknown_name("format", format, ("nwb", "h5"))
-    design, folder = design or Design(), Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    expected: dict[str, list[NDArray[np.float64]]] = {}
-    for animal in range(design.animals):
-        for number in range(design.sessions):
-            session = _session(geometry, design, animal, number, seed)
-            drawn = draw_session(geometry, design, animal, number, seed)
-            expected.setdefault(session.subject, []).append(drawn.expected)
-            path = folder / f"sub-{session.subject}_ses-{session.session}.{format}"
-            paths.append(write_nwb(path, session) if format == "nwb" else write_recordings(path, session))
-    write_json(
-        folder / TRUTH,
-        {
-            "note": "SYNTHETIC recordings: ranks of models on them say nothing about brains.",
-            "synthetic": True,
-            "seed": seed,
-            "design": design,
-            "labels": geometry.labels,
-            "shared": geometry.rdm,
-            "subjects": {name: correlation_rdm(np.concatenate(rates, axis=1)) for name, rates in expected.items()},
-        },
+    writers: dict[str, Callable[[Path, Session], Path]] = {"nwb": write_nwb, "h5": write_recordings}
+    if format not in writers:
+        raise unknown_name("format", format, writers)
+    return write_with_truth(
+        folder,
+        (
+            SyntheticSession(_session(geometry, drawn), drawn.expected)
+            for drawn in draw_sessions(geometry, design, seed)
+        ),
+        write=writers[format],
+        suffix=f".{format}",
+        seed=seed,
+        design=design or Design(),
+        labels=geometry.labels,
+        shared=geometry.rdm,
     )
-    return paths
 
 
 def place_spikes(
@@ -191,44 +167,39 @@ def place_spikes(
     return begin[which] + position[order] + rank * dead
 
 
-def _times(design: Design, trials: int, stream: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Contact and end of every trial, s."""
-    pause = np.round(np.random.default_rng([*stream, 2]).uniform(*_AFTER, trials), 4)
-    stop = 1.0 + np.cumsum(_BEFORE + design.window + pause)
-    return stop - pause - design.window, stop
+def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the contact and the end of every trial [R], s."""
+    pause = np.round(np.random.default_rng([*drawn.stream, 2]).uniform(*_AFTER, len(drawn.labels)), 4)
+    stop = 1.0 + np.cumsum(_BEFORE + drawn.window + pause)
+    return stop - pause - drawn.window, stop
 
 
-def _session(
-    geometry: ResponseGeometry, design: Design, animal: int, number: int, seed: int | Sequence[int]
-) -> Session:
-    drawn = draw_session(geometry, design, animal, number, seed)
-    stream = (*entropy(seed), animal, number)
-    random = np.random.default_rng([*stream, 1])
-    begin, stop = _times(design, len(drawn.labels), stream)
-    start = begin - _BEFORE
-    end = float(stop[-1])
+def _session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
+    random = np.random.default_rng([*drawn.stream, 1])
+    begin, stop = _times(drawn)
+    choice, end = begin + drawn.window, float(stop[-1])
     # The margins keep the refractory time between the spikes of a window and those around it.
-    opened = np.concatenate([[0.0], begin + design.window]) + _DEAD
+    opened = np.concatenate([[0.0], choice]) + _DEAD
     pause = np.concatenate([begin, [end]]) - _DEAD - opened
     rest = _REST * drawn.expected.mean(axis=0)
     spikes = []
     for unit in range(drawn.counts.shape[1]):
-        window = place_spikes(random, drawn.counts[:, unit], begin, design.window, _ONSET)
+        window = place_spikes(random, drawn.counts[:, unit], begin, drawn.window, _ONSET)
         idle = place_spikes(random, random.poisson(rest[unit] * pause), opened, pause, 0.0)
         spikes.append(np.sort(np.concatenate([window, idle])))
     tables: dict[str, dict[str, Any]] = {
         "trials": {
             "id": np.arange(len(begin)),
-            "start_time": start,
+            "start_time": begin - _BEFORE,
             "stop_time": stop,
             "stimulus": np.array(geometry.labels, dtype=str)[drawn.labels],
-            "choice_time": begin + design.window,
+            "choice_time": choice,
         },
         "contacts_by_whisker_C1": {"start_time": begin, "stop_time": begin + _TOUCH},
     }
     return make_session(
-        subject_name(animal),
-        session_name(number),
+        drawn.subject,
+        drawn.session,
         spikes,
         tables,
         observed=[np.array([[0.0, end]])] * len(spikes),

@@ -1,17 +1,69 @@
-"""The truth beside synthetic recordings: a JSON file with the geometry that the neurons were given."""
+"""Files of synthetic sessions, with ``truth.json`` beside them: the geometry that their units were given."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.files import read_json
+from brainbench.core.files import file_hash, read_json, write_json
+from brainbench.datasets.sessions import Session
 
 TRUTH = "truth.json"
+
+
+@dataclass(frozen=True)
+class SyntheticSession:
+    """One session of spike times and the rates behind it."""
+
+    session: Session
+    expected: NDArray[np.float64]
+    """[K, U] expected response to each stimulus in the window that is counted, Hz."""
+
+
+def write_with_truth(
+    folder: str | os.PathLike[str],
+    sessions: Iterable[SyntheticSession],
+    *,
+    write: Callable[[Path, Session], Path],
+    suffix: str,
+    **about: Any,
+) -> list[Path]:
+    """Write sessions as files ``sub-…_ses-…SUFFIX``, and last their truth.
+
+    Args:
+        folder: created if needed; files of the same names are replaced.
+        sessions: drawn one after the other, all of one subject together.
+        write: writes one of them atomically.
+        suffix: end of the files' names.
+        about: what else ``truth.json`` holds: ``labels``, and ``shared``, the RDM [P] of the shared geometry.
+
+    Returns:
+        The files of the sessions.
+    """
+    folder = Path(folder)
+    expected: dict[str, list[NDArray[np.float64]]] = {}
+    paths = []
+    for item in sessions:
+        name = f"sub-{item.session.subject}_ses-{item.session.session}{suffix}"
+        paths.append(write(folder / name, item.session))
+        expected.setdefault(item.session.subject, []).append(item.expected)
+    write_json(
+        folder / TRUTH,
+        {
+            "note": "SYNTHETIC recordings: ranks of models on them say nothing about brains.",
+            "synthetic": True,
+            **about,
+            "subjects": {name: correlation_rdm(np.concatenate(rates, axis=1)) for name, rates in expected.items()},
+            "files": {path.name: {"bytes": path.stat().st_size, "hash": file_hash(path)} for path in paths},
+        },
+    )
+    return paths
 
 
 def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -27,7 +79,7 @@ def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def correlation_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Correlation distance between rows [K, U] as an upper triangle [P]; NaN for rows without variance."""
+    """Return the correlation distances [P] between rows [K, U]; NaN for rows without variance."""
     rows, columns = np.triu_indices(len(responses), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return 1.0 - np.atleast_2d(np.corrcoef(responses))[rows, columns]

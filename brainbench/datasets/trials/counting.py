@@ -289,8 +289,13 @@ def _units_in_order(
     return np.array(sorted(rows.tolist(), key=key), dtype=np.int64)
 
 
+def missing_column(kind: type, units: int) -> NDArray[Any]:
+    """Return a unit column [units] that says "missing" everywhere."""
+    return np.full(units, np.nan) if kind is float else np.full(units, "", dtype="U1")
+
+
 def _unit_column(units: SessionTable, name: str, kind: type, rows: NDArray[np.int64]) -> NDArray[Any]:
     if name not in units:
-        return np.full(len(rows), np.nan) if kind is float else np.full(len(rows), "", dtype="U1")
+        return missing_column(kind, len(rows))
     values = units.column(name)[rows]
     return values.astype(np.float64) if kind is float and values.dtype.kind in "biuf" else as_labels(values)

@@ -11,7 +11,7 @@ from brainbench.datasets.checks.spikes import coincidences
 from brainbench.datasets.exports import subset
 from brainbench.datasets.reading import each_session, open_file
 from brainbench.datasets.sessions import SPIKES, SessionTable, ragged
-from brainbench.datasets.synthetic.animals import Design, ResponseGeometry, make_sessions, write_files
+from brainbench.datasets.synthetic import Design, ResponseGeometry, make_sessions, write_files
 from tests.datasets.layouts.test_rodgers import detection, write_rodgers
 from tests.datasets.test_nwb import HUMAN, write_nwb
 from tests.factories.recordings import make_simple_session
@@ -354,7 +354,7 @@ def test_a_folder_is_judged_as_a_whole_worst_first(tmp_path):
 
 
 def test_counted_recordings_are_said_to_be_beyond_checking(tmp_path):
-    from brainbench.datasets.synthetic.animals import as_recordings
+    from brainbench.datasets.synthetic import as_recordings
 
     path = write_recordings(tmp_path / "a.h5", as_recordings(GEOMETRY, Design(animals=2, units=4, trials=3)))
     assert "already counted" in found(path, "file", "note")[1]
@@ -376,7 +376,7 @@ def test_real_files_pass_without_false_alarm(reference):
 
 @pytest.fixture(scope="session")
 def demo_files(tmp_path_factory):
-    from brainbench.datasets.synthetic.demo import make_demo
+    from brainbench.datasets.synthetic import make_demo
     from tests.factories.recordings import make_stimuli
 
     folder = tmp_path_factory.mktemp("demo-check")

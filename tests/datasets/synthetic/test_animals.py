@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, trials_by_subject
-from brainbench.datasets.synthetic.animals import (
+from brainbench.datasets.synthetic import (
     FAULTS,
     Design,
     ResponseGeometry,
@@ -16,11 +16,11 @@ from brainbench.datasets.synthetic.animals import (
     calibrate,
     make_sessions,
     measure_ceiling,
+    read_truth,
     simulate,
     stimulus_means,
     write_files,
 )
-from brainbench.datasets.synthetic.demo import read_truth
 from brainbench.metrics import Trials, noise_ceiling, rdm, subject_rdm
 
 SMALL = Design(animals=3, sessions=2, units=12, trials=5)

@@ -11,7 +11,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import file_hash
 from brainbench.datasets import inspect, open_recordings, trials_by_subject
-from brainbench.datasets.synthetic import demo
+from brainbench.datasets.synthetic import demo, read_truth
 from tests.factories.recordings import LABELS, make_stimuli
 
 
@@ -111,7 +111,7 @@ def test_counts_are_over_dispersed(dataset):
 
 
 def test_measured_geometry_tends_to_the_stored_truth(folder, dataset):
-    truth = demo.read_truth(folder)
+    truth = read_truth(folder)
     assert truth["labels"] == list(LABELS)
     measured = {name: mean_rdm(sessions) for name, sessions in trials_by_subject(dataset).items()}
     own = {name: correlation(rdm, truth["subjects"][name]) for name, rdm in measured.items()}
@@ -197,16 +197,21 @@ def test_a_damaged_cache_is_made_again(monkeypatch, tmp_path, caplog):
     assert json.loads((made / demo.TRUTH).read_text())["synthetic"] is True
 
 
-def test_what_a_killed_process_left_is_removed_when_old(monkeypatch, tmp_path):
+def test_what_a_killed_process_left_is_completed_and_removed_when_old(monkeypatch, folder, tmp_path):
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    root = demo.demo_folder("x").parent
-    old, young = root / ".demo-old", root / ".demo-young"
-    old.mkdir()
-    young.mkdir()
+    half = demo.demo_folder("fake-0-30", animals=1)
+    half.mkdir()
+    first = sorted(folder.glob("*.nwb"))[0]
+    shutil.copy(first, half)
+    old, young = half / ".sub-old.nwb", half / ".sub-young.nwb"
+    old.touch()
+    young.touch()
     os.utime(old, (0, 0))
-    demo.ensure_demo(make_stimuli(), animals=1)
+    assert demo.ensure_demo(make_stimuli(), animals=1) == half
     assert not old.exists()
     assert young.exists()
+    assert open_recordings(half).attrs["sessions"][1]["session"] == "02"
+    assert file_hash(half / first.name) == file_hash(first)
 
 
 def _ensure(queue):
@@ -226,7 +231,7 @@ def test_two_processes_may_make_them_at_once(monkeypatch, tmp_path):
         assert worker.exitcode == 0
     assert len(paths) == 1
     assert open_recordings(paths.pop()).attrs["synthetic"] is True
-    assert not list((tmp_path / "recordings").glob(".demo-*"))
+    assert not list((tmp_path / "recordings").glob("*/.*"))
 
 
 def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):

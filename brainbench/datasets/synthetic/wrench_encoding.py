@@ -1,4 +1,4 @@
-"""The neurons of the demo recordings: a fixed nonlinear temporal encoding of the whisker wrench.
+"""Expected rates from whisker wrenches: the fixed nonlinear temporal encoding of the demo recordings' neurons.
 
 Afferents: every wrench channel of every whisker, scaled by its root mean square, half-wave rectified
 in both directions, compressed, once adapting within 30 ms (onsets) and once within 200 ms, then
@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, listing
+from brainbench.datasets.layouts.rodgers import TRACKED
 
 if TYPE_CHECKING:
     import xarray as xr
 
-TRACKED = ("C0", "C1", "C2", "C3")
-"""Whiskers that the recorded mice kept, and whose contacts were tracked."""
 LATENCY = 0.015
 """Delay from whisker to spike, s."""
 
@@ -183,10 +182,7 @@ def _unit_scale(drive: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _smooth(values: NDArray[np.float64], seconds: float, frame: float) -> NDArray[np.float64]:
     """First-order low-pass along axis 1, starting from rest."""
+    from scipy.signal import lfilter
+
     share = 1.0 - np.exp(-frame / seconds)
-    state = np.zeros_like(values[:, 0])
-    result = np.empty_like(values)
-    for step in range(values.shape[1]):
-        state = state + share * (values[:, step] - state)
-        result[:, step] = state
-    return result
+    return np.asarray(lfilter([share], [1.0, share - 1.0], values, axis=1))
