@@ -33,6 +33,14 @@ def from_matrices(matrices: ArrayLike) -> NDArray[np.float64]:
     return np.roll(Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(), 1, axis=-1).reshape(*m.shape[:-2], 4)
 
 
+def from_rpy(angles: ArrayLike) -> NDArray[np.float64]:
+    """Return the unit quaternions [..., 4] of turns about the fixed x, y, z axes by angles [..., 3] (rad), as in URDF."""
+    from scipy.spatial.transform import Rotation
+
+    a = np.asarray(angles, dtype=np.float64)
+    return np.roll(Rotation.from_euler("xyz", a.reshape(-1, 3)).as_quat(), 1, axis=-1).reshape(*a.shape[:-1], 4)
+
+
 def constant(values: float | Sequence[float], like: torch.Tensor, dtype: torch.dtype | None = None) -> torch.Tensor:
     """Return numbers as a tensor on the device of another: made once, so that later calls copy nothing to the device.
 

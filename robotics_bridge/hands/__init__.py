@@ -1,22 +1,36 @@
-"""Robot hands: two of our own made of primitives, any URDF or MJCF file, and where their probes sit."""
+"""Robot hands: two of our own made of primitives, any URDF or MJCF file, and where their probes sit.
+
+``spec`` describes a hand as data (``sharpa.toml``, ``xhand1.toml``), ``hand`` makes it or a file's hand ready for use,
+``layouts`` and ``surface`` place probes on its links, ``observations`` turns their readings into what a policy gets,
+and ``scenes`` lays an object on the palm.
+"""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from brainbench.core.errors import unknown_name
+from brainbench.core.lazy import lazy_exports
 from robotics_bridge.hands.hand import Hand, from_file
 from robotics_bridge.hands.layouts import PLACEMENTS, RESOLUTIONS, active_count, read_probes, write_probes
+from robotics_bridge.hands.spec import read_spec
+
+if TYPE_CHECKING:
+    from robotics_bridge.hands import observations, scenes, surface
 
 __all__ = [
-    "PLACEMENTS", "RESOLUTIONS", "Hand", "active_count", "list_hands", "load", "read_probes", "write_probes",
+    "PLACEMENTS", "RESOLUTIONS", "Hand", "active_count", "list_hands", "load", "observations", "read_probes", "scenes",
+    "surface", "write_probes",
 ]  # fmt: skip
+
+_OWN = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"))}
 
 
 def list_hands() -> tuple[str, ...]:
     """Return the names of the hands that come with the package."""
-    return ("sharpa", "xhand1")
+    return tuple(_OWN)
 
 
 def load(name_or_path: str | os.PathLike[str]) -> Hand:
@@ -26,14 +40,15 @@ def load(name_or_path: str | os.PathLike[str]) -> Hand:
         UsageError: there is no hand of this name.
         DataError: the file is missing or holds no hand.
     """
-    from robotics_bridge.hands.sharpa import sharpa
-    from robotics_bridge.hands.xhand1 import xhand1
-
-    own = {"sharpa": sharpa, "xhand1": xhand1}
     name = os.fspath(name_or_path)
-    if name in own:
-        spec = own[name]()
+    if name in _OWN:
+        spec = read_spec(_OWN[name])
         return Hand(spec.name, spec.palm, spec.fingers, spec=spec)
     if Path(name).suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return from_file(Path(name))
-    raise unknown_name("hand", name, own, hint="Or give the path of a URDF or MJCF file.")
+    raise unknown_name("hand", name, _OWN, hint="Or give the path of a URDF or MJCF file.")
+
+
+__getattr__, __dir__ = lazy_exports(
+    __name__, {"observations": ".observations.", "scenes": ".scenes.", "surface": ".surface."}
+)

@@ -10,7 +10,7 @@ import numpy as np
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import read_json, write_json
-from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link
+from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link, Pad
 from robotics_bridge.sensors.probes.placement import Probes
 
 if TYPE_CHECKING:
@@ -36,9 +36,9 @@ def pad_probes(link: Link, grid: Grid) -> Probes:
         raise UsageError(f"Link {link.name!r} has no sensing pad.")
     solid = link.solids[0]
     if isinstance(solid, CapsuleGeometry):
-        position, normal = _on_capsule(solid, link.pad.facing, link.pad.along, link.pad.around, grid)
+        position, normal = _on_capsule(solid, link.pad, grid)
     elif isinstance(solid, BoxGeometry):
-        position, normal = _on_box(solid, link.pad.facing, link.pad.along, grid)
+        position, normal = _on_box(solid, link.pad, grid)
     else:
         raise UsageError(f"The pad of link {link.name!r} lies on a sphere; use a capsule or a box.")
     keep = np.ones(grid.rows * grid.columns, dtype=bool)
@@ -62,19 +62,17 @@ def _centred(count: int, half: float) -> NDArray[np.float64]:
     return np.linspace(-half, half, count) if count > 1 else np.zeros(1)
 
 
-def _on_capsule(
-    solid: CapsuleGeometry, facing: Any, along: tuple[float, float], around: float, grid: Grid
-) -> tuple[Any, Any]:
+def _on_capsule(solid: CapsuleGeometry, pad: Pad, grid: Grid) -> tuple[NDArray, NDArray]:
+    """Return positions and normals [N, 3] of a grid on a capsule."""
     start, end = np.array(solid.start), np.array(solid.end)
     length = np.linalg.norm(end - start)
     axis = (end - start) / length
-    up = np.array(facing, dtype=float) - axis * np.dot(facing, axis)
+    up = np.array(pad.facing, dtype=float) - axis * np.dot(pad.facing, axis)
     up /= np.linalg.norm(up)
     side = np.cross(axis, up)
-    angle, arc = (
-        item.ravel()
-        for item in np.meshgrid(_centred(grid.rows, around), np.linspace(*along, grid.columns), indexing="ij")
-    )
+    last = pad.along[1] + pad.over_end * (solid.radius * (math.pi / 2))
+    arcs = np.linspace(pad.along[0], last, grid.columns)
+    angle, arc = (item.ravel() for item in np.meshgrid(_centred(grid.rows, pad.around), arcs, indexing="ij"))
     # Beyond the end of the axis the meridian runs over the round end.
     tilt = np.maximum(arc - length, 0) / solid.radius
     across = np.cos(angle)[:, None] * up + np.sin(angle)[:, None] * side
@@ -82,15 +80,14 @@ def _on_capsule(
     return start + np.minimum(arc, length)[:, None] * axis + solid.radius * normal, normal
 
 
-def _on_box(solid: BoxGeometry, facing: Any, extent: tuple[float, float], grid: Grid) -> tuple[Any, Any]:
-    normal = np.array(facing, dtype=float)
+def _on_box(solid: BoxGeometry, pad: Pad, grid: Grid) -> tuple[NDArray, NDArray]:
+    """Return positions and normals [N, 3] of a grid on a face of a box."""
+    normal = np.array(pad.facing, dtype=float)
     face = int(np.argmax(np.abs(normal)))
     # Columns run along z where the face has one, rows across.
     rows_axis, columns_axis = {0: (1, 2), 1: (0, 2), 2: (0, 1)}[face]
-    y, x = (
-        item.ravel()
-        for item in np.meshgrid(_centred(grid.rows, extent[0]), _centred(grid.columns, extent[1]), indexing="ij")
-    )
+    sides = (_centred(grid.rows, pad.along[0]), _centred(grid.columns, pad.along[1]))
+    y, x = (item.ravel() for item in np.meshgrid(*sides, indexing="ij"))
     position = np.tile(np.array(solid.center), (len(y), 1))
     position[:, face] += normal[face] * solid.half[face]
     position[:, rows_axis] += y

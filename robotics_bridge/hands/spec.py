@@ -1,11 +1,13 @@
-"""A hand as data: links, joints, sensing pads. Our own hands are such data, with geometry of primitives only.
+"""A hand as data: links, joints, sensing pads. Our own hands are such data (TOML), with geometry of primitives only.
 
-Metres, kilograms, radians, newtons. Vectors of a link are given in its frame, whose origin is its joint.
+:func:`read_spec` reads the data, :func:`build` makes the MuJoCo model of them. Metres, kilograms, radians, newtons.
+Vectors of a link are given in its frame, whose origin is its joint.
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +15,11 @@ import numpy as np
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import from_rpy
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
 Vector = tuple[float, float, float]
 
@@ -67,6 +71,8 @@ class Pad:
     along: tuple[float, float]
     """Capsule: from, to on the meridian, counted from the start of the axis [m]. Box: half extent of rows and
     columns [m]."""
+    over_end: float = 0.0
+    """Capsule: share of the meridian of the round end by which columns run on beyond ``along``."""
     around: float = 0.9
     """Capsule: half angle that the rows cover [rad]."""
 
@@ -161,19 +167,32 @@ class HandSpec:
         return next(link for link in self.links if link.name == name)
 
 
-def quaternion(rpy: Vector) -> tuple[float, float, float, float]:
-    """Return the quaternion (w, x, y, z) of rotations about the fixed x, y, z axes [rad].
+def read_spec(path: Path) -> HandSpec:
+    """Read one of our hands; the file names its fields as the classes here do.
 
-    >>> [round(value, 3) for value in quaternion((0.0, 0.0, math.pi))]
-    [0.0, 0.0, 0.0, 1.0]
+    A grid is (rows, columns, radius) or (…, active).
     """
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in rpy)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    with path.open("rb") as stream:
+        data = _tuples(tomllib.load(stream))
+    links = []
+    for name, row in data.pop("links").items():
+        solids = tuple(_SOLIDS[frozenset(solid)](**solid) for solid in row.get("solids", ()))
+        pad = Pad(**row["pad"]) if "pad" in row else None
+        grids = {resolution: Grid(*grid) for resolution, grid in row.get("grids", {}).items()}
+        links.append(Link(name, row["mass"], solids, pad, grids))
+    joints = tuple(Joint(*row) for row in data.pop("joints"))
+    return HandSpec(links=tuple(links), joints=joints, **data)
+
+
+_SOLIDS = {frozenset(kind.__dataclass_fields__): kind for kind in (CapsuleGeometry, BoxGeometry, SphereGeometry)}
+"""Class of a solid by the fields that it is given with."""
+
+
+def _tuples(value: Any) -> Any:
+    """Return data with tuples in place of lists."""
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def build(hand: HandSpec) -> Any:
@@ -200,7 +219,7 @@ def build(hand: HandSpec) -> Any:
         if not ready:
             raise UsageError(f"The links of hand {hand.name!r} form no tree: {waiting[0].parent!r} hangs on nothing.")
         for joint in ready:
-            body = bodies[joint.parent].add_body(name=joint.child, pos=joint.position, quat=quaternion(joint.rpy))
+            body = bodies[joint.parent].add_body(name=joint.child, pos=joint.position, quat=from_rpy(joint.rpy))
             body.add_joint(
                 name=joint.name, axis=joint.axis, range=joint.limits, limited=True, armature=joint.armature,
                 type=mujoco.mjtJoint.mjJNT_HINGE,

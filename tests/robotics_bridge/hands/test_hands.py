@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.rotations import from_rpy
 from robotics_bridge import hands
 from robotics_bridge.hands.hand import palmar_directions
 from robotics_bridge.hands.layouts import active_count, fillers, read_probes, write_probes
-from robotics_bridge.hands.spec import CapsuleGeometry, HandSpec, Joint, Link, build, quaternion
+from robotics_bridge.hands.spec import CapsuleGeometry, HandSpec, Joint, Link, build
 
 URDF = {
     "xhand1": "hands/xhand1/xhand_right_updated_effort.urdf",
@@ -211,7 +212,7 @@ def test_quaternions_agree_with_mujoco():
     for rpy in ((0.3, -0.7, 1.9), (np.pi, 0.0, np.pi / 2)):
         expected = np.zeros(4)
         mujoco.mju_euler2Quat(expected, np.array(rpy), "XYZ")
-        assert quaternion(rpy) == pytest.approx(expected)
+        assert from_rpy(rpy) == pytest.approx(expected)
 
 
 def test_unknown_names_and_unusable_files_are_explained(tmp_path):
