@@ -26,7 +26,7 @@ from robotics_bridge.sensors import (
 )
 from robotics_bridge.sensors.audio.materials import ElasticMaterial
 from robotics_bridge.sensors.calibration.calibrate import Log, calibrate
-from robotics_bridge.sensors.noise.model import simulate
+from robotics_bridge.sensors.noise.stages import simulate
 from robotics_bridge.sensors.temperature.materials import material
 
 STEEL = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)

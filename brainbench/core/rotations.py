@@ -34,7 +34,7 @@ def from_matrices(matrices: ArrayLike) -> NDArray[np.float64]:
 
 
 def from_rpy(angles: ArrayLike) -> NDArray[np.float64]:
-    """Return the unit quaternions [..., 4] of turns about the fixed x, y, z axes by angles [..., 3] (rad), as in URDF."""
+    """Return the unit quaternions [..., 4] of turns about fixed x, y, z by angles [..., 3] (rad), as in URDF."""
     from scipy.spatial.transform import Rotation
 
     a = np.asarray(angles, dtype=np.float64)
