@@ -41,6 +41,15 @@ def from_rpy(angles: ArrayLike) -> NDArray[np.float64]:
     return np.roll(Rotation.from_euler("xyz", a.reshape(-1, 3)).as_quat(), 1, axis=-1).reshape(*a.shape[:-1], 4)
 
 
+def from_z_axis(direction: ArrayLike) -> NDArray[np.float64]:
+    """Return the quaternion [4] of the shortest turn of the z axis to a unit vector [3]."""
+    x, y, z = np.asarray(direction, dtype=np.float64)
+    if z < -1 + 1e-12:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    q = np.array([1 + z, -y, x, 0.0])
+    return q / np.linalg.norm(q)
+
+
 def constant(values: float | Sequence[float], like: torch.Tensor, dtype: torch.dtype | None = None) -> torch.Tensor:
     """Return numbers as a tensor on the device of another: made once, so that later calls copy nothing to the device.
 

@@ -1,14 +1,17 @@
-"""What the engines share: units, the shape of a link, and when a simulation is doubtful."""
+"""The one rule of which simulated whiskers can be trusted, and the one way of simulating the others again."""
 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, Self, TypeVar
 
 import numpy as np
 
 from brainbench.core.errors import UsageError, listing
 from brainbench.stimuli.engines.reach import distances
+from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
@@ -24,30 +27,161 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-MILLI = 1e3
-"""Millimetres in a metre, milliseconds in a second, millinewtons in a newton."""
-MICRO = 1e6
-"""Milligrams in a kilogram, µN·m in a newton metre."""
-CONE_SIDES = 8
-"""Sides of the cone inside a tapered link."""
-LEAST_TAPER = 1e-6
-"""Difference of the radii of a link's ends (mm) below which it is a capsule."""
 LARGEST_BEND = 1.5
 """Angle between two links (rad) that no intact whisker reaches; beyond it a simulation counts as unstable."""
+LARGEST_RESIDUAL = 0.05
+"""Residual of the contact forces from which a result counts as unstable. Whiskers below it are within a few per cent of
+the converged solution (docs/stimuli.md)."""
+LARGEST_CROWDED_SHARE = 0.02
+"""Share of the steps with more contacts than are solved together from which a result counts as unstable."""
+
+OK, BENT, LOST = 0, 1, 2
+"""Ends of an integration: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunFacts:
+    """Facts of simulated whiskers on which :func:`judge` rests: arrays of one shape, times in s."""
+
+    status: NDArray[np.int32]
+    """:data:`OK`, :data:`BENT` or :data:`LOST`."""
+    failed: NDArray[np.floating]
+    """Time at which that happened."""
+    strength: NDArray[np.floating]
+    """First base force (N) beyond ``strongest``, at ``strong_at``; anything without."""
+    strong_at: NDArray[np.floating]
+    """Its time; inf when every base force is plausible."""
+    strongest: NDArray[np.floating]
+    """Base force (N) that the whisker bears (:func:`strongest_force`)."""
+    travel: NDArray[np.floating]
+    """Way (m) of an object against the whisker in the shortest step, at ``fast_at``; anything without."""
+    fast_at: NDArray[np.floating]
+    """First time at which an object moves further in the shortest step than contacts are looked for; inf if never."""
+    residual: NDArray[np.floating]
+    """As :func:`residual` gives it."""
+    crowded: NDArray[np.int32]
+    """Steps for some of whose contacts there was no room."""
+    steps: NDArray[np.int32]
+    """Steps computed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Reliability of simulated whiskers: arrays of one shape."""
+
+    until: NDArray[np.float64]
+    """Time (s) from which the numbers must not be used: inf for a reliable whisker, −inf where none may be used."""
+    retryable: NDArray[np.bool_]
+    """True where finer steps may give a result that can be trusted."""
+    reasons: NDArray[np.object_]
+    """What is wrong, in words; empty for a reliable whisker."""
+
+    @property
+    def unstable(self) -> NDArray[np.bool_]:
+        """True where not all numbers can be trusted."""
+        return self.until < np.inf
+
+
+def residual(miss: NDArray[np.floating], load: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return what the last iterations still changed in the contact forces, as a share of the forces (root mean square).
+
+    Args:
+        miss: sum over the steps of the squared change of the forces in the last iteration (mN²).
+        load: sum over the steps of the squared forces (mN²).
+    """
+    return np.sqrt(miss / np.maximum(load, 1e-30))
+
+
+def judge(facts: RunFacts) -> Verdict:
+    """Return which whiskers can be trusted; of several things wrong, what happens first is told.
+
+    Shorter steps mend chains that fold and contacts that are not solved; not a force that only stretching the whisker
+    could relieve, nor an object that is too fast for the search for contacts.
+    """
+    until = np.where(facts.status == OK, np.inf, facts.failed)
+    retryable = facts.status != OK
+    reasons = np.full(facts.status.shape, "", dtype=object)
+
+    def blame(which: NDArray[np.bool_], words: Callable[[tuple[int, ...]], str]) -> None:
+        for index in zip(*np.nonzero(which), strict=True):
+            reasons[index] = words(index)
+
+    ends = {
+        BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent",
+        LOST: "the state stopped being finite",
+    }
+    for status, words in ends.items():
+        text = f"{words}, at {{:.6g}} s; choose more links or a smaller time step"
+        blame(facts.status == status, lambda i, text=text: text.format(facts.failed[i]))
+    strong = facts.strong_at < until
+    until = np.where(strong, facts.strong_at, until)
+    blame(strong, lambda i: f"at {facts.strong_at[i]:.6g} s {too_strong(facts.strength[i], facts.strongest[i])}")
+    fast = facts.fast_at < until
+    until = np.where(fast, facts.fast_at, until)
+    blame(
+        fast,
+        lambda i: (
+            f"an object moves by {facts.travel[i] * MILLI:.3g} mm against the whisker in the shortest step at "
+            f"{facts.fast_at[i]:.6g} s, further than contacts are looked for; choose a smaller time step"
+        ),
+    )
+    unsolved = (until == np.inf) & ~(facts.residual <= LARGEST_RESIDUAL)
+    blame(
+        unsolved,
+        lambda i: f"contact forces missed by {facts.residual[i]:.0%} (root mean square); choose a smaller time step",
+    )
+    crowded = (until == np.inf) & ~unsolved & (facts.crowded > LARGEST_CROWDED_SHARE * facts.steps)
+    blame(
+        crowded,
+        lambda i: f"more contacts than can be solved together in {facts.crowded[i]} of {facts.steps[i]} steps",
+    )
+    return Verdict(np.where(unsolved | crowded, -np.inf, until), (retryable & ~fast) | unsolved | crowded, reasons)
+
+
+class Judged(Protocol):
+    """Results of a simulation whose whiskers were judged."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Reliability of each whisker."""
+        ...
+
+    def replaced(self, which: NDArray[np.bool_], finer: Self) -> Self:
+        """Return the results with these whiskers as another simulation of them gave them."""
+        ...
+
+
+Result = TypeVar("Result", bound=Judged)
+
+
+def run_with_retries(simulate: Callable[[NDArray[np.bool_] | None, int], Result], retry: int) -> Result:
+    """Simulate whiskers, and those that finer steps may mend again, at most twice.
+
+    Args:
+        simulate: called with which whiskers (all when None) and by what their steps are divided.
+        retry: divisor of the steps the second time; twice that is the divisor the third time. 1 leaves all as they are.
+    """
+    result = simulate(None, 1)
+    for finer in (retry, 2 * retry) if retry > 1 else ():
+        left = result.verdict.retryable
+        if not left.any():
+            break
+        result = result.replaced(left, simulate(left, finer))
+    return result
 
 
 def strongest_force(whisker: Whisker) -> float:
-    """Force (N) that would stretch the base of the whisker to twice its length: far beyond what keratin bears.
+    """Return the force (N) that would stretch a whisker's base to twice its length: far beyond what keratin bears.
 
     A chain cannot stretch, so a contact that can only be relieved along it has any force; it counts as unstable.
     """
     return whisker.young_modulus * np.pi * whisker.base_radius**2
 
 
-def too_strong(force: float, whisker: Whisker) -> str:
-    """Say in words that a base force (N) cannot be right."""
+def too_strong(force: float, strongest: float) -> str:
+    """Return in words that a base force (N) cannot be right, beyond the ``strongest`` (N) that the whisker bears."""
     return (
-        f"the base force reached {force:.3g} N, and {strongest_force(whisker):.3g} N stretch the whisker to twice its "
+        f"the base force reached {force:.3g} N, and {strongest:.3g} N stretch the whisker to twice its "
         "length: an overlap could not be resolved; choose a smaller time step or slower motion"
     )
 
@@ -55,7 +189,7 @@ def too_strong(force: float, whisker: Whisker) -> str:
 def step_travel(
     whisker: Whisker, position: NDArray, euler: NDArray, obstacle: Obstacle, times: NDArray
 ) -> NDArray[np.float64]:
-    """Farthest [n] (m) that a point of the unbent whisker can move against an obstacle in each step.
+    """Return how far [n] (m) a point of the unbent whisker can at most move against an obstacle in each step.
 
     Args:
         whisker: carried by its base at ``position`` [n + 1, 3] (m) with angles ``euler`` [n + 1, 3] (rad).
@@ -99,7 +233,7 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
 
 
 def _bounds(obstacle: Obstacle) -> NDArray[np.float64]:
-    """Lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
+    """Return the lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
     bodies = obstacle.parts if obstacle.surface is None else (obstacle.surface,)
     corners = np.stack([body.bounds() for body in bodies])
     return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
@@ -139,7 +273,7 @@ def require_parts(jobs: Sequence[Job], backend: str) -> None:
 
 
 def warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:
-    """Say when the time step alone damps a whisker at least twice as much as it should be damped."""
+    """Warn when the time step alone damps a whisker at least twice as much as it should be damped."""
     if fidelity.solver == "quasistatic":
         return
     worst, wanted = 0.0, 0.0

@@ -8,7 +8,20 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
-from brainbench.stimuli.engines.trust import passed_unseen, require_parts, step_travel, strongest_force
+from brainbench.stimuli.engines.trust import (
+    BENT,
+    LOST,
+    OK,
+    RunFacts,
+    Verdict,
+    judge,
+    passed_unseen,
+    require_parts,
+    residual,
+    run_with_retries,
+    step_travel,
+    strongest_force,
+)
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -68,3 +81,74 @@ def test_a_surface_without_parts_is_refused_in_words():
     bare = Obstacle((), surface=TETRAHEDRON)
     with pytest.raises(UsageError, match="a concave surface of 4 triangles"):
         require_parts([Job(WHISKER, StillFollicle(), (parts, bare), TIMES[1:])], "mujoco")
+
+
+def _facts(**changed):
+    """Facts of one whisker in good order but for what is changed."""
+    values = {
+        "status": OK, "failed": 0.0, "strength": 0.0, "strong_at": np.inf, "strongest": 30.0, "travel": 0.0,
+        "fast_at": np.inf, "residual": 0.01, "crowded": 0, "steps": 100,
+    }  # fmt: skip
+    return RunFacts(**{name: np.array([value]) for name, value in (values | changed).items()})
+
+
+@pytest.mark.parametrize(
+    ("changed", "until", "retryable", "words"),
+    [
+        ({}, np.inf, False, ""),
+        ({"crowded": 2}, np.inf, False, ""),
+        ({"status": BENT, "failed": 0.3}, 0.3, True, "a joint bent by more than 1.5 rad"),
+        ({"status": LOST, "failed": 0.3}, 0.3, True, "stopped being finite"),
+        ({"strength": 31.0, "strong_at": 0.2}, 0.2, False, "reached 31 N, and 30 N stretch"),
+        ({"strength": 31.0, "strong_at": 0.2, "status": BENT, "failed": 0.3}, 0.2, True, "stretch the whisker"),
+        ({"strength": 31.0, "strong_at": 0.4, "status": BENT, "failed": 0.3}, 0.3, True, "a joint bent"),
+        ({"travel": 9e-4, "fast_at": 0.1}, 0.1, False, "moves by 0.9 mm"),
+        ({"travel": 9e-4, "fast_at": 0.1, "status": BENT, "failed": 0.3}, 0.1, False, "moves by 0.9 mm"),
+        ({"residual": 0.06}, -np.inf, True, "missed by 6%"),
+        ({"residual": np.nan}, -np.inf, True, "contact forces missed"),
+        ({"crowded": 3}, -np.inf, True, "in 3 of 100 steps"),
+        ({"residual": 0.06, "strength": 31.0, "strong_at": 0.2}, 0.2, False, "stretch the whisker"),
+    ],
+)
+def test_what_goes_wrong_first_is_told_and_finer_steps_are_tried_where_they_may_mend_it(
+    changed, until, retryable, words
+):
+    verdict = judge(_facts(**changed))
+    assert verdict.until.tolist() == [until]
+    assert verdict.retryable.tolist() == [retryable]
+    assert verdict.unstable.tolist() == [until < np.inf]
+    assert words in verdict.reasons[0]
+    assert bool(verdict.reasons[0]) == verdict.unstable[0]
+
+
+def test_the_residual_is_what_changed_last_over_the_forces():
+    np.testing.assert_allclose(residual(np.array([0.04, 0.0]), np.array([4.0, 0.0])), [0.1, 0.0])
+
+
+class _Runs:
+    """Whiskers of which each is in order from some fineness of its steps on."""
+
+    def __init__(self, needs, finer=1):
+        self.needs, self.finer = np.array(needs), np.full(len(needs), finer)
+
+    @property
+    def verdict(self):
+        bad = self.finer < self.needs
+        return Verdict(np.where(bad, 0.0, np.inf), bad & (self.needs < 1000), np.where(bad, "bad", ""))
+
+    def replaced(self, which, finer):
+        self.finer[which] = finer.finer
+        return self
+
+
+@pytest.mark.parametrize(("retry", "finest"), [(1, [1, 1, 1, 1, 1]), (5, [1, 5, 10, 10, 1])])
+def test_whiskers_that_may_be_mended_are_simulated_again_at_most_twice(retry, finest):
+    needs, calls = np.array([1, 3, 10, 100, 1000]), []
+
+    def simulate(which, finer):
+        calls.append((None if which is None else which.tolist(), finer))
+        return _Runs(needs if which is None else needs[which], finer)
+
+    assert run_with_retries(simulate, retry).finer.tolist() == finest
+    again = [([False, True, True, True, False], 5), ([False, False, True, True, False], 10)]
+    assert calls == [(None, 1), *(again if retry > 1 else [])]

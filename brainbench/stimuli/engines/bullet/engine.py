@@ -37,13 +37,12 @@ from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotat
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
-    MICRO,
-    MILLI,
     check_jobs,
     passed_unseen,
     strongest_force,
     too_strong,
 )
+from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import rotation_matrix
 from brainbench.stimuli.whiskers.chain import build_chain
 
@@ -244,8 +243,8 @@ class _Run:
                 f"joint {int(bend.argmax()) // 2} bent by {bend.max():.2f} rad, more than a chain of links can "
                 "represent,"
             )
-        strength = float(np.abs(self.wrench[n, :3]).max())
-        return too_strong(strength, self.chain.whisker) if strength > strongest_force(self.chain.whisker) else ""
+        strength, strongest = float(np.abs(self.wrench[n, :3]).max()), strongest_force(self.chain.whisker)
+        return too_strong(strength, strongest) if strength > strongest else ""
 
     def _loads(self, n: int, q: list[float]) -> NDArray[np.float64]:
         """Joint forces [6 + 2N] of the loads of the job at step n."""

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import MissingDependencyError, UsageError, missing_dependency
-from brainbench.stimuli.engines.trust import CONE_SIDES, LEAST_TAPER, MICRO, MILLI
+from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
+from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere
 
 if TYPE_CHECKING:
@@ -210,11 +211,9 @@ class BulletWorld:
         if core == 0:
             return self._capsule(np.zeros(3), np.array([length, 0, 0]), self.chain.radii[link] * MILLI)
         radii = self.chain.whisker.radius(self.chain.nodes[link : link + 2])
-        angle = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
-        wide, apex = (0.0, length) if radii[0] > radii[1] else (length, 0.0)
-        ring = np.stack([np.full(CONE_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)
+        cone = cone_vertices(core, length, narrows=bool(radii[0] > radii[1]))
         return self.bullet.createCollisionShape(
-            self.bullet.GEOM_MESH, vertices=[*ring.tolist(), [apex, 0.0, 0.0]], physicsClientId=self.client
+            self.bullet.GEOM_MESH, vertices=cone.tolist(), physicsClientId=self.client
         )
 
     def _add_part(self, part: Part) -> int:

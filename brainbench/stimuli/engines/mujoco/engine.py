@@ -24,13 +24,12 @@ from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
-    MICRO,
-    MILLI,
     check_jobs,
     passed_unseen,
     strongest_force,
     too_strong,
 )
+from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
@@ -290,7 +289,7 @@ def _reason(job: Job, hinges: NDArray, force: NDArray, warned: list[str], moment
     if bend >= LARGEST_BEND:
         joint = int(np.abs(hinges).argmax()) // 2
         return f"joint {joint} bent by {bend:.2f} rad {where}, more than a chain of links can represent"
-    strength = float(np.abs(force).max()) / MILLI
-    if strength > strongest_force(job.whisker):
-        return f"{where} {too_strong(strength, job.whisker)}"
+    strength, strongest = float(np.abs(force).max()) / MILLI, strongest_force(job.whisker)
+    if strength > strongest:
+        return f"{where} {too_strong(strength, strongest)}"
     return f"MuJoCo warned of {', '.join(warned) or 'a non-finite sensor'} {where}"

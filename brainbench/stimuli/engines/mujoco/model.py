@@ -17,7 +17,9 @@ import numpy as np
 from brainbench.core.errors import MissingDependencyError
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE, PrescribedMotion, drive_free, drive_scalars
 from brainbench.stimuli.engines.protocol import base_rotation
-from brainbench.stimuli.engines.trust import CONE_SIDES, LEAST_TAPER, MICRO, MILLI, step_travel
+from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
+from brainbench.stimuli.engines.trust import step_travel
+from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Sphere, rotation_matrix
 
 if TYPE_CHECKING:
@@ -212,19 +214,13 @@ def _add_links(
 def _segment(
     chain: Chain, link: int, length: float, assets: Element, thickness: tuple[float, float]
 ) -> dict[str, object]:
-    """Collision geometry of one link: a capsule, or all points within a margin of a slim cone.
-
-    A staircase of capsules turns the force of a peg that sits on a step dr by up to √(2 dr/R). The cone has the
-    taper as its surface and the margin rounds it, so its facets are smaller than dr and do not matter.
-    """
+    """Return the collision geometry of one link: a capsule, or all points within a margin of a slim cone."""
     core, margin = thickness
     radii = chain.whisker.radius(chain.nodes[link : link + 2])
     if core == 0:
         return {"type": "capsule", "fromto": (0, 0, 0, length, 0, 0), "size": chain.radii[link] * MILLI}
-    angle = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
-    wide, apex = (0.0, length) if radii[0] > radii[1] else (length, 0.0)
-    ring = np.stack([np.full(CONE_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)
-    _add(assets, "mesh", name=f"link{link}", vertex=np.append(ring.ravel(), (apex, 0.0, 0.0)), inertia="shell")
+    cone = cone_vertices(core, length, narrows=bool(radii[0] > radii[1]))
+    _add(assets, "mesh", name=f"link{link}", vertex=cone.ravel(), inertia="shell")
     return {"type": "mesh", "mesh": f"link{link}", "margin": margin, "mass": 0}
 
 

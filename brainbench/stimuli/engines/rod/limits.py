@@ -1,5 +1,7 @@
 """Limits of the ``rod`` solver: what it looks at, how long it tries, and when it gives up. mm, ms, rad."""
 
+from brainbench.stimuli.engines.trust import BENT, LARGEST_BEND, LOST  # noqa: F401 — kernels take every limit from here
+
 CONTACTS = 8, 14
 """Contacts of one whisker that are solved together, of up to 12 links and of more; the tightest are kept when there are
 more. A finely divided whisker that lies on a round face touches it with link after link."""
@@ -11,18 +13,11 @@ CLOSED = 1e-3
 """Overlap (mm) at the end of a step from which a place counts as pressed upon."""
 SWEEPS = 8
 """Most Gauss-Seidel sweeps over the contacts of one step."""
-LARGEST_BEND = 1.5
-"""Bend of one joint (rad) beyond which a chain means nothing."""
 FOLD = 1.2
 """Bend (rad) beyond which a joint stiffens. The last links of a fine tip are so soft that the slightest force folds
 them double; what reaches the base through them is nothing."""
 STOP = 1e3
 """Stiffness beyond :data:`FOLD` over that of the joint."""
-DOUBTFUL = 0.05
-"""What the last iterations still changed in the contact forces (root mean square, of the forces themselves) from which
-a result counts as unstable. Whiskers below it are within a few per cent of the converged solution (docs/stimuli.md)."""
-CROWDED = 0.02
-"""Share of the steps with more contacts than there is room for from which a result counts as unstable."""
 LIGHT = 5e-3
 """Share of a whisker's mass that a quasi-static step keeps. It bounds the way of one step where there is no balance,
 as when a whisker slips off; what one step of 1 ms leaves of a slow mode is this share over (omega h)², below .5 %."""
@@ -65,11 +60,3 @@ NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 
 SPHERE, CAPSULE, CYLINDER, BOX, MESH = range(5)
 """Kinds of shapes: sizes are (radius, –, –), (radius, half length, –) twice, half edge lengths, and nothing."""
-
-OK, BENT, LOST = 0, 1, 2
-"""How a whisker ended: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
-
-
-def finer_steps(retry: int) -> tuple[int, ...]:
-    """Return by what the steps of whiskers that cannot be trusted are divided, one time after the other."""
-    return (retry, 2 * retry) if retry > 1 else ()

@@ -40,7 +40,6 @@ class Slices:
     def __init__(
         self,
         kernels: Any,
-        real: Any,
         capacity: int,
         lanes: int,
         device: Any,

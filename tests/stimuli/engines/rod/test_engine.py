@@ -148,7 +148,7 @@ def test_single_precision_loses_nothing_that_matters():
 
 def test_sweeps_through_the_fast_path_equal_their_scenes():
     from brainbench.stimuli import simulate
-    from brainbench.stimuli.engines.rod.sweeps import simulate_sweeps
+    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 
     objects = resolve_objects(["ellipsoid-1"], surfaces=True)
     grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
@@ -166,7 +166,7 @@ def test_sweeps_through_the_fast_path_equal_their_scenes():
 
 
 def test_sweeps_do_not_depend_on_which_share_a_launch():
-    from brainbench.stimuli.engines.rod.sweeps import simulate_sweeps
+    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 
     objects = resolve_objects(["ellipsoid-1", "brick-2"], surfaces=True)
     grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
@@ -177,7 +177,7 @@ def test_sweeps_do_not_depend_on_which_share_a_launch():
 
 
 def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_changes():
-    from brainbench.stimuli.engines.rod.sweeps import simulate_sweeps
+    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 
     objects = resolve_objects(["chair-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
@@ -220,14 +220,16 @@ def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine():
     launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
     chosen = [("brick-0", [scenes.grid.sweeps("brick-0")[74]])]
     once = launcher.launch(chosen)
-    five = launcher.launch(chosen, once.unstable, 5)
-    assert five.unstable.any()
-    assert not (five.unstable & ~once.unstable).any()
+    bad = once.verdict.unstable
+    five = launcher.launch(chosen, bad, 5)
+    left = five.verdict.unstable
+    assert left.any()
+    assert not (left & ~bad).any()
     result = launcher.trusted(chosen, 5)
     assert (result.unstable.any(), result.reasons, result.retried) == (False, ("",), 1)
-    ten = launcher.launch(chosen, five.unstable, 10)
-    whiskers = five.unstable[0]
-    np.testing.assert_array_equal(result.wrench[0][:, whiskers], ten.wrench.numpy()[0][:, whiskers])
+    ten = launcher.launch(chosen, left, 10)
+    whiskers = left[0]
+    np.testing.assert_array_equal(result.wrench[0][:, whiskers], ten.wrench[0][:, whiskers])
     # All that was computed is counted.
     assert result.steps == once.steps.sum() + five.steps.sum() + ten.steps.sum()
 
@@ -241,13 +243,54 @@ def test_a_whisker_that_cannot_be_trusted_says_why():
     found = set()
     for name, index in (("brick-0", 74), ("chair-0", 168)):
         result = launcher.launch([(name, [scenes.grid.sweeps(name)[index]])])
-        reason = launcher.batch(result).reasons[0]
-        first = int(np.argmax(result.unstable[0]))
-        assert reason.startswith(f"{scenes.array.names[first]}: {result.reason(0, first)}")
-        found |= {result.reason(0, k) for k in np.flatnonzero(result.unstable[0])}
-        bent = {k for k in range(result.status.shape[1]) if result.status[0, k] == 1}
-        assert bent == {k for k in range(result.status.shape[1]) if result.reason(0, k) == "a joint bent too far"}
+        status, unstable, reasons = result.counts["status"][0], result.verdict.unstable[0], result.verdict.reasons[0]
+        first = int(np.argmax(unstable))
+        told = f"{scenes.array.names[first]}: {reasons[first]}"
+        assert launcher.batch(result).reasons[0].startswith(told)
+        assert [bool(reason) for reason in reasons] == unstable.tolist()
+        assert ["a joint bent by" in reason for reason in reasons] == (status == 1).tolist()
+        found |= {reason.split(" ")[0] for reason in reasons[unstable]}
     assert len(found) > 1
+
+
+def _few_sweeps(**grid):
+    objects = resolve_objects(["ellipsoid-1"], surfaces=True)
+    grid = SweepGrid(**{"speed": (0.05,), "rotation": (0.0,), "distance": (0.005,), "size": (0.03,), **grid})
+    return SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2,D2")
+
+
+@pytest.mark.parametrize("path", ["sweeps", "scenes"])
+def test_an_object_too_fast_for_the_search_is_told_of_in_sweeps_as_in_scenes(path):
+    from brainbench.stimuli import simulate
+    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
+
+    scenes, fidelity = _few_sweeps(speed=(0.05, 3.0)), Fidelity(links=10, time_step=5e-3)
+    if path == "sweeps":
+        batch = simulate_sweeps(scenes, [0, 1], fidelity=fidelity, retry=5)
+        unstable, reasons = batch.unstable.any(axis=1), batch.reasons
+    else:
+        dataset = simulate([scenes[0], scenes[1]], fidelity=fidelity, cache=False)
+        unstable = (dataset["status"].values != "ok").any(axis=1)
+        reasons = ["".join(words) for words in dataset["reason"].values]
+    assert unstable.tolist() == [False, True]
+    assert "moves by 0.938 mm" in reasons[1]
+    assert not reasons[0]
+
+
+def test_a_force_that_no_whisker_bears_is_flagged_in_sweeps_and_not_tried_again():
+    from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
+
+    scenes = _few_sweeps()
+    launcher = SweepLauncher(scenes, COARSE)
+    (name,) = scenes.objects
+    sound = launcher.trusted([(name, scenes.grid.sweeps(name))], 5)
+    assert not sound.unstable.any()
+    peaks = np.linalg.norm(sound.wrench[0, ..., :3], axis=-1).max(axis=0)
+    launcher.solver.strongest[:] = 0.5 * peaks.max()
+    found = launcher.trusted([(name, scenes.grid.sweeps(name))], 5)
+    assert found.unstable.tolist() == [(peaks > 0.5 * peaks.max()).tolist()]
+    assert "stretch the whisker" in found.reasons[0]
+    assert found.retried == 0
 
 
 def test_an_unknown_device_is_refused_in_words():
@@ -270,15 +313,15 @@ def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same(budget):
     results = []
     for sliced in (False, True):
         launcher = SweepLauncher(scenes, COARSE, sliced=sliced)
-        launcher.tuning = {"budget": budget}
+        launcher.solver.tuning = {"budget": budget}
         results.append(launcher.launch([(name, grid.sweeps(name)) for name in scenes.objects]))
-        assert (launcher.slices > 1) == sliced
+        assert (launcher.solver.slices > 1) == sliced
     whole, parts = results
-    assert whole.touching.sum() > 100
-    for name in ("wrench", "contact"):
-        np.testing.assert_array_equal(getattr(whole, name).numpy(), getattr(parts, name).numpy())
-    for name in ("steps", "touching", "unsolved", "crowded", "depth", "doubt", "status"):
+    assert whole.counts["touching"].sum() > 100
+    for name in ("wrench", "contact", "depth", "residual"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
+    for name, values in whole.counts.items():
+        np.testing.assert_array_equal(values, parts.counts[name])
 
 
 @pytest.mark.parametrize("step", [2e-4, 2e-3])
@@ -314,7 +357,7 @@ def test_a_weight_bends_a_whisker_without_inertia_as_it_does_with():
 
 
 def test_sweeps_through_the_fast_path_may_leave_inertia_out():
-    from brainbench.stimuli.engines.rod.sweeps import simulate_sweeps
+    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 
     objects = resolve_objects(["ellipsoid-1"], surfaces=True)
     grid = SweepGrid(speed=(0.03,), rotation=(0.0,), distance=(0.005,), size=(0.03,))

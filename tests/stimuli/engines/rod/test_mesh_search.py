@@ -8,7 +8,7 @@ import pytest
 from brainbench.core.devices import to_struct
 from brainbench.stimuli.engines.rod.kernels import specialize
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, spatial_order, tree_boxes
-from brainbench.stimuli.engines.rod.packing import Shapes, Surface
+from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.objects.obstacle import TriangleMesh
 from tests.factories.rod_threads import WARP, Memory, thread_warp
 
@@ -82,9 +82,9 @@ def _ask(surface, starts, stops, radius, within, leaf):
 
 
 def _shapes(surface):
-    shapes = Shapes()
+    shapes = PackedShapes()
     one, still = np.ones(1), np.array([[1.0, 0, 0, 0]])
-    prepared = Surface.of(surface.vertices, surface.faces)
+    prepared = PackedSurface.of(surface.vertices, surface.faces)
     shapes.add_placed(prepared, track=np.zeros(1), turn=still, scale=one, radius=one, speed=np.zeros(1))
     return shapes.arrays()
 

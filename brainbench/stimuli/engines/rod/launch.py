@@ -1,0 +1,251 @@
+"""One launch of the whisker kernel, for scenes and for sweeps: packed jobs go in, judged results come out."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.devices import to_struct, warp
+from brainbench.stimuli.engines.rod.compilation import load_kernels
+from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
+from brainbench.stimuli.engines.rod.packing import PackedChains, capacity_for
+from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
+from brainbench.stimuli.engines.trust import RunFacts, Verdict, judge, residual, strongest_force
+from brainbench.stimuli.engines.units import MILLI
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions
+    from brainbench.stimuli.engines.rod.shapes import PackedShapes
+    from brainbench.stimuli.whiskers.chain import Chain
+
+_NUMBERS = ("depth", "failed", "miss", "load")
+_COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
+"""Results of each job besides its readings."""
+
+
+@dataclass(eq=False)
+class LaunchResult:
+    """Results of a launch, in a table of jobs: rows are the jobs of scenes, or sweeps; columns are whiskers, or one."""
+
+    wrench: NDArray[np.floating]
+    """[row, reading, column, 6] action of the whisker on its base (N, N·m)."""
+    contact: NDArray[np.floating]
+    """[row, reading, column] arc of the contact (m), negative without."""
+    counts: dict[str, NDArray[np.int32]]
+    """[row, column] of each: ``status``, ``steps`` computed, steps ``touching`` anything, steps for some of whose
+    contacts there was no room (``crowded``), and steps whose contact forces did not converge (``unsolved``)."""
+    depth: NDArray[np.floating]
+    """[row, column] deepest overlap (m)."""
+    residual: NDArray[np.floating]
+    """[row, column] as :func:`brainbench.stimuli.engines.trust.residual`."""
+    verdict: Verdict
+    """[row, column]"""
+    retried: NDArray[np.bool_]
+    """[row, column] True where a whisker was simulated again."""
+    points: NDArray[np.floating] | None = None
+    """[row, reading, node, 3] joints and tip (m), when shapes were asked for."""
+    contact_wrench: NDArray[np.floating] | None = None
+    """[row, reading, 6] force and moment of all contacts (N, N·m), when shapes were asked for."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Elapsed time of ``upload`` and ``kernel``."""
+
+    @property
+    def steps(self) -> NDArray[np.int32]:
+        """[row, column] steps computed, in all simulations of the whisker."""
+        return self.counts["steps"]
+
+    def replaced(self, which: NDArray[np.bool_], finer: LaunchResult) -> LaunchResult:
+        """Return these results with those of some jobs [row, column] from another launch, of their rows alone."""
+        rows = np.flatnonzero(which.any(axis=1))
+        some = which[rows]
+
+        def take(mine: NDArray, theirs: NDArray, mask: NDArray[np.bool_] = some) -> None:
+            mine[rows] = np.where(mask, theirs, mine[rows])
+
+        take(self.wrench, finer.wrench, some[:, None, :, None])
+        take(self.contact, finer.contact, some[:, None])
+        finer.counts["steps"] += self.steps[rows]
+        for mine, theirs in ((self.counts, finer.counts), (vars(self.verdict), vars(finer.verdict))):
+            for name in mine:
+                take(mine[name], theirs[name])
+        take(self.depth, finer.depth)
+        take(self.residual, finer.residual)
+        if self.points is not None and self.contact_wrench is not None:
+            self.points[rows], self.contact_wrench[rows] = finer.points, finer.contact_wrench
+        self.retried |= which
+        return self
+
+
+class WhiskerSolver:
+    """Some whiskers on a device with the kernels for them, ready for any number of launches."""
+
+    def __init__(
+        self,
+        chains: Sequence[Chain],
+        fidelity: Fidelity,
+        device: Any,
+        needs: int,
+        *,
+        block: int | None = None,
+        sliced: bool = False,
+        **options: Any,
+    ) -> None:
+        """Load kernels.
+
+        Args:
+            chains: of the whiskers.
+            fidelity: time step, precision and solver.
+            device: a Warp device.
+            needs: what there is to touch; see :mod:`brainbench.stimuli.engines.rod.limits`.
+            block: threads of a block on a GPU; Warp's choice when None.
+            sliced: whether whiskers pause for looks at meshes and for contact forces (:class:`.scheduling.Slices`).
+            options: further ones of :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
+        """
+        self.chains, self.device, self.sliced = list(chains), device, sliced
+        self.real = real_type(fidelity)
+        self.capacity = capacity_for(max(chain.links for chain in chains))
+        self.quasistatic = fidelity.solver == "quasistatic"
+        if options:
+            options["sliced"] = sliced
+        self.kernels = load_kernels(device, self.real, self.capacity, needs, **options)
+        packed = PackedChains(self.capacity, self.chains, self.quasistatic)
+        self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed.arrays(), device)
+        self.block = {} if block is None else {"block_dim": block}
+        self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in self.chains])
+        """[whisker] longest time step (ms)."""
+        self.shortest = self.steps / FINEST / MILLI
+        """[whisker] shortest time step (s)."""
+        self.strongest = np.array([strongest_force(chain.whisker) for chain in self.chains])
+        self.tuning: dict[str, Any] = {}
+        """Arguments of :class:`Slices`."""
+        self.slices = 0
+        """Slices of the last launch."""
+
+    def launch(
+        self,
+        jobs: PackedJobs,
+        motions: PackedMotions,
+        shapes: PackedShapes,
+        readings: NDArray[np.float64],
+        size: tuple[int, int],
+        *,
+        start: float = 0.0,
+        gravity: Sequence[float] = (0.0, 0.0, 0.0),
+        axes: NDArray[np.float64] | None = None,
+        finer: int = 1,
+        travel: NDArray[np.float64] | None = None,
+        fast_at: NDArray[np.float64] | None = None,
+        record_shape: bool = False,
+    ) -> LaunchResult:
+        """Simulate jobs.
+
+        Args:
+            jobs: what to simulate.
+            motions: of bases and objects.
+            shapes: of all scenes.
+            readings: times (s) at which results are read.
+            size: rows and columns of the results; jobs that stand in none of them are as if at rest.
+            start: beginning of the simulation (s).
+            gravity: acceleration [3] (m/s²).
+            axes: rotation [3, 3] of the results; none when None.
+            finer: divides the time steps.
+            travel, fast_at: [row, column] as in :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
+            record_shape: also return shapes and contact wrenches; jobs then stand in their rows in order.
+        """
+        wp, structs, device, real = warp(), self.kernels.structs, self.device, self.real
+        clock = [time.perf_counter()]
+        count, frames = len(jobs), len(readings)
+        out = allocate(
+            structs.ResultArrays,
+            device,
+            wrench=(size[0], frames, size[1], 6),
+            points=(frames, self.capacity + 1, count) if record_shape else (1, 1, 1),
+            contact_wrench=(frames, 2, count) if record_shape else (1, 1, 1),
+            **dict.fromkeys((*_NUMBERS, *_COUNTS), count),
+        )
+        out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=real, device=device)
+        options = structs.StepOptions()
+        options.start = start * MILLI
+        options.quasistatic = int(self.quasistatic)
+        weight = LIGHT if self.quasistatic else 1.0
+        options.gravity = structs.vec3(*np.divide(gravity, MILLI * weight).tolist())
+        options.axes = structs.mat33(*(np.eye(3) if axes is None else axes).ravel().tolist())
+        options.shape = int(record_shape)
+        inputs = [
+            self.chain_arrays,
+            to_struct(structs.MotionArrays, motions.arrays(), device),
+            to_struct(structs.ShapeArrays, shapes.arrays(), device),
+            to_struct(structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker] / finer), device),
+            options,
+            wp.array(readings * MILLI, dtype=real, device=device),
+            out,
+            make_problems(self.kernels, self.capacity, count, device),
+        ]
+        wp.synchronize_device(device)
+        clock.append(time.perf_counter())
+        if self.sliced:
+            slices = Slices(self.kernels, self.capacity, count, device, **self.tuning)
+            self.slices = slices.run(inputs, self.block["block_dim"])
+        else:
+            wp.launch(self.kernels.run, count, [*inputs, structs.PausedWhiskers()], device=device, **self.block)
+        wp.synchronize_device(device)
+        clock.append(time.perf_counter())
+
+        def table(values: NDArray) -> NDArray:
+            whole = np.zeros(size, dtype=values.dtype)
+            whole[jobs.row, jobs.column] = values
+            return whole
+
+        counts = {name: table(getattr(out, name).numpy()) for name in _COUNTS}
+        numbers = {name: getattr(out, name).numpy() for name in _NUMBERS}
+        wrench, missed = out.wrench.numpy(), table(residual(numbers["miss"], numbers["load"]))
+        facts = RunFacts(
+            counts["status"],
+            table(numbers["failed"].astype(float)) / MILLI,
+            *_strong(wrench, table(self.strongest[jobs.whisker]), readings),
+            travel=np.zeros(size) if travel is None else travel,
+            fast_at=np.full(size, np.inf) if fast_at is None else fast_at,
+            residual=missed,
+            crowded=counts["crowded"],
+            steps=counts["steps"],
+        )
+        result = LaunchResult(
+            wrench,
+            out.contact.numpy(),
+            counts,
+            table(numbers["depth"].astype(float)) / MILLI,
+            missed,
+            judge(facts),
+            np.zeros(size, dtype=bool),
+            seconds=dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True)),
+        )
+        if record_shape:
+            result.points = np.moveaxis(out.points.numpy().astype(float) / MILLI, 2, 0)
+            forces = out.contact_wrench.numpy().astype(float)
+            result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(count, frames, 6)
+        return result
+
+
+def real_type(fidelity: Fidelity) -> type:
+    """Return Warp's type of the numbers that a simulation calculates with."""
+    return warp().float32 if fidelity.precision == "single" else warp().float64
+
+
+def _strong(
+    wrench: NDArray[np.floating], strongest: NDArray[np.float64], readings: NDArray[np.float64]
+) -> tuple[NDArray[np.floating], NDArray[np.float64], NDArray[np.float64]]:
+    """Return ``strength``, ``strong_at`` and ``strongest`` of :class:`RunFacts`, [row, column]."""
+    force = wrench[..., :3]
+    strength = np.sqrt(np.einsum("...d,...d", force, force))
+    wild = ~(strength <= strongest[:, None])
+    first = wild.argmax(axis=1)
+    at = np.where(wild.any(axis=1), readings[first], np.inf)
+    return np.take_along_axis(strength, first[:, None], axis=1)[:, 0], at, strongest
