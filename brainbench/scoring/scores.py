@@ -100,7 +100,7 @@ def score_record(
     compared = {network.card.name: network.features(rows)}
     if baselines:
         compared |= network.baseline_features(rows, options.seed)
-    common = {"stimuli": kept, "estimator": options.estimator}
+    common: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator}
     scores = [
         metric.score(features, animals, name=name, seed=options.seed, **common) for name, features in compared.items()
     ]
