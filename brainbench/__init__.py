@@ -15,6 +15,7 @@ __all__ = [
     "BrainbenchError",
     "ResultRecord",
     "Score",
+    "ScoreOptions",
     "__version__",
     "extract",
     "list_models",
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from brainbench.datasets import open_recordings
     from brainbench.models.activations import extract
     from brainbench.models.registry import list_models, load_model, register_model
+    from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.scores import score
 
 
@@ -39,6 +41,7 @@ __getattr__, __dir__ = lazy_exports(
         "BrainbenchError": "brainbench.core.errors",
         "ResultRecord": "brainbench.core.records",
         "Score": "brainbench.core.records",
+        "ScoreOptions": "brainbench.scoring",
         "extract": "brainbench.models.activations",
         "list_models": "brainbench.models.registry",
         "load_model": "brainbench.models.registry",

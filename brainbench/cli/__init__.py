@@ -16,7 +16,6 @@ import typer
 from brainbench import __version__
 from brainbench.cli import (
     doctor,
-    export,
     leaderboard,
     models,
     policy,
@@ -41,7 +40,7 @@ app = typer.Typer(
 app.command("score")(score.score)
 app.command("power")(power.power)
 app.command("train")(train.train)
-app.command("export")(export.export)
+app.command("export")(models.export)
 app.command("doctor")(doctor.doctor)
 app.add_typer(models.app, name="models")
 app.add_typer(recordings.app, name="recordings")

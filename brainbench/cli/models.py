@@ -1,12 +1,13 @@
-"""``brainbench models``: what can be scored by name."""
+"""``brainbench models`` and ``brainbench export``: what can be scored by name, and a model as a file."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, facts, table_of
 from brainbench.core.files import to_plain
 
 app = typer.Typer(no_args_is_help=True, help="List and describe the registered models.")
@@ -30,13 +31,15 @@ def list_(
         item.name: [str(Architecture.parse(recipe).tag) for recipe in list_recipes(f"{item.name}.*")]
         for item in records
     }
-    rows = [
-        [item.name, f"{item.parameters:,}", _millions(item.multiply_adds), item.family, ", ".join(tags[item.name])]
-        for item in records
-    ]
-    columns = ["model", "parameters", "multiply-adds/step", "family", "published with"]
+    columns = {
+        "model": "{0.name}",
+        ">parameters": "{0.parameters:,}",
+        ">multiply-adds/step": lambda item: _millions(item.multiply_adds),
+        "family": "{0.family}",
+        "published with": lambda item: ", ".join(tags[item.name]),
+    }
     data = [{**to_plain(item), "recipes": tags[item.name]} for item in records]
-    emit(data, table("", columns, rows, right=(1, 2)), as_json=as_json)
+    emit(data, table_of("", records, columns), as_json=as_json)
 
 
 @app.command("recipes")
@@ -49,20 +52,16 @@ def recipes(
 
     found = [find_recipe(name) for name in list_recipes(pattern)]
     sizes = {name: describe_model(name) for name in {item.architecture for item in found}}
-    rows = [
-        [
-            item.name,
-            f"{sizes[item.architecture].parameters:,}",
-            _millions(sizes[item.architecture].multiply_adds),
-            str(item.setting),
-            str(item.batch_size),
-            str(len(item.search)),
-        ]
-        for item in found
-    ]
-    columns = ["recipe", "parameters", "multiply-adds/step", "default setting", "batch", "settings in the search"]
+    columns = {
+        "recipe": "{0.name}",
+        ">parameters": lambda item: f"{sizes[item.architecture].parameters:,}",
+        ">multiply-adds/step": lambda item: _millions(sizes[item.architecture].multiply_adds),
+        "default setting": "{0.setting}",
+        ">batch": "{0.batch_size}",
+        ">settings in the search": lambda item: len(item.search),
+    }
     data = [{"name": item.name, **to_plain(item)} for item in found]
-    emit(data, table("", columns, rows, right=(1, 2, 4, 5)), as_json=as_json)
+    emit(data, table_of("", found, columns), as_json=as_json)
 
 
 @app.command("show")
@@ -82,8 +81,30 @@ def show(
         data["recipe"] = to_plain(recipe)
         if not as_json:
             data["recipe"] |= {"setting": str(recipe.setting), "search": [f"({item})" for item in recipe.search]}
-    rows = [[key.replace("_", " "), _text(value)] for key, value in data.items() if value is not None]
-    emit(data, table("", ["", ""], rows), as_json=as_json)
+    shown = {key.replace("_", " "): _text(value) for key, value in data.items() if value is not None}
+    emit(data, facts(shown), as_json=as_json)
+
+
+def export(
+    model: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
+    format: Annotated[str, typer.Option(help="onnx, or torch (an exported program).")] = "onnx",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Export one step, obs and h_in to features and h_out, with its contract, and check the written file."""
+    from brainbench.models.export import SUFFIXES, export_model
+    from brainbench.models.registry import load_model
+    from brainbench.models.training.checkpoints import PREFIXES, find_folder
+
+    loaded = load_model(model, seed=seed)
+    name = find_folder(model).resolve().name if model.startswith(PREFIXES) else model
+    made = export_model(loaded, out or Path(f"{name}{SUFFIXES.get(format, '')}"), format=format, name=model)
+    text = (
+        f"{model}: {made.features} features, {made.state_size:,} numbers of state; the file agrees with the network "
+        f"to {made.difference:.1e}\n\nfile      {made.path}\ncontract  {made.contract}"
+    )
+    emit(made, text, as_json=as_json)
 
 
 def _millions(value: int | None) -> str:

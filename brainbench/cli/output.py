@@ -1,10 +1,10 @@
-"""What the commands share: the ``--json`` option, printing, and progress that vanishes off a terminal."""
+"""Output of every command: the ``--json`` option, tables, and progress that vanishes off a terminal."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -14,17 +14,32 @@ from brainbench.core.progress import Progress
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
 
-SelectOption = Annotated[
-    str | None, typer.Option(help="Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name.")
-]
-WindowOption = Annotated[
-    str | None, typer.Option(help="Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'.")
-]
-
 
 def emit(data: Any, text: str, *, as_json: bool) -> None:
     """Print ``data`` as JSON, or ``text`` for people, on stdout."""
     print(to_json(data) if as_json else text)
+
+
+def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:
+    """Lay out one row per item.
+
+    Args:
+        title: Line above the table; none if empty.
+        items: What is shown.
+        columns: Heading → format of an item (``"{0.error:.2%}"``, ``"{0[cost]:.3g}"``) or function of it. A heading
+            that begins with ``>`` is set flush right.
+    """
+    rows = [
+        [cell.format(item) if isinstance(cell, str) else str(cell(item)) for cell in columns.values()] for item in items
+    ]
+    right = tuple(index for index, heading in enumerate(columns) if heading.startswith(">"))
+    return table(title, [heading.removeprefix(">") for heading in columns], rows, right=right)
+
+
+def facts(values: Mapping[str, object], title: str = "") -> str:
+    """Lay out names and values; a list is joined by commas."""
+    rows = [[name, ", ".join(map(str, one)) if isinstance(one, list) else str(one)] for name, one in values.items()]
+    return table(title, ["", ""], rows)
 
 
 def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple[int, ...] = ()) -> str:

@@ -7,13 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brainbench.cli.output import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
+from brainbench.cli.options import SCORE, option
+from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from brainbench.metrics import SubjectRDM
+
+SelectOption = Annotated[str | None, option(SCORE, "select")]
+WindowOption = Annotated[str | None, option(SCORE, "window")]
+ConditionsOption = Annotated[str | None, option(SCORE, "conditions")]
 
 _LARGEST_SHOWN = 12
 """RDMs of more conditions are only written as JSON."""
@@ -36,9 +41,7 @@ def inspect(
 @app.command("rdm")
 def rdm(
     source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, or a glob.")],
-    conditions: Annotated[
-        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] that labels the trials; see 'recordings inspect'.")
-    ] = None,
+    conditions: ConditionsOption = None,
     select: SelectOption = None,
     window: WindowOption = None,
     pool: Annotated[str, typer.Option(help="One RDM per 'subject', per 'session', or of 'all' together.")] = "subject",
@@ -56,29 +59,22 @@ def rdm(
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, time="mean", seed=seed)
+    told = ("subject", "units", "trials", "reliability", "problem", "rdm")
     data = {
         "labels": labels,
         "recordings": brain.origin,
-        "animals": [
-            {
-                "subject": item.subject,
-                "units": item.units,
-                "trials": item.trials,
-                "reliability": item.reliability,
-                "problem": item.problem,
-                "rdm": item.rdm,
-            }
-            for item in animals
-        ],
+        "animals": [{name: getattr(item, name) for name in told} for item in animals],
     }
-    rows = [
-        [item.subject, str(item.units), str(item.trials), f"{item.reliability:.3f}", _verdict(item)] for item in animals
-    ]
-    text = table(
+    text = table_of(
         f"{brain.dataset.attrs['conditions']}, {brain.dataset.attrs['window']}; RDM: correlation distance",
-        ["animal", "units", "trials", "reliability", ""],
-        rows,
-        right=(1, 2, 3),
+        animals,
+        {
+            "animal": "{0.subject}",
+            ">units": "{0.units}",
+            ">trials": "{0.trials}",
+            ">reliability": "{0.reliability:.3f}",
+            "": _verdict,
+        },
     )
     if len(labels) <= _LARGEST_SHOWN:
         for item in animals:
@@ -103,13 +99,8 @@ def check(
     from brainbench.datasets import check as check_files
 
     checkup = check_files(_found(source), conditions=conditions)
-    data = {
-        "verdict": checkup.verdict,
-        "source": checkup.source,
-        "sessions": checkup.sessions,
-        "findings": checkup.findings,
-    }
-    emit(data, str(checkup), as_json=as_json)
+    told = ("verdict", "source", "sessions", "findings")
+    emit({name: getattr(checkup, name) for name in told}, str(checkup), as_json=as_json)
     if checkup.count("error") or (strict and checkup.count("warning")):
         raise typer.Exit(1)
 
@@ -125,8 +116,8 @@ def export(
     from brainbench.datasets import export as export_files
 
     files = export_files(_found(source), target, select=select)
-    rows = [[str(path), f"{path.stat().st_size / 1e6:.2f} MB"] for path in files]
-    emit({"files": files}, table("", ["file", ""], rows, right=(1,)), as_json=as_json)
+    columns = {"file": "{0}", ">": lambda path: f"{path.stat().st_size / 1e6:.2f} MB"}
+    emit({"files": files}, table_of("", files, columns), as_json=as_json)
 
 
 @app.command("fetch")

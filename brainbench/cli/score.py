@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, SelectOption, WindowOption, emit, progress_bar, table
+from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
+from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 
 if TYPE_CHECKING:
-    from brainbench.core.records import ResultRecord, Score
+    from collections.abc import Mapping
 
+    from brainbench.core.records import ResultRecord, Score
+    from brainbench.scoring import ScoreOptions
 
 _RELIABILITY = {
     True: "split halves, Spearman-Brown, mean over animals",
@@ -28,6 +31,7 @@ def _complete_model(incomplete: str) -> list[str]:
     return [name for name in list_models() if name.startswith(incomplete)]
 
 
+@with_options(SCORE, flags=SCORE_FLAGS)
 def score(
     model: Annotated[
         str,
@@ -36,51 +40,7 @@ def score(
             autocompletion=_complete_model,
         ),
     ],
-    recordings: Annotated[
-        str, typer.Option("--recordings", "-r", help="'demo' (synthetic), an NWB or HDF5 file, a folder, or a glob.")
-    ] = "demo",
-    stimuli: Annotated[
-        str, typer.Option("--stimuli", "-s", help="A recipe, a scene file, a stimulus-set file, or an HDF5 array.")
-    ] = "rodgers",
-    conditions: Annotated[
-        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] of the recordings that labels the trials.")
-    ] = None,
-    match: Annotated[
-        Path | None, typer.Option(help="JSON, TOML or CSV file: recording label → stimulus label.")
-    ] = None,
-    select: SelectOption = None,
-    window: WindowOption = None,
-    whiskers: Annotated[str, typer.Option(help="Whiskers to simulate: all, C0-C3, C2,D1, …")] = "all",
-    fidelity: Annotated[
-        str, typer.Option(help="Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs).")
-    ] = "balanced",
-    layers: Annotated[str | None, typer.Option(help="Comma-separated layers to compare; all by default.")] = None,
-    time: Annotated[
-        str, typer.Option(help="Time axis of both sides: 'mean' averages over it, 'concatenate' keeps every step.")
-    ] = "mean",
-    bin: Annotated[float | None, typer.Option(help="Bin width of the spike counts in seconds.")] = None,
-    estimator: Annotated[str, typer.Option(help="default, thesis or thesis-input (as published).")] = "default",
-    metric: Annotated[
-        str,
-        typer.Option(
-            help="rsa, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, or FILE.py:CLASS of your own."
-        ),
-    ] = "rsa",
-    normalize: Annotated[
-        bool, typer.Option(help="Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI.")
-    ] = True,
-    seed: Annotated[int, typer.Option(help="Seed of untrained weights and of split halves.")] = 0,
-    weights_seed: Annotated[
-        int | None, typer.Option(help="Seed of untrained weights alone; --seed then keeps that of the statistics.")
-    ] = None,
-    explain_estimator: Annotated[
-        bool,
-        typer.Option(
-            "--explain-estimator",
-            help="Also walk from the published estimator to the default one, fault by fault; MODEL may then be an .npz "
-            "of stored splits (arrays r_xy, r_yy and r_xx).",
-        ),
-    ] = False,
+    options: Any,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the record and the report.")] = Path(
         "brainbench-results"
     ),
@@ -91,36 +51,19 @@ def score(
     as_json: JsonOption = False,
 ) -> None:
     """Score a model against neural recordings and write a result record and an HTML report."""
+    from brainbench.core.files import to_plain
+    from brainbench.metrics.explain import explain_file
     from brainbench.scoring.scores import score_record
     from leaderboards.report.score_report import write_report
     from leaderboards.store import write_record
 
-    if explain_estimator and Path(model).suffix == ".npz":
-        _explain_splits(Path(model), as_json=as_json)
+    chosen: ScoreOptions = options
+    if chosen.explain and Path(model).suffix == ".npz":
+        steps = to_plain(explain_file(model))
+        emit({"estimator_walk": steps}, _walk(steps), as_json=as_json)
         return
     with progress_bar() as progress:
-        record = score_record(
-            model,
-            recordings=recordings,
-            stimuli=stimuli,
-            conditions=conditions,
-            match=match,
-            select=select,
-            window=window,
-            whiskers=whiskers,
-            fidelity=fidelity,
-            layers=tuple(name.strip() for name in layers.split(",")) if layers else None,
-            time=time,  # pyright: ignore[reportArgumentType]  # checked there, with the allowed values
-            bin=bin,
-            estimator=estimator,
-            metric=metric,
-            normalize=normalize,
-            seed=seed,
-            weights_seed=weights_seed,
-            explain=explain_estimator,
-            command=_command(),
-            progress=progress,
-        )
+        record = score_record(model, chosen, command=_command(), progress=progress)
     path = write_record(record, out)
     report = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
@@ -133,46 +76,8 @@ def score(
     emit(data, text, as_json=as_json)
 
 
-def _alike(record: ResultRecord, animals: Score) -> str:
-    """Test the score against the animals' own consistency (NeuroAI Turing test)."""
-    from brainbench.metrics import turing_test
-
-    return turing_test(record.score, animals).summary()
-
-
-def _explain_splits(path: Path, *, as_json: bool) -> None:
-    """Print the walk through stored split halves."""
-    import numpy as np
-
-    from brainbench.core.errors import DataError, DataFileNotFoundError
-    from brainbench.core.files import to_plain
-    from brainbench.metrics.explain import explain_splits
-
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {path}.")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} is no .npz file of plain arrays ({error}).") from error
-    if missing := {"r_xy", "r_yy"} - arrays.keys():
-        raise DataError(f"{path} lacks the array {sorted(missing)[0]!r}; it has {sorted(arrays)}.")
-    steps = [to_plain(step) for step in explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))]
-    emit({"estimator_walk": steps}, _walk(steps), as_json=as_json)
-
-
-def _walk(steps: list[dict[str, Any]]) -> str:
-    """Lay out the walk from the published estimator to the default one."""
-    rows = [
-        ["–" if step["value"] is None else f"{step['value']:.3f}", step["change"], step["status"], step["detail"]]
-        for step in steps
-    ]
-    title = "From the published estimator to the default, one fault at a time"
-    return f"{title}\n{table('', ['value', 'step', 'status', ''], rows, right=(0,))}"
-
-
 def _command() -> str:
-    """The command as typed, without what only says where and how to print."""
+    """Return the command as typed, without what only says where and how to print."""
     words = iter(sys.argv[1:])
     kept = []
     for word in words:
@@ -184,77 +89,80 @@ def _command() -> str:
 
 
 def _text(record: ResultRecord) -> str:
-    score = record.score
-    source = score.provenance["recordings"]["source"]
-    known = score.subjects or (record.animal_to_animal.subjects if record.animal_to_animal else ())
-    lines = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(known)} animals  ·  {source}"]
+    from brainbench.metrics import turing_test
+
+    score, animals = record.score, record.animal_to_animal
+    known = score.subjects or (animals.subjects if animals else ())
+    source = score.provenance.recordings["source"]
+    parts = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(known)} animals  ·  {source}"]
     if record.synthetic:
-        lines.append("Synthetic recordings: ranks on them say nothing about brains.")
+        parts[0] += "\nSynthetic recordings: ranks on them say nothing about brains."
     rsa = score.metric.startswith("RSA")
-    facts = [
-        [
-            "score",
-            f"{_number(score.value)} {_interval(score)}",
-            "noise-corrected RSA, 1 = explains all that is reliable" if rsa else score.metric,
-        ],
+    explained = "noise-corrected RSA, 1 = explains all that is reliable" if rsa else score.metric
+    ceiling = score.ceiling
+    rows = [
+        ["score", _value(score), explained],
         ["status", score.status, "; ".join(score.reasons)],
-        ["raw r", _number(score.r), _ceiling(score)],
+        [
+            "raw r",
+            _number(score.r),
+            f"noise ceiling {_number(ceiling.lower)} to {_number(ceiling.upper)}" if ceiling else "no noise ceiling",
+        ],
         ["reliability", _number(score.reliability), _RELIABILITY[rsa]],
         ["permutation p", _number(score.p), f"{score.p_method}; smallest possible {_number(score.p_smallest)}"],
         ["layer", str(score.layer), score.layer_rule],
-        ["best layer", f"{_number(score.best_layer_value)}", f"{score.best_layer}: optimistic maximum, not a result"],
+        ["best layer", _number(score.best_layer_value), f"{score.best_layer}: optimistic maximum, not a result"],
         ["estimator", score.estimator, score.metric],
     ]
-    others = [("animal to animal", record.animal_to_animal), *record.baselines.items()]
-    rows = [
-        [name, f"{_number(item.value)} {_interval(item)}", item.status] for name, item in others if item is not None
-    ]
-    text = "\n".join(lines) + "\n\n" + table("", ["", "", ""], facts)
-    if found := _details(score.provenance.get("statistics", {})):
-        text += f"\n\n{found}"
-    if record.animal_to_animal is not None and score.estimator == "default" and score.subjects:
-        text += f"\n\nAs much like the animals as they are like one another? {_alike(record, record.animal_to_animal)}"
-    if walk := score.provenance.get("statistics", {}).get("estimator_walk"):
-        text += f"\n\n{_walk(walk)}"
+    parts += [table("", ["", "", ""], rows), *_details(score.provenance.statistics)]
+    if animals is not None and score.estimator == "default" and score.subjects:
+        alike = turing_test(score, animals).summary()
+        parts.append(f"As much like the animals as they are like one another? {alike}")
+    if walk := score.provenance.statistics.get("estimator_walk"):
+        parts.append(_walk(walk))
+    others = {"animal to animal": animals, **record.baselines}
+    rows = [[name, _value(item), item.status] for name, item in others.items() if item is not None]
     if rows:
-        text += "\n\n" + table("Baselines, same estimator", ["", "score", "status"], rows)
-    return text
+        parts.append(table("Baselines, same estimator", ["", "score", "status"], rows))
+    return "\n\n".join(parts)
 
 
-def _details(statistics: dict[str, Any]) -> str:
+def _walk(steps: list[dict[str, Any]]) -> str:
+    """Lay out the walk from the published estimator to the default one."""
+    columns = {
+        ">value": lambda step: "–" if step["value"] is None else f"{step['value']:.3f}",
+        "step": "{0[change]}",
+        "status": "{0[status]}",
+        "": "{0[detail]}",
+    }
+    return f"From the published estimator to the default, one fault at a time\n{table_of('', steps, columns)}"
+
+
+def _details(statistics: Mapping[str, Any]) -> list[str]:
     """Lay out what single metrics add: accuracies by property, shares of variance."""
     parts = []
     if accuracies := statistics.get("decoding"):
-        rows = [
-            [
-                item["property"],
-                *(f"{item[name]:.2f}" for name in ("accuracy", "expected", "chance")),
-                f"{item['p']:.2g}",
-            ]
-            for item in accuracies
-        ]
-        columns = ["property", "accuracy", "without information", "1 / classes", "p"]
-        parts.append(table("Decoding of stimuli left out", columns, rows, right=(1, 2, 3, 4)))
+        columns = {
+            "property": "{0[property]}",
+            ">accuracy": "{0[accuracy]:.2f}",
+            ">without information": "{0[expected]:.2f}",
+            ">1 / classes": "{0[chance]:.2f}",
+            ">p": "{0[p]:.2g}",
+        }
+        parts.append(table_of("Decoding of stimuli left out", accuracies, columns))
     if shares := statistics.get("variance_partition"):
         parts.append(
             f"Variance of the animals' RDMs: {shares['total']:.2f} explained; by the model alone "
             f"{shares['unique_model']:.2f} (by luck {shares['chance']:.2f}), by {', '.join(shares['nuisances'])} alone "
             f"{shares['unique_nuisance']:.2f}, by either {shares['shared']:.2f}"
         )
-    return "\n\n".join(parts)
+    return parts
 
 
 def _number(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "–"
 
 
-def _interval(score: Score) -> str:
-    if score.interval is None:
-        return ""
-    return f"[{_number(score.interval.low)}, {_number(score.interval.high)}]"
-
-
-def _ceiling(score: Score) -> str:
-    if score.ceiling is None:
-        return "no noise ceiling"
-    return f"noise ceiling {_number(score.ceiling.lower)} to {_number(score.ceiling.upper)}"
+def _value(score: Score) -> str:
+    span = score.interval
+    return f"{_number(score.value)} {f'[{_number(span.low)}, {_number(span.high)}]' if span else ''}"

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.options import items, numbers
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
@@ -35,22 +36,16 @@ def whisker(
 
     The table that ships with the package (brainbench/stimuli/fidelity_table.json) is made by this command.
     """
-    from brainbench.core.errors import UsageError
     from brainbench.stimuli import tradeoff
 
-    try:
-        counts = tuple(int(item) for item in links.split(",") if item.strip()) or tradeoff.LINKS
-        steps = tuple((float(item) * 1e-3, None) for item in time_steps.split(",") if item.strip())
-    except ValueError as error:
-        raise UsageError(f"--links and --time-steps take numbers separated by commas ({error}).") from error
-    names = tuple(item.strip() for item in backends.split(",") if item.strip())
-    shapes = tuple(item.strip() for item in collisions.split(",") if item.strip())
+    shapes = tuple(items(collisions))
     chosen = tradeoff.settings(
-        links=counts,
-        time_steps=steps or tradeoff.TIME_STEPS,
-        backends=names,
+        links=numbers(links, "--links") or tradeoff.LINKS,
+        time_steps=tuple((1e-3 * step, None) for step in numbers(time_steps, "--time-steps", float))
+        or tradeoff.TIME_STEPS,
+        backends=tuple(items(backends)),
         collisions=tradeoff.COLLISIONS if shapes == ("all",) else shapes,
-        solvers=tuple(item.strip() for item in solvers.split(",") if item.strip()),
+        solvers=tuple(items(solvers)),
     )
     with progress_bar() as progress:
         points = tradeoff.measure_tradeoff(out, chosen, progress=progress)
@@ -59,53 +54,33 @@ def whisker(
     if plot is not None:
         tradeoff.plot_tradeoff(points, plot)
     best = tradeoff.front(points)
-    rows = [
-        [
-            f"{point.error:.2%}",
-            f"{point.cost:.3g}",
-            str(point.settings["links"]),
-            f"{point.settings['time_step'] * 1e3:g}",
-            str(point.settings["backend"]),
-        ]
-        for point in best
-    ]
-    text = table(
+    setting = {">links": "{0[links]}", ">step ms": lambda point: f"{point['time_step'] * 1e3:g}"}
+    text = table_of(
         f"{len(points)} settings measured; bench tests that no other beats in both error and cost:",
-        ["error", "processor s / whisker-s", "links", "step ms", "backend"],
-        rows,
-        right=(0, 1, 2, 3),
+        [point.settings | {"error": point.error, "cost": point.cost} for point in best],
+        {">error": "{0[error]:.2%}", ">processor s / whisker-s": "{0[cost]:.3g}", **setting, "backend": "{0[backend]}"},
     )
     still = [point for point in points if point.get("solver") == "quasistatic" and point["error"] is not None]
     if still:
-        rows = [
-            [
-                *(f"{point[name]:.2%}" for name in ("static_error", "dynamic_error", "sliding_error", "flick_error")),
-                f"{point['cost']:.3g}",
-                str(point["links"]),
-                f"{point['time_step'] * 1e3:g}",
-            ]
-            for point in still
-        ]
-        columns = ["pegs", "whisking", "with friction", "flicks", "processor s / whisker-s", "links", "step ms"]
-        title = "without inertia (rod, quasistatic), error by test:"
-        text += "\n\n" + table(title, columns, rows, right=tuple(range(7)))
-    hollow = tradeoff.collision_points(points)
-    if hollow:
-        rows = [
-            [
-                f"{point['error']:.2%}" if point["error"] is not None else "—",
-                f"{point['cost']:.3g}" if point["cost"] is not None else "—",
-                point["collision"],
-                str(point.get("pieces", "")),
-                str(point["links"]),
-                f"{point['time_step'] * 1e3:g}",
-                point["backend"],
-                point["note"],
-            ]
-            for point in hollow
-        ]
-        columns = ["error", "processor s / whisker-s", "collision", "pieces", "links", "step ms", "backend", "note"]
-        text += "\n\n" + table("whisking into the hollow of a concave object:", columns, rows, right=(0, 1, 3, 4, 5))
+        columns = {
+            ">pegs": "{0[static_error]:.2%}",
+            ">whisking": "{0[dynamic_error]:.2%}",
+            ">with friction": "{0[sliding_error]:.2%}",
+            ">flicks": "{0[flick_error]:.2%}",
+            ">processor s / whisker-s": "{0[cost]:.3g}",
+        }
+        text += "\n\n" + table_of("without inertia (rod, quasistatic), error by test:", still, columns | setting)
+    if hollow := tradeoff.collision_points(points):
+        columns = {
+            ">error": lambda point: "—" if point["error"] is None else f"{point['error']:.2%}",
+            ">processor s / whisker-s": lambda point: "—" if point["cost"] is None else f"{point['cost']:.3g}",
+            "collision": "{0[collision]}",
+            ">pieces": lambda point: point.get("pieces", ""),
+            **setting,
+            "backend": "{0[backend]}",
+            "note": "{0[note]}",
+        }
+        text += "\n\n" + table_of("whisking into the hollow of a concave object:", hollow, columns)
     emit({"points": points, "front": best, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)
 
 
@@ -122,21 +97,16 @@ def score(
 
     with progress_bar() as progress:
         points = measure_tradeoff(animals=animals, units=units, trials=trials, repeats=repeats, progress=progress)
-    rows = [
-        [
-            point.quantity.replace("_", " "),
-            f"{point.count:,}" + ("  (default)" if point.default else ""),
-            f"{point.error:.2g}",
-            point.of,
-            f"{point.seconds:.2f}",
-        ]
-        for point in points
-    ]
-    text = table(
+    text = table_of(
         f"{animals} animals, {units} units, {trials} trials per stimulus; standard deviation over {repeats} seeds",
-        ["quantity", "number", "error", "of", "s"],
-        rows,
-        right=(2, 4),
+        points,
+        {
+            "quantity": lambda point: point.quantity.replace("_", " "),
+            "number": lambda point: f"{point.count:,}" + ("  (default)" if point.default else ""),
+            ">error": "{0.error:.2g}",
+            "of": "{0.of}",
+            ">s": "{0.seconds:.2f}",
+        },
     )
     emit({"points": points}, text, as_json=as_json)
 
@@ -153,15 +123,10 @@ def model(
     as_json: JsonOption = False,
 ) -> None:
     """Measure error, latency, score and accuracy of a network over precision, unrolling and number of steps."""
-    from brainbench.core.errors import UsageError
     from brainbench.models import tradeoff
     from brainbench.stimuli import load_stimuli
 
-    try:
-        counts = [int(item) for item in _items(steps)]
-    except ValueError as error:
-        raise UsageError(f"--steps takes whole numbers separated by commas; received {steps!r}.") from error
-    chosen = tradeoff.settings(_items(precisions), _items(unrolls), counts)
+    chosen = tradeoff.settings(items(precisions), items(unrolls), list(numbers(steps, "--steps")))
     results = []
     with progress_bar() as progress:
         sweeps = load_stimuli("rodgers", whiskers="all", fidelity=None, progress=progress).input
@@ -177,22 +142,18 @@ def model(
                 found |= _accuracy(reduced, data)
             results.append(found)
             progress(done + 1, len(chosen), "settings")
-    rows = [
-        [
-            str(item["precision"]),
-            str(item["unroll"]),
-            str(item["steps"]),
-            f"{item['error']:.2%}",
-            f"{item['ms']:.2f}",
-            f"{item['p99_ms']:.2f}",
-            f"{item['stored_bytes'] / 1e6:.2f}",
-            f"{item['score']:.3f}" if "score" in item else "–",
-            f"{item['top1']:.3f}" if "top1" in item else "–",
-        ]
-        for item in results
-    ]
-    columns = ["precision", "unrolling", "steps", "error", "ms / sweep", "p99 ms", "MB", "score", "top-1"]
-    emit(results, table(f"{name}, batch 1:", columns, rows, right=tuple(range(2, 9))), as_json=as_json)
+    columns = {
+        "precision": "{0[precision]}",
+        "unrolling": "{0[unroll]}",
+        ">steps": "{0[steps]}",
+        ">error": "{0[error]:.2%}",
+        ">ms / sweep": "{0[ms]:.2f}",
+        ">p99 ms": "{0[p99_ms]:.2f}",
+        ">MB": lambda item: f"{item['stored_bytes'] / 1e6:.2f}",
+        ">score": lambda item: f"{item['score']:.3f}" if "score" in item else "–",
+        ">top-1": lambda item: f"{item['top1']:.3f}" if "top1" in item else "–",
+    }
+    emit(results, table_of(f"{name}, batch 1:", results, columns), as_json=as_json)
 
 
 @app.command("tactile")
@@ -211,18 +172,15 @@ def tactile(
         points = tradeoff.measure_tradeoff(out, progress=progress)
     if plot is not None:
         tradeoff.plot_tradeoff(points, plot)
-    rows = []
-    for point in points:
-        setting = point.get("points") or point.get("taxels") or point["query"]
-        detail = f"{point['resolution']} cells" if point.get("resolution") else ""
-        rows.append([point["part"], str(setting), detail, f"{point['error']:.2e}", f"{point['cost']:.2f}"])
-    columns = ["part", "setting", "resolution", "error", "µs / environment"]
-    text = table("relative force errors against double precision", columns, rows, right=(1, 3, 4))
+    columns = {
+        "part": "{0[part]}",
+        ">setting": lambda point: point.get("points") or point.get("taxels") or point["query"],
+        "resolution": lambda point: f"{point['resolution']} cells" if point.get("resolution") else "",
+        ">error": "{0[error]:.2e}",
+        ">µs / environment": "{0[cost]:.2f}",
+    }
+    text = table_of("relative force errors against double precision", points, columns)
     emit({"points": points, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)
-
-
-def _items(text: str) -> list[str]:
-    return [item.strip() for item in text.split(",") if item.strip()]
 
 
 def _accuracy(reduced: Any, data: Path) -> dict[str, float]:

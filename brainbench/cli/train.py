@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.options import part_of, with_options
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 
 if TYPE_CHECKING:
     import torch
@@ -18,37 +19,25 @@ if TYPE_CHECKING:
     from brainbench.models.training.trainer import TrainingResult
 
 
+TRAINING = "brainbench.models.training.config:TrainingConfig"
+OFFERED = (
+    "objective", "epochs", "batch_size", "optimizer", "schedule", "learning_rate", "augmentation", "masking",
+    "precision", "compile", "weights_dtype", "seed",
+)  # fmt: skip
+"""Fields of the configuration that have a flag; a file sets the others too."""
+
+
+@with_options(TRAINING, OFFERED, given=True)
 def train(
     model: Annotated[str, typer.Argument(help="A registry name, such as zhuang-intersection-ln-small.")],
     data: Annotated[Path, typer.Option("--data", "-d", help="Folder that brainbench stimuli sweep wrote.")],
-    objective: Annotated[
-        str | None, typer.Option(help="supervised, simclr, simsiam, simsiam-warmup or ae; supervised if not given.")
-    ] = None,
+    options: dict[str, Any],
     config: Annotated[
         Path | None, typer.Option(help="TOML or JSON file of training options; options given here win.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder of the run; started again, it goes on.")
     ] = None,
-    epochs: Annotated[int | None, typer.Option(help="Passes over the data (published: 100).")] = None,
-    batch_size: Annotated[int | None, typer.Option(help="Sweeps per step over all processes.")] = None,
-    optimizer: Annotated[str | None, typer.Option(help="sgd, adam, adamw or lars.")] = None,
-    schedule: Annotated[str | None, typer.Option(help="step, constant or cosine.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Initial learning rate.")] = None,
-    augmentation: Annotated[str | None, typer.Option(help="none, physical, thesis or image.")] = None,
-    masking: Annotated[float | None, typer.Option(help="Share of masked time steps (published with 0.75).")] = None,
-    precision: Annotated[str | None, typer.Option(help="bf16 (mixed), float32, or auto: bf16 on CUDA.")] = None,
-    compile: Annotated[
-        str | None,
-        typer.Option(help="off, parts (of the network), default (the whole) or graphs (whole steps as CUDA graphs)."),
-    ] = None,
-    weights_dtype: Annotated[
-        str | None,
-        typer.Option(
-            help="Precision of the model that is written: auto (that of the training), float32, float16 or bfloat16."
-        ),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of weights, order, augmentation and dropout.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda or cuda:N; CUDA when there is one.")] = None,
     stop_after: Annotated[float | None, typer.Option(help="Save the state and stop after so many seconds.")] = None,
     sweep: Annotated[
@@ -66,30 +55,20 @@ def train(
     from brainbench.models.training.search_space import SweepRun, best_run, sweep_runs
     from brainbench.models.training.trainer import train as run
 
-    options = read_options(config) if config is not None else {}
-    given = {
-        "epochs": epochs,
-        "batch_size": batch_size,
-        "optimizer": optimizer,
-        "schedule": schedule,
-        "learning_rate": learning_rate,
-        "augmentation": augmentation,
-        "masking": masking,
-        "precision": precision,
-        "compile": compile,
-        "weights_dtype": weights_dtype,
-        "seed": seed,
-    }
-    options |= {name: value for name, value in given.items() if value is not None}
+    options = (read_options(config) if config is not None else {}) | options
     if (named := options.pop("model", model)) != model:
         raise UsageError(f"The configuration is for the model {named!r} and the command names {model!r}.")
-    wanted = objective or options.pop("objective", "supervised")
-    options.pop("objective", None)
+    wanted = options.pop("objective", "supervised")
     chosen = TrainingConfig.published(model, wanted, **options)
     where = out or Path("brainbench-training") / f"{model}.{wanted}"
     runs = [SweepRun(chosen, where)]
     if sweep is not None:
-        runs = sweep_runs(chosen, where, job=_job(sweep), warmup=wanted.endswith("-warmup"))
+        runs = sweep_runs(
+            chosen,
+            where,
+            job=(0, 1) if sweep == "all" else part_of(sweep, "--sweep takes 'all', or"),
+            warmup=wanted.endswith("-warmup"),
+        )
     source = SweepFolder(data)
     results: dict[str, TrainingResult] = {}
     with progress_bar() as progress:
@@ -104,9 +83,16 @@ def train(
             )
     if os.environ.get("RANK", "0") != "0":
         return
-    rows = [[folder, *_row(result)] for folder, result in results.items()]
-    columns = ["run", "status", "epochs", "best", "top-1", "top-5", "collapsed"]
-    text = table("", columns, rows, right=(2, 3, 4, 5))
+    columns = {
+        "run": "{0[0]}",
+        "status": "{0[1].status}",
+        ">epochs": "{0[1].epochs}",
+        ">best": lambda item: "–" if item[1].best_epoch is None else item[1].best_epoch,
+        ">top-1": lambda item: _told(item[1], "{0.top1:.3f} [{0.interval.low:.3f}, {0.interval.high:.3f}]"),
+        ">top-5": lambda item: _told(item[1], "{0.top5:.3f}"),
+        "collapsed": lambda item: _told(item[1], "{0.reason}") or "no",
+    }
+    text = table_of("", results.items(), columns)
     text += "".join(f"\n{folder}: {result.reason}" for folder, result in results.items() if result.reason)
     done = [result for result in results.values() if result.status == "finished"]
     payload: dict[str, Any] = {"config": chosen, "runs": results}
@@ -152,26 +138,9 @@ class SweepFolder:
         return self._open(split, batch_size=batch_size // part[1], shuffle=shuffle, seed=seed, part=part, device=device)
 
 
-def _job(text: str) -> tuple[int, int]:
-    from brainbench.core.errors import UsageError
-
-    if text == "all":
-        return 0, 1
-    number, slash, count = text.partition("/")
-    if not slash or not number.isdigit() or not count.isdigit():
-        raise UsageError(f"--sweep takes 'all', or NUMBER/COUNT with numbers from 0; received {text!r}.")
-    return int(number), int(count)
-
-
 def _named(progress: Progress, name: str) -> Progress:
     return lambda done, total, what: progress(done, total, f"{what}: {name}")
 
 
-def _row(result: TrainingResult) -> list[str]:
-    found = result.evaluation
-    best = "–" if result.best_epoch is None else str(result.best_epoch)
-    if found is None:
-        return [result.status, str(result.epochs), best, "–", "–", "–"]
-    low, high = found.interval.low, found.interval.high
-    top1 = f"{found.top1:.3f} [{low:.3f}, {high:.3f}]"
-    return [result.status, str(result.epochs), best, top1, f"{found.top5:.3f}", found.reason or "no"]
+def _told(result: TrainingResult, form: str) -> str:
+    return "–" if result.evaluation is None else form.format(result.evaluation)

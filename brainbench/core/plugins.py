@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,6 +55,7 @@ def load_module(path: str) -> ModuleType:
     Raises:
         DataFileNotFoundError: there is no such file or module.
         DataError: it cannot be imported.
+        BrainbenchError: what the code itself raises of this kind stays as it is.
     """
     is_file = path.endswith(".py") or "/" in path or "\\" in path
     if is_file and not Path(path).is_file():
@@ -65,6 +66,8 @@ def load_module(path: str) -> ModuleType:
         if not is_file and error.name is not None and (path == error.name or path.startswith(f"{error.name}.")):
             raise DataFileNotFoundError(f"There is no Python module {path!r}; a file is given as {path}.py.") from error
         raise DataError(f"Importing {path!r} failed: {error}.") from error
+    except BrainbenchError:
+        raise
     except Exception as error:
         raise DataError(f"Importing {path!r} failed with {type(error).__name__}: {error}.") from error
 

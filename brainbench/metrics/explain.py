@@ -21,11 +21,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.core.records import Status
 from brainbench.metrics.animals import gather
 from brainbench.metrics.layers import held_out
@@ -101,6 +102,25 @@ def corrected_value(
         return math.nan, 0
     ratios = raw[keep][real] / np.sqrt(first[real] * second[real])
     return float(np.median(ratios) if switches.median else ratios.mean()), int(real.sum())
+
+
+def explain_file(path: str | Path) -> tuple[Step, ...]:
+    """Walk through the split halves in an ``.npz`` file: arrays ``r_xy``, ``r_yy`` and maybe ``r_xx``.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it holds something else.
+    """
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no file {path}.")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} is no .npz file of plain arrays ({error}).") from error
+    if missing := {"r_xy", "r_yy"} - arrays.keys():
+        raise DataError(f"{path} lacks the array {sorted(missing)[0]!r}; it has {sorted(arrays)}.")
+    return explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))
 
 
 def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None = None) -> tuple[Step, ...]:

@@ -12,13 +12,15 @@ import numpy as np
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.files import content_hash, file_hash
 from brainbench.core.progress import Progress
-from brainbench.core.records import ModelCard
+from brainbench.core.records import Interval, ModelCard
 
 if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 
+    from brainbench.scoring.options import ScoreOptions
     from brainbench.stimuli import Stimuli
 
 DEFAULT_STIMULI = "rodgers"
@@ -42,18 +44,18 @@ class ModelResponses:
     """Provenance of stimuli and weights."""
 
     def features(self, rows: list[int]) -> dict[str, NDArray[np.floating]]:
-        """Every layer's features [K, F] of the stimuli ``rows``."""
-        return {layer: _features_of(values[rows], self.time) for layer, values in self.activations.items()}
+        """Return every layer's features [K, F] of the stimuli ``rows``."""
+        return {layer: reduce_time(values[rows], self.time) for layer, values in self.activations.items()}
 
     def baseline_features(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.floating]]]:
-        """The raw input and random features of it; empty without an input."""
+        """Return the raw input and random features of it; nothing without an input."""
         if self.model_input is None:
             return {}
         raw = self.model_input[rows].astype(np.float64)
         weights = np.random.default_rng(seed).standard_normal((raw.shape[-1], RANDOM_FEATURES)) / np.sqrt(raw.shape[-1])
         return {
-            "raw input": {"input": _features_of(raw, self.time)},
-            "random features": {"random": _features_of(np.maximum(raw @ weights, 0.0), self.time)},
+            "raw input": {"input": reduce_time(raw, self.time)},
+            "random features": {"random": reduce_time(np.maximum(raw @ weights, 0.0), self.time)},
         }
 
 
@@ -69,39 +71,31 @@ class ResolvedModel:
     """Labels of the rows of ``activations``; None when they follow the stimuli."""
     origin: Mapping[str, Any] = field(default_factory=dict)
 
-    def respond(
-        self,
-        stimuli: Any,
-        *,
-        whiskers: str,
-        fidelity: Any,
-        layers: tuple[str, ...] | None,
-        normalize: bool,
-        time: str,
-        progress: Progress | None,
-    ) -> ModelResponses:
-        """Run the model on the stimuli; see :func:`brainbench.scoring.scores.score_record` for the arguments."""
-        if self.activations is not None and self.labels is not None:
-            return ModelResponses(self.card, self.labels, _chosen(self.activations, layers), time, origin=self.origin)
-        from brainbench.stimuli import load_stimuli
+    def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
+        """Run the model on the stimuli, or take the features that were computed elsewhere."""
+        card, labels, origin, model_input = self.card, self.labels, self.origin, None
+        shown = None
+        if labels is None:
+            from brainbench.stimuli import load_stimuli
 
-        shown = load_stimuli(stimuli or DEFAULT_STIMULI, whiskers=whiskers, fidelity=fidelity, progress=progress)
-        names = ("description", "content_hash", "config_hash")
-        told: dict[str, Any] = {name: getattr(shown, name) for name in names}
-        if shown.dataset is not None and shown.dataset.attrs.get("backend"):
-            told["backend"] = str(shown.dataset.attrs["backend"])
-        origin = {**self.origin, "stimuli": told}
-        if self.module is None:
-            given = {
-                layer: _as_steps(layer, item, len(shown.labels)) for layer, item in (self.activations or {}).items()
-            }
-            return ModelResponses(self.card, shown.labels, _chosen(given, layers), time, origin=origin)
-        from brainbench.models.activations import extract
+            source = options.stimuli if options.stimuli is not None else DEFAULT_STIMULI
+            shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
+            labels, origin = shown.labels, {**origin, "stimuli": _stated(shown)}
+        if self.module is None or shown is None:
+            found = self.activations or {}
+            for layer in options.layers or ():
+                if layer not in found:
+                    raise unknown_name("layer", layer, found)
+            activations = {layer: _as_steps(layer, found[layer], len(labels)) for layer in options.layers or found}
+        else:
+            from brainbench.models.activations import extract
 
-        values, note = _network_input(self.module, shown, normalize)
-        activations = extract(self.module, values, layers=layers)
-        card = replace(self.card, input=note)
-        return ModelResponses(card, shown.labels, activations, time, _baseline_input(shown), origin)
+            values, comparable, note = _network_input(self.module, shown, options.normalize)
+            activations = extract(self.module, values, layers=options.layers)
+            card = replace(card, input=note)
+            steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
+            model_input = steps.reshape(*steps.shape[:2], -1)
+        return ModelResponses(card, labels, activations, options.time, model_input, origin)
 
 
 def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
@@ -114,7 +108,12 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     if isinstance(model, Mapping):
         return ResolvedModel(ModelCard("features", family=_ELSEWHERE), activations=model)
     if isinstance(model, (str, os.PathLike)) and Path(model).suffix.lower() in (".h5", ".hdf5"):
-        return _features(Path(model))
+        from brainbench.models.features import read_features
+
+        path = Path(model)
+        features = read_features(path)
+        card = ModelCard(path.stem, family=_ELSEWHERE, weights=file_hash(path))
+        return ResolvedModel(card, None, features.activations, features.labels, {"features": path.name})
     import torch
 
     if isinstance(model, torch.nn.Module):
@@ -143,53 +142,25 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
         seed=seed,
         citation=known.citation or None,
     )
-    return _with_weights(load_model(model, seed=seed), card if known.trained is None else _trained(card, known.trained))
+    return _with_weights(load_model(model, seed=seed), replace(card, **_trained(known.trained)))
 
 
-def _trained(card: ModelCard, config: Mapping[str, Any]) -> ModelCard:
-    """Fill in the card what a checkpoint's configuration says of its training."""
-    from brainbench.core.records import Interval
-
-    found = config.get("evaluation") or {}
-    twin = config.get("twin_evaluation") or {}
-    return replace(
-        card,
-        objective=config.get("objective"),
-        augmentation=config.get("augmentation"),
-        top1=found.get("top1"),
-        top5=found.get("top5"),
-        accuracy_interval=Interval(**found["interval"]) if found.get("interval") else None,
-        accuracy_data=found.get("data"),
-        collapsed=found.get("collapsed"),
-        twin=config.get("twin"),
-        twin_top1=twin.get("top1"),
-        twin_interval=Interval(**twin["interval"]) if twin.get("interval") else None,
-        seed=config.get("seed"),
-        training=_training(config),
-    )
-
-
-def _training(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a checkpoint says of its training, without what the card says already."""
+def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return what a checkpoint's configuration says of its training, by the fields of a card."""
+    if config is None:
+        return {}
+    found, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
     stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence")}
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
-    return {name: value for name, value in {**options, **stated}.items() if value is not None}
-
-
-def _features(path: Path) -> ResolvedModel:
-    from brainbench.core.files import file_hash
-    from brainbench.models.features import read_features
-
-    features = read_features(path)
-    card = ModelCard(path.stem, family=_ELSEWHERE, weights=file_hash(path))
-    return ResolvedModel(card, None, features.activations, features.labels, {"features": path.name})
-
-
-def _chosen(activations: Mapping[str, Any], layers: tuple[str, ...] | None) -> Mapping[str, Any]:
-    for layer in layers or ():
-        if layer not in activations:
-            raise unknown_name("layer", layer, activations)
-    return {layer: activations[layer] for layer in layers} if layers else activations
+    return {
+        **{name: config.get(name) for name in ("objective", "augmentation", "twin", "seed")},
+        **{name: found.get(name) for name in ("top1", "top5", "collapsed")},
+        "accuracy_interval": Interval(**found["interval"]) if found.get("interval") else None,
+        "accuracy_data": found.get("data"),
+        "twin_top1": twin.get("top1"),
+        "twin_interval": Interval(**twin["interval"]) if twin.get("interval") else None,
+        "training": {name: value for name, value in {**options, **stated}.items() if value is not None},
+    }
 
 
 def _as_steps(layer: str, values: Any, rows: int) -> NDArray[np.floating]:
@@ -201,38 +172,33 @@ def _as_steps(layer: str, values: Any, rows: int) -> NDArray[np.floating]:
     return array[:, None, :] if array.ndim == 2 else array
 
 
-def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -> tuple[Any, str]:
-    """Return the model's input [K, T, …] and a sentence on how it was made."""
+def _stated(stimuli: Stimuli) -> dict[str, Any]:
+    """Return the provenance of stimuli."""
+    told = {name: getattr(stimuli, name) for name in ("description", "content_hash", "config_hash")}
+    backend = None if stimuli.dataset is None else stimuli.dataset.attrs.get("backend")
+    return {**told, "backend": str(backend)} if backend else told
+
+
+def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -> tuple[Any, Any, str]:
+    """Return the model's input [K, T, …], the stimuli with forces and moments comparable, and how they were made."""
+    given = scaled = stimuli.input
+    if stimuli.dataset is not None:
+        import torch
+
+        from brainbench.models.normaliser import Normaliser
+
+        scaled = Normaliser.physical(given.shape[2] // len(CHANNELS))(torch.from_numpy(given)).numpy()
     if hasattr(module, "spec"):  # ours, or made like ours: takes SI units
-        return stimuli.input, "SI (N, N·m); normalised inside the model"
+        return given, scaled, "SI (N, N·m); normalised inside the model"
     if stimuli.dataset is None:
-        return stimuli.input, "as given"
-    if not normalize:
-        return stimuli.input, "SI (N, N·m)"
-    return _scaled(stimuli), "forces in 1e-4 N, moments in 1e-6 N·m"
-
-
-def _scaled(stimuli: Stimuli) -> NDArray[np.float32]:
-    import torch
-
-    from brainbench.models.normaliser import Normaliser
-
-    steps = torch.from_numpy(stimuli.input)
-    return Normaliser.physical(steps.shape[2] // len(CHANNELS))(steps).numpy()
-
-
-def _baseline_input(stimuli: Stimuli) -> NDArray[np.floating]:
-    """[K, T, F] the raw input in units that make forces and moments comparable."""
-    values = stimuli.input if stimuli.dataset is None else _scaled(stimuli)
-    steps = values if values.ndim > 2 else values[:, None, :]
-    return steps.reshape(*steps.shape[:2], -1)
+        return given, scaled, "as given"
+    return (scaled, scaled, "forces in 1e-4 N, moments in 1e-6 N·m") if normalize else (given, scaled, "SI (N, N·m)")
 
 
 def _with_weights(module: torch.nn.Module, card: ModelCard) -> ResolvedModel:
     """Fill in the card what the weights tell."""
     import torch
 
-    from brainbench.core.files import content_hash
     from brainbench.models.diagram import graph_of
 
     lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
@@ -247,6 +213,6 @@ def _with_weights(module: torch.nn.Module, card: ModelCard) -> ResolvedModel:
     return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
 
 
-def _features_of(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
-    """[K, T, F] → [K, F'] by the time rule; NaN activations stay NaN, since here nothing is "not recorded"."""
+def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
+    """Return [K, T, F] as [K, F'] by the time rule; NaN activations stay NaN, since here nothing is "not recorded"."""
     return values.reshape(len(values), -1) if time == "concatenate" else values.mean(axis=1, dtype=np.float64)

@@ -36,7 +36,7 @@ class NeuralResponses:
 
     @property
     def synthetic(self) -> bool:
-        """Whether the recordings were made by a program."""
+        """True when the recordings were made by a program."""
         return bool(self.dataset.attrs["synthetic"])
 
     @property
@@ -48,7 +48,7 @@ class NeuralResponses:
     def animals(
         self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
     ) -> tuple[Any, ...]:
-        """Every animal prepared by a metric (RSA by default) over the labels ``kept``, in that order."""
+        """Prepare every animal by a metric (RSA by default) over the labels ``kept``, in that order."""
         from brainbench.datasets import trials_by_subject
         from brainbench.metrics import get_metric
 
@@ -92,7 +92,7 @@ def demo_recordings(*, progress: Progress | None = None) -> Path:
 
 
 def without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
-    """[R or K, T, F] → [R or K, F'] by the time rule; a step that was not recorded does not count."""
+    """Return [R or K, T, F] as [R or K, F'] by the time rule; a step that was not recorded does not count."""
     if time == "concatenate":
         return values.reshape(len(values), -1)
     missing = np.isnan(values)

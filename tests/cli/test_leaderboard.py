@@ -187,10 +187,10 @@ def test_seeds_and_batches_are_read_or_refused(tmp_path):
         parse_seeds("0,3-1")
     batch = tmp_path / "b.toml"
     batch.write_text('[[entries]]\nmodels = ["s4-small"]\nseeds = [0, 1]\n')
-    assert [(job.model, job.weights_seed) for job in read_batch(batch)] == [("s4-small", 0), ("s4-small", 1)]
+    assert [(job.model, job.options.model_seed) for job in read_batch(batch)] == [("s4-small", 0), ("s4-small", 1)]
     assert read_batch(batch)[1].command == "brainbench score s4-small --weights-seed 1"
     batch.write_text("[options]\ncolour = 1\n")
-    with pytest.raises(UsageError, match="Unknown option of a batch 'colour'"):
+    with pytest.raises(UsageError, match="Unknown option of a score 'colour'"):
         read_batch(batch)
     with pytest.raises(DataError, match="not a readable batch"):
         read_batch(tmp_path / "none.toml")

@@ -2,12 +2,8 @@
 
 import typer
 
-from brainbench.cli.leaderboard import add, build, diff, report, serve, verify
+from brainbench.cli.leaderboard import records, site
 
 app = typer.Typer(no_args_is_help=True, help="Collect result records, check them, and show them as a leaderboard.")
-app.command("add")(add.add)
-app.command("verify")(verify.verify)
-app.command("diff")(diff.diff)
-app.command("build")(build.build)
-app.command("report")(report.report)
-app.command("serve")(serve.serve)
+for _command in (records.add, records.verify, site.diff, site.build, site.report, site.serve):
+    app.command(_command.__name__)(_command)

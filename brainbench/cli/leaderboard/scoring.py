@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.progress import Progress
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
-
-REPEATED = ("estimator", "metric", "whiskers", "fidelity", "normalize", "time", "conditions", "select", "window", "bin")
-"""Settings of a record that are arguments of :func:`brainbench.scoring.scores.score_record`."""
+from brainbench.scoring.options import ScoreOptions
 
 
 @dataclass(frozen=True)
@@ -22,18 +21,22 @@ class ScoringJob:
     """One score to compute."""
 
     model: str
-    weights_seed: int
-    options: dict[str, Any] = field(default_factory=dict)
+    options: ScoreOptions
 
     @property
     def command(self) -> str:
-        """The command line that makes this score by itself."""
-        words = ["brainbench", "score", self.model]
-        if self.weights_seed:
-            words += ["--weights-seed", str(self.weights_seed)]
-        for name, value in self.options.items():
-            words += [f"--{name}", str(value)]
-        return shlex.join(words)
+        """Command line that makes this score by itself."""
+        return shlex.join(["brainbench", "score", self.model, *as_flags(SCORE, self.options, SCORE_FLAGS)])
+
+
+def jobs_of(patterns: Sequence[str], seeds: Sequence[int], options: dict[str, Any]) -> list[ScoringJob]:
+    """Return the scores of the models that the patterns match, for each seed of untrained weights."""
+    common = ScoreOptions.of(options)
+    return [
+        ScoringJob(name, replace(common, weights_seed=None if seed == common.seed else seed))
+        for name in find_models(patterns)
+        for seed in seeds
+    ]
 
 
 def score_again(
@@ -52,32 +55,18 @@ def score_again(
     """
     from brainbench.scoring.scores import score_record
 
-    score = record.score
-    settings = score.provenance.get("settings") or {}
-    source = (score.provenance.get("recordings") or {}).get("source")
-    model = settings.get("model")
+    origin = record.score.provenance
+    model, source = origin.settings.get("model"), origin.recordings.get("source")
     if not isinstance(model, str):
         raise DataError(
-            f"The record of {score.name!r} does not name a model that can be loaded (a module in memory or a record "
-            "of an earlier layout); score the model again."
+            f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
+            "record of an earlier layout); score the model again."
         )
     if recordings is None and source != "demo":
         raise UsageError(f"The record was made with the recordings {source!r}; give them with --recordings PATH.")
-    options = {name: settings[name] for name in REPEATED if settings.get(name) is not None}
-    layers = settings.get("layers")
-    pairs = score.provenance.get("pairs") or {}
-    match = pairs if any(label != partner for label, partner in pairs.items()) else None
-    return score_record(
-        model,
-        recordings=recordings or "demo",
-        stimuli=settings.get("stimuli"),
-        match=match,
-        layers=tuple(layers) if layers else None,
-        seed=settings.get("seed", 0),
-        weights_seed=settings.get("weights_seed"),
-        progress=progress,
-        **options,
-    )
+    match = origin.pairs if any(label != partner for label, partner in origin.pairs.items()) else None
+    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or "demo", match=match)
+    return score_record(model, options, progress=progress)
 
 
 def find_models(patterns: Sequence[str]) -> list[str]:
@@ -108,10 +97,8 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     return list(found)
 
 
-def missing(
-    jobs: Iterable[ScoringJob], records: Iterable[ResultRecord], *, options: dict[str, Any]
-) -> list[ScoringJob]:
-    """Return the jobs whose score is not among the records.
+def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list[ScoringJob]:
+    """Return the jobs, of one set of options, whose score is not among the records.
 
     A record counts only if made by this version of the package and of the estimator from the same weights,
     recordings, stimuli and settings, so that a batch also renews what has become stale.
@@ -121,48 +108,25 @@ def missing(
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.stimuli import load_stimuli
 
-    selection = {name: options.get(name) for name in ("conditions", "select", "window")}
-    brain = open_neural_responses(options.get("recordings", "demo"), progress=None, **selection).origin["content_hash"]
-    shown = load_stimuli(
-        options.get("stimuli", DEFAULT_STIMULI),
-        whiskers=options.get("whiskers", "all"),
-        fidelity=options.get("fidelity", "balanced"),
-    )
-    stimuli = shown.config_hash or shown.content_hash
-    defaults = {"metric": "rsa", "estimator": "default", "time": "mean"}
-    wanted = tuple(options.get(name, default) for name, default in defaults.items())
+    options = jobs[0].options
+    brain = open_neural_responses(options.recordings, progress=None, **options.selection).origin["content_hash"]
+    shown = load_stimuli(options.stimuli or DEFAULT_STIMULI, whiskers=options.whiskers, fidelity=options.fidelity)
+    names = ("metric", "estimator", "time", "weights_seed", "estimator_version")
+    common = (__version__, brain, shown.config_hash or shown.content_hash)
     known = set()
     for record in records:
-        said = record.score.provenance
-        settings = said.get("settings") or {}
-        seen = said.get("stimuli") or {}
-        known.add(
-            (
-                record.score.name,
-                settings.get("weights_seed"),
-                record.card.weights if record.card else None,
-                said.get("version"),
-                (said.get("recordings") or {}).get("content_hash"),
-                seen.get("config_hash") or seen.get("content_hash"),
-                tuple(settings.get(name) for name in defaults),
-                settings.get("estimator_version"),
-            )
-        )
-    return [
-        job
-        for job in jobs
-        if (
-            job.model,
-            job.weights_seed,
-            resolve_model(job.model, seed=job.weights_seed).card.weights,
-            __version__,
-            brain,
-            stimuli,
-            wanted,
-            ESTIMATOR_VERSION,
-        )
-        not in known
-    ]
+        origin = record.score.provenance
+        hashes = origin.stimuli.get("config_hash") or origin.stimuli.get("content_hash")
+        made = (origin.version, origin.recordings.get("content_hash"), hashes)
+        weights = record.card.weights if record.card else None
+        known.add((record.score.name, weights, *made, *(origin.settings.get(name) for name in names)))
+    found = []
+    for job in jobs:
+        settings = job.options.settings | {"estimator_version": ESTIMATOR_VERSION}
+        weights = resolve_model(job.model, seed=job.options.model_seed).card.weights
+        if (job.model, weights, *common, *(settings[name] for name in names)) not in known:
+            found.append(job)
+    return found
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -190,7 +154,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 def read_batch(path: Path) -> list[ScoringJob]:
     """Read the scores that a batch file asks for: TOML with ``[[entries]]`` of ``models`` and ``seeds``.
 
-    ``[options]`` are those of ``brainbench score`` that hold for all: recordings, stimuli, fidelity, whiskers, …
+    ``[options]`` are the fields of :class:`~brainbench.scoring.options.ScoreOptions` that hold for all of them.
 
     Raises:
         DataError: the file is missing or of another kind.
@@ -202,20 +166,10 @@ def read_batch(path: Path) -> list[ScoringJob]:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise DataError(f"{str(path)!r} is not a readable batch file ({error}).") from error
-    options = data.get("options", {})
-    for name in options:
-        if name not in OPTIONS:
-            raise unknown_name("option of a batch", name, OPTIONS)
+    options = vars(ScoreOptions.of(data.get("options", {})))
     jobs = []
     for entry in data.get("entries", []):
         if set(entry) - {"models", "seeds"} or "models" not in entry:
             raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {sorted(entry)}.")
-        for model in find_models(entry["models"]):
-            jobs += [ScoringJob(model, seed, options) for seed in entry.get("seeds", [0])]
+        jobs += jobs_of(entry["models"], entry.get("seeds", [0]), options)
     return jobs
-
-
-OPTIONS = (
-    "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric", "estimator", "time"
-)  # fmt: skip
-"""Options of a scoring run that ``leaderboard add`` passes on."""

@@ -1,4 +1,4 @@
-"""Options that the commands on tasks share, and the environment that they describe."""
+"""Options that the commands on tasks share, and the environments and agents that they name."""
 
 from __future__ import annotations
 
@@ -29,39 +29,21 @@ def make_env(name: str, *, task_file: Path | None = None, **options: Any) -> Env
     """Return the environment of a command; a task of the user's own is read first."""
     from robotics_bridge import tasks
 
-    if task_file is not None:
-        read_task_file(task_file)
+    read_task_file(task_file)
     return tasks.make(name, **options)
 
 
-def read_task_file(path: Path) -> None:
-    """Run a Python file that registers tasks.
+def read_task_file(path: Path | None) -> None:
+    """Run a Python file that registers tasks, if there is one."""
+    from brainbench.core.plugins import load_module
 
-    Raises:
-        DataError: it is missing, or fails.
-    """
-    import importlib.util
-
-    from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError
-
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no task file {str(path)!r}.")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise DataError(f"{str(path)!r} is no Python file.")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except BrainbenchError:
-        raise
-    except Exception as error:
-        raise DataError(f"The task file {str(path)!r} failed: {type(error).__name__}: {error}.") from error
+    if path is not None:
+        load_module(str(path.absolute()))
 
 
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     """Return the agent ``zero`` or ``random``, a shipped policy, or the teacher or student of a run's folder."""
     from brainbench.core.errors import unknown_name
-    from brainbench.core.files import read_json
     from robotics_bridge.policies import evaluate, shipped
     from robotics_bridge.policies.training import teacher
 
@@ -70,8 +52,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     known = (*evaluate.AGENTS, *shipped.list_teachers(), *shipped.list_students())
     if name not in known and not Path(name).exists():
         raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
-    config = _folder(name) / "config.json"
-    if config.is_file() and read_json(config).get("brainbench_student"):
+    if _student(name):
         from robotics_bridge.policies.training.distill import StudentPolicy, load_student
 
         student, _ = load_student(name, device=str(env.device))
@@ -79,10 +60,14 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     return teacher.load_teacher(name, env)
 
 
-def _folder(name: str) -> Path:
+def _student(name: str) -> dict[str, Any]:
+    """Return what the configuration of a student's run says; nothing for other agents."""
+    from brainbench.core.files import read_json
     from robotics_bridge.policies.shipped import FOLDER
 
-    return FOLDER / name if not Path(name).exists() and (FOLDER / name).is_dir() else Path(name)
+    folder = FOLDER / name if not Path(name).exists() and (FOLDER / name).is_dir() else Path(name)
+    facts = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
+    return facts if facts.get("brainbench_student") else {}
 
 
 def touch_of(names: list[str]) -> dict[str, Any]:
@@ -92,19 +77,12 @@ def touch_of(names: list[str]) -> dict[str, Any]:
         UsageError: students with different senses are asked for at once.
     """
     from brainbench.core.errors import UsageError
-    from brainbench.core.files import read_json
 
     found: dict[str, dict[str, Any]] = {}
     for name in names:
-        config = _folder(name) / "config.json"
-        if config.is_file():
-            facts = read_json(config)
-            if facts.get("brainbench_student"):
-                kept = facts.get("distill", facts)
-                found[name] = {key: kept[key] for key in _TOUCH if key in kept}
+        if facts := _student(name):
+            kept = facts.get("distill", facts)
+            found[name] = {key: kept[key] for key in ("observe", "placement", "resolution", "noisy") if key in kept}
     if any(senses != next(iter(found.values())) for senses in found.values()):
         raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")
     return next(iter(found.values()), {})
-
-
-_TOUCH = ("observe", "placement", "resolution", "noisy")

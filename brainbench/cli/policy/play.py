@@ -1,16 +1,18 @@
-"""``brainbench policy play``: watch an agent."""
+"""``brainbench policy tasks | play | evaluate``: what there is to do, and how well agents do it."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_of
 from brainbench.cli.policy.options import (
     ConfigOption,
     DeviceOption,
+    EnvsOption,
     HandOption,
     NoisyOption,
     ObserveOption,
@@ -23,6 +25,38 @@ from brainbench.cli.policy.options import (
     make_env,
     touch_of,
 )
+
+
+def list_tasks(as_json: JsonOption = False) -> None:
+    """List the tasks with their success, length, observation groups, and the policies that come with the package."""
+    from robotics_bridge import tasks
+    from robotics_bridge.policies.shipped import list_students, list_teachers
+
+    found = []
+    for name in tasks.list_tasks():
+        task = tasks.load(name)
+        student = [*task.groups["student"], "tactile"]
+        found.append(
+            {
+                "task": name,
+                "text": task.text,
+                "seconds": task.episode,
+                "metric": task.success.metric,
+                "success_from": task.success.threshold,
+                "student": student,
+                "teacher": list(task.groups["actor"]),
+                "shipped": [*list_teachers(name), *list_students(name)],
+            }
+        )
+    columns = {
+        "task": "{0[task]}",
+        "what to do": "{0[text]}",
+        "s": "{0[seconds]:g}",
+        "success": "{0[metric]} ≥ {0[success_from]:.3g}",
+        "student sees": lambda item: ", ".join(item["student"]),
+        "trained": lambda item: ", ".join(item["shipped"]),
+    }
+    emit(found, table_of("", found, columns), as_json=as_json)
 
 
 def play(
@@ -45,8 +79,7 @@ def play(
     as_json: JsonOption = False,
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
-    import math
-
+    from brainbench.cli.policy import pictures as drawing
     from brainbench.core.errors import UsageError
 
     if not (seconds > 0 and math.isfinite(seconds) and rate > 0 and width >= 64):
@@ -64,10 +97,8 @@ def play(
     rewards: list[float] = []
     ended = 0
     with progress_bar() as progress:
-        from brainbench.cli.policy import pictures as _picture
-
         size = (width, round(width * 5 / 6))
-        stage = _picture.Stage(env, size) if pictures else None
+        stage = drawing.Stage(env, size) if pictures else None
         every = max(round(1 / (rate * env.step_dt)), 1)
         marks = {round(index * (steps - 1) / 5) for index in range(6)}
         film, stills, times = [], [], []
@@ -84,14 +115,66 @@ def play(
             ended += int(terminated | truncated)
             progress(step + 1, steps, "playing")
         if video is not None:
-            _picture.write_video(video, film, len(film), size, 1 / (every * env.step_dt))
+            drawing.write_video(video, film, len(film), size, 1 / (every * env.step_dt))
         if strip is not None:
-            _picture.write_strip(strip, stills, times)
-    facts = {
+            drawing.write_strip(strip, stills, times)
+    told = {
         "task": env.task.name, "hand": env.hand.name, "agent": agent, "seconds": steps * env.step_dt,
         "reward": sum(rewards), "episodes_ended": ended, "metric": env.task.success.metric, "files": pictures,
     }  # fmt: skip
-    rows = [
-        [key, ", ".join(map(str, value)) if isinstance(value, list) else str(value)] for key, value in facts.items()
-    ]
-    emit(facts, table(env.task.text, ["", ""], rows), as_json=as_json)
+    emit(told, facts(told, env.task.text), as_json=as_json)
+
+
+def evaluate(
+    task: TaskArgument,
+    agents: Annotated[
+        list[str] | None,
+        typer.Argument(help="Shipped policies, or folders of teachers or students; zero and random always run."),
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Per agent and seed.")] = 100,
+    seeds: Annotated[int, typer.Option(help="Evaluation seeds.")] = 3,
+    envs: EnvsOption = 32,
+    hand: HandOption = "xhand1",
+    config: ConfigOption = "default",
+    task_file: TaskFileOption = None,
+    device: DeviceOption = "cpu",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the result as JSON here too.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare agents over whole episodes: success rate with its 95 % interval, and what it does not tell.
+
+    Beside success stand the task's metric, the return, the rate of rotation about the commanded axis while anything
+    touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
+    task) ended.
+    """
+    from brainbench.core.errors import UsageError
+    from brainbench.core.files import write_json
+    from robotics_bridge.policies.evaluate import evaluate as run
+
+    if seeds < 1:
+        raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
+    touch = touch_of(list(agents or []))
+    env = make_env(task, task_file=task_file, num_envs=envs, hand=hand, config=config, device=device, **touch)
+    names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
+    found: list[dict[str, Any]] = []
+    with progress_bar() as progress:
+        for name in names:
+            result = run(
+                env, agent_of(name, env), episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress
+            )
+            found.append(result.summary())
+    if out is not None:
+        write_json(out, found)
+    columns = {
+        "agent": "{0[agent]}",
+        ">episodes": "{0[episodes]}",
+        ">success": "{0[success_rate]:.3f}",
+        ">95 %": lambda item: "{:.3f}–{:.3f}".format(*item["success_interval"]),
+        f">{env.task.success.metric}": "{0[metric]:.3g} ± {0[metric_half_width]:.2g}",
+        ">return": "{0[returns]:.4g} ± {0[returns_half_width]:.2g}",
+        ">rad/s": "{0[turn_rate]:.3g} ± {0[turn_rate_half_width]:.2g}",
+        ">s": "{0[seconds]:.3g}",
+        ">dropped": "{0[dropped]:.3f}",
+        ">diverged": "{0[diverged]}",
+    }
+    emit(found, table_of(env.task.text, found, columns), as_json=as_json)

@@ -1,13 +1,15 @@
-"""``brainbench policy train``: train the privileged teacher of a task."""
+"""``brainbench policy train | distill | sweep``: a teacher that knows everything, students that feel."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.options import part_of, with_options
+from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 from brainbench.cli.policy.options import (
     ConfigOption,
     DeviceOption,
@@ -53,15 +55,12 @@ def train(
     The run's folder holds checkpoints, log.jsonl and TensorBoard events. A killed run goes on from its last
     checkpoint exactly as if nothing had happened.
     """
-    from dataclasses import replace
-
     from robotics_bridge import tasks
     from robotics_bridge.policies.training import teacher
     from robotics_bridge.tasks.overrides import changed
 
     count = envs or (8192 if device != "cpu" else 64)
-    if task_file is not None:
-        read_task_file(task_file)
+    read_task_file(task_file)
     chosen_task = changed(tasks.load(task, config), change or ())
     env = tasks.make(chosen_task, num_envs=count, hand=hand, device=device, seed=seed)
     given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
@@ -74,9 +73,120 @@ def train(
             start=start, start_std=start_std, progress=progress,
         )  # fmt: skip
     last = dict(result.history[-1]) if result.history else {}
-    facts = {
+    told = {
         "run": result.run, "iterations": result.iterations, "control_steps": result.steps, "seconds": result.seconds,
         "reward": last.get("reward"), "success": last.get("episode/success"),
     }  # fmt: skip
-    rows = [[key, f"{value:.4g}" if isinstance(value, float) else str(value)] for key, value in facts.items()]
-    emit(facts | {"last": last}, table("", ["", ""], rows), as_json=as_json)
+    shown = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in told.items()}
+    emit(told | {"last": last}, facts(shown), as_json=as_json)
+
+
+DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
+DISTILL_FLAGS = {"variant": ("--config",), "num_envs": ("--envs",)}
+OFFERED = (
+    "observe", "placement", "resolution", "noisy", "embedder", "hand", "variant", "num_envs", "iterations",
+    "learning_rate", "epochs", "teacher_share", "teacher_iterations", "aggregate", "precision", "save_interval", "seed",
+)  # fmt: skip
+"""Fields of a student's configuration that have a flag of their name."""
+
+
+@with_options(DISTILL, OFFERED, flags=DISTILL_FLAGS, build=False)
+def distill(
+    task: TaskArgument,
+    teacher: Annotated[Path, typer.Option(help="A shipped teacher, or a folder of brainbench policy train.")],
+    options: dict[str, Any],
+    out: Annotated[Path | None, typer.Option(help="Folder of the run; by default students/<what it is>.")] = None,
+    encoder: Annotated[
+        str, typer.Option(help="mlp, rnn, tactile_cnn, tactile_convrnn, …, or a model's name; auto as published.")
+    ] = "auto",
+    learning: Annotated[str, typer.Option(help="Of a model: frozen or finetuned.")] = "frozen",
+    time: Annotated[str, typer.Option(help="Of a model: native or resampled to its own 9 ms.")] = "native",
+    pretrained: Annotated[Path | None, typer.Option(help="Weights of a tagged model.")] = None,
+    episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,
+    device: DeviceOption = "cpu",
+    stop_after: Annotated[float | None, typer.Option(help="Save, stop and evaluate after so many seconds.")] = None,
+    stop_at: Annotated[int | None, typer.Option(help="Likewise after so many iterations in all.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
+    from robotics_bridge.policies.encoders.arms import ARMS, AUTO
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+    from robotics_bridge.policies.training.students import train_student
+
+    settings: dict[str, Any] = {}
+    if encoder not in (AUTO, *ARMS):
+        settings = {"learning": learning, "time": time}
+        if pretrained is not None:
+            settings["pretrained"] = str(pretrained)
+    config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)
+    folder = out or Path("students") / config.name
+    with progress_bar() as progress:
+        student = train_student(
+            config, folder, device=device, episodes=episodes, stop_after=stop_after, stop_at=stop_at, progress=progress
+        )
+    told = describe(student)
+    lines = [f"{key}: {value}" for key, value in told.items() if value not in ("", None)]
+    emit(told, "\n".join(lines), as_json=as_json)
+    if student.result.status == "diverged":
+        raise typer.Exit(1)
+
+
+def describe(student: Any) -> dict[str, Any]:
+    """Return what is printed about a student."""
+    success = [value for item in student.evaluations for value in item["success"]]
+    return {
+        "folder": str(student.folder),
+        "status": student.result.status,
+        "reason": student.result.reason,
+        "iterations": student.result.iterations,
+        "loss": student.result.loss,
+        "success": sum(success) / len(success) if success else None,
+        "episodes": len(success),
+        "seconds": round(student.result.seconds, 1),
+    }
+
+
+def sweep(
+    file: Annotated[Path | None, typer.Argument(help="A sweep (TOML); by default table 4.10 of the thesis.")] = None,
+    subset: Annotated[str, typer.Option(help="all, types, encoders, or an observation type.")] = "all",
+    count: Annotated[bool, typer.Option("--count", help="Print how many students there are, and stop.")] = False,
+    names: Annotated[bool, typer.Option("--list", help="Print their names, and stop.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("students"),
+    shard: Annotated[str, typer.Option(help="Part of the students, as 0/4.")] = "0/1",
+    envs: Annotated[int | None, typer.Option(help="Environments at once, in place of the file's.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="In place of the file's.")] = None,
+    episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed.")] = 100,
+    device: DeviceOption = "cpu",
+    as_json: JsonOption = False,
+) -> None:
+    """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
+    from robotics_bridge.policies.report import EVALUATION
+    from robotics_bridge.policies.training.students import train_student
+    from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
+
+    found = read_sweep(file or PUBLISHED)
+    if count:
+        numbers = found.count(subset)
+        rows = [[name, str(value)] for name, value in {**numbers["entries"], **numbers["types"]}.items()]
+        more = numbers["students"] - numbers["published"]
+        extra = f" ({numbers['published']} without {', '.join(found.extra_types)})" if more else ""
+        text = table("", ["entry or type", "students"], rows, right=(1,))
+        emit(numbers, f"{text}\n\n{numbers['students']} students in {found.name}, {subset}{extra}", as_json=as_json)
+        return
+    part, parts = part_of(shard, "--shard takes")
+    changes: dict[str, Any] = {"num_envs": envs, "iterations": iterations}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    students = [replace(student, **changes) for student in found.students(subset)][part::parts]
+    if names:
+        emit([student.name for student in students], "\n".join(student.name for student in students), as_json=as_json)
+        return
+    results = []
+    for student in students:
+        folder = out / student.name
+        if (folder / EVALUATION).is_file():
+            results.append({"student": student.name, "status": "there already"})
+            continue
+        with progress_bar() as progress:
+            done = train_student(student, folder, device=device, episodes=episodes, progress=progress)
+        results.append({"student": student.name, "status": done.result.status})
+    emit(results, "\n".join(f"{item['student']}: {item['status']}" for item in results), as_json=as_json)

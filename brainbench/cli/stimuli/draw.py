@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from brainbench.cli.options import numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar
-from brainbench.cli.stimuli.options import (
+from brainbench.cli.stimuli.scenes import (
     BackendOption,
     FidelityOption,
     StimulusOption,
     WhiskersOption,
     choose_scene,
-    numbers,
     open_recipe,
 )
 from brainbench.core.errors import UsageError
@@ -57,16 +57,21 @@ def render(
 
     suffix = check_format(out, drawing.FORMATS)
     scene = choose_scene(open_recipe(source, whiskers), stimulus)
-    times = [_instant(scene, at)] if suffix == ".png" else _film(scene, at, start, stop, step)
-    target = None if look_at is None else numbers(look_at, 3, "--look-at")
+    if suffix == ".png":
+        times = [drawing.still_time(scene) if at is None else at * 1e-3]
+    elif at is not None:
+        raise UsageError("--at chooses the instant of a .png; a film takes --start, --stop and --step.")
+    else:
+        times = list(drawing.film_times(scene, start * 1e-3, None if stop is None else stop * 1e-3, step * 1e-3))
+    target = None if look_at is None else numbers(look_at, "--look-at", float, count=3)
     camera = Camera(
-        view=view if view.replace("-", "").isalpha() else numbers(view, 3, "--view"),  # type: ignore[arg-type]
+        view=view if view.replace("-", "").isalpha() else numbers(view, "--view", float, count=3),  # type: ignore[arg-type]
         projection=projection,  # type: ignore[arg-type]
-        target=None if target is None else (target[0] * 1e-3, target[1] * 1e-3, target[2] * 1e-3),
+        target=None if target is None else tuple(1e-3 * value for value in target),  # type: ignore[arg-type]
         width=None if width is None else width * 1e-3,
     )
     usual = drawing.Style().size if suffix == ".png" else drawing.FILM_SIZE
-    pixels = usual if size is None else tuple(map(int, numbers(size, 2, "--size")))
+    pixels = usual if size is None else numbers(size, "--size", count=2)
     style = drawing.Style(
         color=color,  # type: ignore[arg-type]
         moment_limit=None if moment_limit is None else moment_limit * 1e-6,
@@ -130,27 +135,13 @@ def plot(
         raise UsageError(f"{source!r} holds arrays, not forces of whiskers; there is nothing to plot.")
     low = -math.inf if start is None else start * 1e-3
     high = math.inf if stop is None else stop * 1e-3
-    pixels = numbers(size, 2, "--size")
+    pixels = numbers(size, "--size", count=2)
     paths = draw(
         stimuli.dataset,
         out,
         channel=channel,
         stimulus=stimulus,
         window=(low, high),
-        size=(int(pixels[0]), int(pixels[1])),
+        size=(pixels[0], pixels[1]),
     )
     emit({"paths": paths, "channel": channel}, "\n".join(map(str, paths)), as_json=as_json)
-
-
-def _instant(scene: Any, at: float | None) -> float:
-    from brainbench.stimuli.figures.scenes import still_time
-
-    return still_time(scene) if at is None else at * 1e-3
-
-
-def _film(scene: Any, at: float | None, start: float, stop: float | None, step: float) -> list[float]:
-    from brainbench.stimuli.figures.scenes import film_times
-
-    if at is not None:
-        raise UsageError("--at chooses the instant of a .png; a film takes --start, --stop and --step.")
-    return list(film_times(scene, start * 1e-3, None if stop is None else stop * 1e-3, step * 1e-3))

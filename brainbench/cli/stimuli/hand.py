@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 
 if TYPE_CHECKING:
     from robotics_bridge.exploration.record import Explored
@@ -65,17 +65,25 @@ def hand(
     if out is not None:
         write_stimulus_set(dataset, out)
     force = np.linalg.norm(found.wrench[..., :3], axis=-1)
-    rows, data = [], []
-    for label, felt in zip(found.labels, force, strict=True):
-        touched = int((felt.max(axis=0) > 1e-3).sum())
-        facts = {"stimulus": label, "sites_touched": touched, "peak_force_N": float(felt.sum(axis=1).max())}
-        data.append(facts)
-        rows.append([label, f"{touched} of {felt.shape[1]}", f"{facts['peak_force_N']:.3g}"])
+    sites = force.shape[-1]
+    data = [
+        {
+            "stimulus": label,
+            "sites_touched": int((felt.max(axis=0) > 1e-3).sum()),
+            "peak_force_N": float(felt.sum(axis=1).max()),
+        }
+        for label, felt in zip(found.labels, force, strict=True)
+    ]
     silent = [item["stimulus"] for item in data if not item["sites_touched"]]
     title = (
         f"{found.hand}, {placement}, {resolution}; one unit = {calibration.force:.3g} N, {calibration.moment:.3g} N·m"
     )
-    text = table(title, ["stimulus", "sites touched", "peak force N"], rows, right=(1, 2))
+    columns = {
+        "stimulus": "{0[stimulus]}",
+        ">sites touched": lambda item: f"{item['sites_touched']} of {sites}",
+        ">peak force N": "{0[peak_force_N]:.3g}",
+    }
+    text = table_of(title, data, columns)
     if silent:
         text += f"\n\n{len(silent)} never touch a taxel: {', '.join(silent)}."
     result: dict[str, Any] = {

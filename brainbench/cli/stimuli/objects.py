@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, facts, table
 
 if TYPE_CHECKING:
     from brainbench.geometry import DecompositionSettings, Mesh
@@ -137,26 +137,24 @@ def _measures(mesh: Mesh, solid: Solid) -> dict[str, Any]:
 def _text(data: dict[str, Any]) -> str:
     size = " × ".join(f"{value:.4g}" for value in data["size_mm"])
     volume = "unknown: not closed" if data["volume_mm3"] is None else f"{data['volume_mm3']:.4g} mm³"
-    rows = [["object", f"{data['name']}: {data['description']}" if "description" in data else data["name"]]]
+    rows = {"object": f"{data['name']}: {data['description']}" if "description" in data else data["name"]}
     if "parameters" in data:
-        drawn = [
-            f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}"
-            for key, value in data["parameters"].items()
-        ]
-        rows.append(["drawn", ", ".join(drawn)])
+        drawn = data["parameters"].items()
+        rows["drawn"] = ", ".join(f"{key} {f'{one:.3g}' if isinstance(one, float) else one}" for key, one in drawn)
     if "as_read" in data:
-        rows.append(["as read", data["as_read"]])
-    rows += [
-        ["surface", f"{data['diagnosis']}, {data['triangles']:,} triangles"],
-        ["size", f"{size} mm, diagonal {data['diagonal_mm']:.4g} mm"],
-        ["volume", volume],
-        ["touched", _touched(data["convex_parts"])],
-        *([["note" if i == 0 else "", note] for i, note in enumerate(data["notes"])]),
-        ["hash", data["content_hash"]],
-    ]
+        rows["as read"] = data["as_read"]
+    rows |= {
+        "surface": f"{data['diagnosis']}, {data['triangles']:,} triangles",
+        "size": f"{size} mm, diagonal {data['diagonal_mm']:.4g} mm",
+        "volume": volume,
+        "touched": _touched(data["convex_parts"]),
+    }
+    if data["notes"]:
+        rows["note"] = "\n".join(data["notes"])
+    rows["hash"] = data["content_hash"]
     if "export" in data:
-        rows.append(["written", f"{data['export']} (mm)"])
-    return table("", ["", ""], rows)
+        rows["written"] = f"{data['export']} (mm)"
+    return facts(rows)
 
 
 def _touched(parts: int) -> str:

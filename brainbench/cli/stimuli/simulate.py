@@ -1,4 +1,4 @@
-"""``brainbench stimuli simulate``: from scenes to a file of forces."""
+"""``brainbench stimuli simulate | separability``: from scenes to forces, and what can be told from them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
-from brainbench.cli.stimuli.options import BackendOption, FidelityOption, WhiskersOption
+from brainbench.cli.options import items, numbers
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
@@ -41,16 +42,13 @@ def simulate(
         write_stimulus_set(dataset, out)
     data: dict[str, Any] = {"content_hash": stimuli.content_hash, "stimuli": _summary(dataset), "path": out}
     whiskers_in_all = dataset.sizes["whisker"]
-    rows = [
-        [
-            item["stimulus"],
-            f"{len(item['whiskers_touched'])} of {whiskers_in_all}",
-            f"{item['peak_force_mN']:.3g}",
-            f"{item['peak_moment_uNm']:.3g}",
-        ]
-        for item in data["stimuli"]
-    ]
-    text = table(stimuli.description, ["stimulus", "whiskers touched", "peak force mN", "peak moment µN·m"], rows)
+    columns = {
+        "stimulus": "{0[stimulus]}",
+        "whiskers touched": lambda item: f"{len(item['whiskers_touched'])} of {whiskers_in_all}",
+        "peak force mN": "{0[peak_force_mN]:.3g}",
+        "peak moment µN·m": "{0[peak_moment_uNm]:.3g}",
+    }
+    text = table_of(stimuli.description, data["stimuli"], columns)
     if told is not None:
         data["explanation"] = told
         text += f"\n\n{told}"
@@ -77,3 +75,53 @@ def _summary(dataset: Any) -> list[dict[str, Any]]:
         }
         for label, hits, peak, bend in zip(labels, touched, force, moment, strict=True)
     ]
+
+
+def separability(
+    folder: Annotated[Path, typer.Argument(help="Data set that brainbench stimuli sweep --out made.")],
+    classes: Annotated[
+        str | None, typer.Option(help="Classes, with commas between them. [default: the four with the most objects]")
+    ] = None,
+    counts: Annotated[str, typer.Option(help="How many classes at a time, with commas between them.")] = "2,3,4",
+    sweeps_per_class: Annotated[int, typer.Option(min=2, help="Sweeps drawn of each class.")] = 400,
+    split: Annotated[str, typer.Option(help="all, train, validation or test.")] = "all",
+    seed: Annotated[int, typer.Option(help="Of the draw, the folds and the resampling.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Train support vector machines on 2, 3 and 4 classes; print their accuracy on new objects against chance."""
+    from brainbench.datasets.whisking.dataset import WhiskingDataset
+    from brainbench.datasets.whisking.separability import separability as measure
+
+    data = WhiskingDataset(folder, split=split, view="raw")
+    names = None if classes is None else items(classes)
+    with progress_bar() as progress:
+        found = measure(
+            data,
+            classes=names,
+            counts=numbers(counts, "--counts"),
+            sweeps_per_class=sweeps_per_class,
+            seed=seed,
+            progress=progress,
+        )
+    used = dict.fromkeys(name for item in found for choice in item.choices for name in choice)
+    title = f"{', '.join(used)}: {found[0].objects} objects, {found[0].sweeps} sweeps"
+    columns = {
+        "classes": "{0.count}",
+        "accuracy": "{0.accuracy:.3f}",
+        "95 % interval": "[{0.interval.low:.3f}, {0.interval.high:.3f}]",
+        "chance": "{0.chance:.3f}",
+        "": lambda item: (
+            ("above chance" if item.above_chance else "not above chance")
+            + (f" ({item.status}: {item.reason})" if item.status != "ok" else "")
+        ),
+    }
+    text = table_of(title, found, columns)
+    if data.skipped:
+        text += f"\n\n{data.skipped} unstable sweeps were left out"
+    result = {
+        "content_hash": data.manifest["content_hash"],
+        "split": split,
+        "unstable": data.skipped,
+        "results": [{**vars(item), "above_chance": item.above_chance} for item in found],
+    }
+    emit(result, text, as_json=as_json)

@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
-from brainbench.cli.stimuli.options import BackendOption, FidelityOption, WhiskersOption
+from brainbench.cli.options import with_options
+from brainbench.cli.output import JsonOption, emit, facts, progress_bar
+from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.plan import GenerationPlan
 
+SETTINGS = "brainbench.stimuli.sweeps.plan:Settings"
+OFFERED = ("split", "limit", "sample", "seed", "device", "shard_size", "retry")
 _SHOWN = 8
 
 
+@with_options(SETTINGS, OFFERED, build=False)
 def sweep(
     grid: Annotated[str, typer.Argument(help="thesis-low or thesis-high.")],
     objects: Annotated[
@@ -36,22 +40,13 @@ def sweep(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Simulate, into shards and a manifest in this folder.")
     ] = None,
-    split: Annotated[str, typer.Option(help="Train, validation and test (80/10/10) by object or by sweep.")] = "object",
-    limit: Annotated[int | None, typer.Option(min=1, help="Only the first sweeps of each object.")] = None,
-    sample: Annotated[float | None, typer.Option(help="Only this fraction of all sweeps, drawn at random.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the split, the order of the objects and the sample.")] = 0,
+    options: Any = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) do it.")
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu, or cuda with a backend that runs there.")] = "cpu",
-    shard_size: Annotated[int | None, typer.Option(min=1, help="Sweeps per shard. [default: by backend]")] = None,
-    retry: Annotated[
-        int,
-        typer.Option(min=1, help="Divides the steps of whiskers that cannot be trusted and are simulated again (rod)."),
-    ] = 5,
     unit: Annotated[str | None, typer.Option(help="Length unit of mesh files: m, cm, mm, …")] = None,
     collision: Annotated[str | None, typer.Option(help="What whiskers touch: hull, exact, decomposition, …")] = None,
     whiskers: WhiskersOption = "all",
@@ -77,31 +72,18 @@ def sweep(
         [*(objects or ()), *(more_objects or ())], unit=unit, collision=collision, surfaces=surfaces
     )
     scenes = SweepScenes(GRIDS[grid], {name: item.load for name, item in found.items()}, whiskers=whiskers)
-    settings = Settings(
-        Fidelity.parse(fidelity),
-        backend=backend,
-        device=device,
-        split=split,  # type: ignore[arg-type]
-        seed=seed,
-        limit=limit,
-        sample=sample,
-        shard_size=shard_size,
-        retry=retry,
-    )
+    settings = Settings(Fidelity.parse(fidelity), backend=backend, **options)
     plan = GenerationPlan(grid, GRIDS[grid], found, settings, whiskers)
     summary = counts(scenes)
-    rows = [
-        ["objects", f"{summary['objects']} of {len(plan.classes)} classes"],
-        ["sweeps per object", f"{summary['sweeps_per_object']}"],
-        [
-            "scenes",
-            f"{summary['scenes']:,} of {summary['whiskers']} whiskers, {summary['bytes'] / 1e6:.3g} MB of forces",
-        ],
-        ["published", summary["published"]],
-        ["data set", _describe(plan)],
-    ]
+    shown = {
+        "objects": f"{summary['objects']} of {len(plan.classes)} classes",
+        "sweeps per object": summary["sweeps_per_object"],
+        "scenes": f"{summary['scenes']:,} of {summary['whiskers']} whiskers, {summary['bytes'] / 1e6:.3g} MB of forces",
+        "published": summary["published"],
+        "data set": _describe(plan),
+    }
     data: dict[str, Any] = {**summary, "classes": len(plan.classes), "shards": len(plan.shards), "files": []}
-    text = table(grid, ["", ""], rows)
+    text = facts(shown, grid)
     if out is None:
         data["labels"] = list(scenes.labels)
         first = "\n".join(data["labels"][:_SHOWN])
@@ -145,12 +127,12 @@ def _generate(
         "files": [out / shard["name"] for shard in manifest["shards"]],
     }
     unusable = {name: item["unusable"] for name, item in manifest["objects"].items() if "unusable" in item}
-    rows = [
-        ["steps", f"{manifest['steps']:,} of {manifest['steps_in_full']:,} computed ({saved:.0%} saved)"],
-        ["unstable", f"{manifest['unstable']:,} of {manifest['sweeps']:,} sweeps, marked in the shards"],
-        *([["unusable", f"{name}: {reason}"] for name, reason in unusable.items()]),
-        ["hash", manifest["content_hash"]],
-        ["time", f"{seconds:.1f} s in this run"],
-        ["data set", f"{out} (manifest.json, {len(manifest['shards'])} shards)"],
-    ]
-    return data, table("", ["", ""], rows)
+    rows = {
+        "steps": f"{manifest['steps']:,} of {manifest['steps_in_full']:,} computed ({saved:.0%} saved)",
+        "unstable": f"{manifest['unstable']:,} of {manifest['sweeps']:,} sweeps, marked in the shards",
+        "unusable": "\n".join(f"{name}: {reason}" for name, reason in unusable.items()),
+        "hash": manifest["content_hash"],
+        "time": f"{seconds:.1f} s in this run",
+        "data set": f"{out} (manifest.json, {len(manifest['shards'])} shards)",
+    }
+    return data, facts({name: value for name, value in rows.items() if value})

@@ -49,7 +49,9 @@ class ExperimentDesign:
     """
 
     stimuli: int = 6
+    """Number of stimuli."""
     animals: int = 11
+    """Number of animals."""
     effect: float = 0.5
     """True noise-corrected score of the model, −1 … 1; 0 gives the rate of false alarms."""
     consistency: float = 0.8
@@ -57,7 +59,9 @@ class ExperimentDesign:
     reliability: float = 0.8
     """Reliability of one animal's RDM, 0 … 1."""
     layers: int = 1
+    """Layers among which one is chosen; one of them has the effect."""
     alpha: float = 0.05
+    """Level of the test."""
 
     def __post_init__(self) -> None:
         """Refuse what no experiment can be."""

@@ -33,17 +33,17 @@ class TrainingConfig:
     model: str
     """Registry name without a tag."""
     objective: str = "supervised"
-    """One of :data:`~brainbench.models.architecture.OBJECTIVES`."""
+    """``supervised``, ``simclr``, ``simsiam`` or ``ae``; ``simsiam-warmup`` names a recipe of its own."""
     optimizer: str = "sgd"
-    """One of :data:`~brainbench.models.training.optimizers.OPTIMIZERS`."""
+    """``sgd``, ``adam``, ``adamw`` or ``lars``."""
     schedule: str = "step"
-    """One of :data:`~brainbench.models.training.optimizers.SCHEDULES`."""
+    """``step``, ``constant`` or ``cosine``."""
     learning_rate: float = 1e-2
     """Highest learning rate."""
     warmup_epochs: int = 0
     """Epochs in which the rate of the ``cosine`` schedule rises from 1e-4 of its highest."""
     epochs: int = EPOCHS
-    """Passes through the training sweeps."""
+    """Passes through the training sweeps (published: 100)."""
     batch_size: int = BATCH_SIZE
     """Sweeps per optimiser step, over all processes."""
     decoder: str = "linear"
@@ -51,7 +51,7 @@ class TrainingConfig:
     augmentation: str = "physical"
     """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.training.augmentation`)."""
     masking: float = 0.0
-    """Share of masked time steps."""
+    """Share of masked time steps (published with 0.75)."""
     precision: str = "auto"
     """``float32``, ``bf16`` (mixed precision with float32 weights), or ``auto``: bf16 on CUDA and float32 on the CPU,
     where PyTorch's half-precision gradients of small convolutions are slower and now and then not finite."""

@@ -44,7 +44,9 @@ class Settings:
     fidelity: Fidelity
     backend: str = DEFAULT_ENGINE
     device: str = "cpu"
+    """``cpu``, or ``cuda`` with a backend that runs there."""
     split: SplitBy = "object"
+    """Train, validation and test (80/10/10) by ``object`` or by ``sweep``."""
     seed: int = 0
     """Seed of the split, of the order of the objects and of the sample; the grid has a seed of its own."""
     limit: int | None = None

@@ -30,23 +30,23 @@ class DistillConfig:
     teacher: str = ""
     """Folder of the teacher's run, or the name of a shipped teacher."""
     hand: str = "xhand1"
-    """Name or file (:func:`robotics_bridge.hands.load`)."""
+    """``xhand1``, ``sharpa``, or a URDF or MJCF file."""
     variant: str = "default"
     """Configuration of the task: ``default`` or ``published``."""
     observe: str = "force_torque"
-    """Observation type of table 4.3, or ``agg_bool``."""
+    """Tactile observation type (table 4.3), ``agg_bool``, or ``none``."""
     placement: str = "hand"
     """Where taxels sit: ``tips``, ``fingers``, ``palm`` or ``hand``."""
     resolution: str = "med"
-    """How many there are: ``low``, ``med`` or ``high``."""
+    """How many taxels there are: ``low``, ``med`` or ``high``."""
     noisy: bool = False
-    """Whether they have the published noise (table 4.12)."""
+    """Taxels with the published noise (table 4.12)."""
     encoder: str = AUTO
     """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`: time, learning, seed, …"""
     embedder: str = "mlp"
-    """Of flat groups: ``none``, ``mlp`` or ``lstm``."""
+    """Embedder of joints and goal: ``none``, ``mlp`` or ``lstm``."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Widths of the head's layers."""
     num_envs: int = 4096
@@ -54,9 +54,11 @@ class DistillConfig:
     steps_per_env: int = 24
     """Control steps of every environment in an iteration."""
     iterations: int | None = None
+    """Iterations in all; by default the task's own (table 4.4)."""
     learning_rate: float | None = None
+    """Learning rate; by default the task's own (table 4.4)."""
     epochs: int | None = None
-    """Passes over the steps of an iteration."""
+    """Passes over the steps of an iteration; by default the task's own."""
     gradient_length: int | None = None
     """Steps through which gradients flow back in time."""
     clip: float | None = None
@@ -74,9 +76,9 @@ class DistillConfig:
     save_interval: int = 100
     """Iterations from one saved state to the next."""
     seed: int = 0
-    """Of weights, episodes and the teacher's share."""
+    """Seed of weights, episodes and the teacher's share."""
     precision: str = "float32"
-    """Of the tactile encoder in learning and acting: ``float32`` or ``bf16`` (mixed). The rest is single."""
+    """Precision of the tactile encoder in learning and acting: ``float32`` or ``bf16`` (mixed). The rest is single."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))

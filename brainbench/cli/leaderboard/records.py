@@ -1,4 +1,4 @@
-"""``brainbench leaderboard add``: take in records, or score models into a folder of records."""
+"""``brainbench leaderboard add | verify``: take in records, score models into a folder of them, and check them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, SelectOption, WindowOption, emit, progress_bar
+from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 
 if TYPE_CHECKING:
     from brainbench.cli.leaderboard.scoring import ScoringJob
     from brainbench.core.records import ResultRecord
 
+OFFERED = (
+    "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric", "estimator", "time"
+)  # fmt: skip
+"""Options of a score that have a flag here; a batch file can set the others too."""
 
+
+@with_options(SCORE, OFFERED, flags=SCORE_FLAGS, given=True, help="As in brainbench score.")
 def add(
     records: Annotated[list[Path] | None, typer.Argument(help="Record files or folders of them to take in.")] = None,
     to: Annotated[Path, typer.Option("--to", "-o", help="Folder of the leaderboard's records.")] = Path(
@@ -24,16 +31,7 @@ def add(
     ] = None,
     seeds: Annotated[str, typer.Option("--seed", "--seeds", help="Seeds of untrained weights: 0, 0-4 or 0,3.")] = "0",
     batch: Annotated[Path | None, typer.Option(help="TOML file that names many models and their seeds.")] = None,
-    recordings: Annotated[str | None, typer.Option("--recordings", "-r", help="As in brainbench score.")] = None,
-    conditions: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    select: SelectOption = None,
-    window: WindowOption = None,
-    stimuli: Annotated[str | None, typer.Option("--stimuli", "-s", help="As in brainbench score.")] = None,
-    fidelity: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    whiskers: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    metric: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    estimator: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    time: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    options: Any = None,
     keep_both: Annotated[
         bool, typer.Option("--keep-both", help="Take in a record although one there states other numbers.")
     ] = False,
@@ -49,20 +47,15 @@ def add(
     states other numbers for the same computation. Scores that are there already are not computed again, so an
     interrupted batch goes on where it stopped, and a stale one is renewed.
     """
-    from brainbench.cli.leaderboard.scoring import ScoringJob, find_models, parse_seeds, read_batch
+    from brainbench.cli.leaderboard.scoring import jobs_of, parse_seeds, read_batch
     from brainbench.core.errors import UsageError
 
-    given = {"recordings": recordings, "stimuli": stimuli, "fidelity": fidelity, "whiskers": whiskers}
-    given |= {"conditions": conditions, "select": select, "window": window}
-    given |= {"metric": metric, "estimator": estimator, "time": time}
-    options = {name: value for name, value in given.items() if value is not None}
     jobs: list[ScoringJob] = []
     if model:
-        names, counts = find_models(model), parse_seeds(seeds)
+        first, *others = parse_seeds(seeds)
         # Trained weights do not depend on a seed.
-        jobs = [
-            ScoringJob(name, seed, options) for name in names for seed in (counts if "." not in name else counts[:1])
-        ]
+        jobs = jobs_of(model, [first], options)
+        jobs += [job for job in jobs_of(model, others, options) if "." not in job.model]
         if not jobs:
             raise UsageError(f"No model matches {', '.join(map(repr, model))}; see them with: brainbench models list")
     if batch is not None:
@@ -137,14 +130,12 @@ def _present(to: Path) -> list[Any]:
 
 
 def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
-    """Tell whether two records answer the same question, the old one with what has since changed."""
+    """Return whether two records answer the same question, the old one with what has since changed."""
     settings = ("weights_seed", "metric", "estimator", "time", "whiskers", "stimuli", "layers")
 
     def question(record: ResultRecord) -> tuple[Any, ...]:
-        said = record.score.provenance
-        stated = said.get("settings") or {}
-        source = (said.get("recordings") or {}).get("source")
-        return (record.score.name, source, *(stated.get(name) for name in settings))
+        origin = record.score.provenance
+        return (record.score.name, origin.recordings.get("source"), *(origin.settings.get(name) for name in settings))
 
     return question(new) == question(old)
 
@@ -159,15 +150,15 @@ def _score(jobs: list[ScoringJob], to: Path, *, prune: bool) -> list[dict[str, A
     done: list[dict[str, Any]] = []
     with progress_bar() as progress:
         present = _present(to)
-        open_jobs = missing(jobs, [item.record for item in present], options=jobs[0].options)
+        open_jobs = missing(jobs, [item.record for item in present])
         done += [
-            {"state": "known", "record": None, "model": f"{job.model} seed {job.weights_seed}", "note": ""}
+            {"state": "known", "record": None, "model": f"{job.model} seed {job.options.model_seed}", "note": ""}
             for job in jobs
             if job not in open_jobs
         ]
         for index, job in enumerate(open_jobs):
             progress(index, len(open_jobs), "models scored")
-            record = score_record(job.model, weights_seed=job.weights_seed, command=job.command, **job.options)
+            record = score_record(job.model, job.options, command=job.command)
             path = write_record(record, to)
             replaced = [item for item in present if prune and item.path != path and _replaces(record, item.record)]
             for item in replaced:
@@ -175,3 +166,76 @@ def _score(jobs: list[ScoringJob], to: Path, *, prune: bool) -> list[dict[str, A
             note = "".join(f"\n          replaces {item.path.name}" for item in replaced)
             done.append({"state": "scored", "record": path.name, "model": job.model, "note": note})
     return done
+
+
+def verify(
+    records: Annotated[list[Path], typer.Argument(help="Record files or folders of them.")],
+    recordings: Annotated[
+        str | None, typer.Option("--recordings", "-r", help="Where the recordings are, if not 'demo'.")
+    ] = None,
+    score: Annotated[
+        bool, typer.Option("--score/--no-score", help="Score the model again and compare; else only read the files.")
+    ] = True,
+    tolerance: Annotated[float, typer.Option(help="Numbers that differ by no more are equal.")] = 1e-3,
+    as_json: JsonOption = False,
+) -> None:
+    """Check records: the file against its hash, the records against one another, the numbers against a repetition.
+
+    Exit status 1 if a file was edited or a repetition gives something else; what differs is printed.
+    """
+    from leaderboards.audit import remarks
+    from leaderboards.store import read_records
+
+    stored = read_records(records)
+    doubts = remarks(stored)
+    results: list[dict[str, Any]] = []
+    with progress_bar() as progress:
+        for index, item in enumerate(stored):
+            progress(index, len(stored), "records verified")
+            result: dict[str, Any] = {"record": item.path.name, "verdict": "refused", "problem": item.problem}
+            if item.record is not None:
+                result |= {"verdict": "intact", "doubts": doubts.get(item.record.identity, ())}
+                if score:
+                    result |= _repeat(item.record, recordings, tolerance)
+            results.append(result)
+    emit(results, "\n".join(_verdict(result) for result in results), as_json=as_json)
+    if any(result["verdict"] in ("refused", "differs", "not repeated") for result in results):
+        raise typer.Exit(1)
+
+
+def _repeat(record: Any, recordings: str | None, tolerance: float) -> dict[str, Any]:
+    from brainbench.cli.leaderboard.scoring import score_again
+    from brainbench.core.errors import BrainbenchError
+    from leaderboards.changes import differences
+
+    try:
+        again = score_again(record, recordings=recordings)
+    except BrainbenchError as error:
+        return {"verdict": "not repeated", "problem": str(error)}
+    found = differences(record, again, tolerance=tolerance)
+    return {"verdict": "differs" if found else "confirmed", "differences": found, "value": again.score.value}
+
+
+def _verdict(result: dict[str, Any]) -> str:
+    words = {
+        "confirmed": "confirmed: scored again with the same result",
+        "intact": "intact: the file fits its hash (not scored again)",
+        "differs": "differs: scored again with another result",
+        "not repeated": f"not repeated: {result['problem']}",
+        "refused": f"refused: {result['problem']}",
+    }
+    lines = [f"{result['record']}\n  {words[result['verdict']]}"]
+    lines += [f"  {doubt}" for doubt in result.get("doubts", ())]
+    if found := result.get("differences"):
+        columns = {
+            "what": "{0.what}",
+            "record": lambda item: _short(item.before),
+            "now": lambda item: _short(item.after),
+        }
+        lines.append(table_of("", found[:12], columns))
+        lines += [f"  and {len(found) - 12} more"] if len(found) > 12 else []
+    return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""``brainbench stimuli list`` and ``show``: which recipes there are, and what stands in a scene."""
+"""``brainbench stimuli list | show``: the recipes, and what stands in a scene; what a SOURCE of the commands names."""
 
 from __future__ import annotations
 
@@ -8,16 +8,71 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.options import SCORE, option
 from brainbench.cli.output import JsonOption, emit, table
-from brainbench.cli.stimuli.options import StimulusOption, choose_scene, open_recipe
+from brainbench.core.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from brainbench.stimuli import Recipe, Scene
 
+WhiskersOption = Annotated[str, option(SCORE, "whiskers")]
+FidelityOption = Annotated[
+    str,
+    typer.Option(
+        help="Simulation preset: fast, balanced or accurate; single values may follow, as in "
+        "fast,links=12,time_step=5e-4,solver=quasistatic."
+    ),
+]
+BackendOption = Annotated[str, typer.Option(help="Physics engine: rod (our own), mujoco, or bullet.")]
+StimulusOption = Annotated[
+    str | None, typer.Option("--stimulus", "-s", help="Label of the stimulus; needed where there are several.")
+]
+
 _SHOWN = 20
 """Scenes that are printed in full; any number is written as JSON."""
+
+
+def open_recipe(source: str, whiskers: str) -> Recipe:
+    """Return the scenes that a recipe name or a scene file holds.
+
+    Raises:
+        UsageError: there is no such recipe, or the file holds finished forces.
+    """
+    from brainbench.stimuli import get_recipe, list_recipes, load_scene
+
+    suffix = Path(source).suffix
+    if suffix == ".toml":
+        return load_scene(source, whiskers=whiskers)
+    if suffix in (".h5", ".hdf5", ".nc"):
+        raise UsageError(
+            f"{source!r} is a file of forces, in which objects and whiskers have no shape; give the recipe or the "
+            "scene file (.toml) that it was made from."
+        )
+    if Path(source).is_file():
+        raise UsageError(
+            f"{source!r} is no scene file; scene files end in .toml. Recipes: {', '.join(list_recipes())}."
+        )
+    return get_recipe(source, whiskers=whiskers)
+
+
+def choose_scene(recipe: Recipe, stimulus: str | None) -> Scene:
+    """Return the scene of a recipe that ``stimulus`` names, or its only one.
+
+    Raises:
+        UsageError: there is no such scene, or there are several and none was named.
+    """
+    if stimulus is None:
+        if len(recipe.scenes) == 1:
+            return recipe.scenes[0]
+        raise UsageError(
+            f"{recipe.name!r} has {len(recipe.scenes)} scenes and one is drawn at a time; choose with --stimulus "
+            f"({', '.join(recipe.labels[:8])}{', …' if len(recipe.labels) > 8 else ''})."
+        )
+    if stimulus not in recipe.labels:
+        raise unknown_name("stimulus", stimulus, recipe.labels)
+    return recipe.scenes[recipe.labels.index(stimulus)]
 
 
 def list_(as_json: JsonOption = False) -> None:
@@ -25,7 +80,7 @@ def list_(as_json: JsonOption = False) -> None:
     from brainbench.stimuli import describe_recipe, list_recipes
 
     recipes = {name: describe_recipe(name).strip() for name in list_recipes()}
-    emit(recipes, table("", ["recipe", ""], [[name, text] for name, text in recipes.items()]), as_json=as_json)
+    emit(recipes, table("", ["recipe", ""], [list(item) for item in recipes.items()]), as_json=as_json)
 
 
 def show(
@@ -64,8 +119,6 @@ def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:
 
 def _of_file(dataset: xr.Dataset, stimulus: str | None) -> dict[str, Any]:
     import json
-
-    from brainbench.core.errors import unknown_name
 
     scenes = json.loads(dataset.attrs["scene"])
     labels = [scene["label"] for scene in scenes]

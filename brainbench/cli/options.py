@@ -1,0 +1,191 @@
+"""Options of the commands, made from the dataclasses that state them.
+
+A command decorated with :func:`with_options` takes one parameter ``options`` and has, in its place, one flag per field
+of a dataclass: the name, kind and default of the field, and its docstring as the help. The source of the dataclass is
+parsed, not imported, so that ``--help`` stays quick whatever its package loads.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brainbench.core.errors import UsageError
+
+SCORE = "brainbench.scoring.options:ScoreOptions"
+SCORE_FLAGS = {
+    "recordings": ("--recordings", "-r"),
+    "stimuli": ("--stimuli", "-s"),
+    "explain": ("--explain-estimator",),
+}
+"""Flags of fields of :class:`~brainbench.scoring.ScoreOptions` that are not just their names."""
+
+_KINDS: dict[str, Any] = {"str": str, "int": int, "float": float, "bool": bool, "Path": Path}
+
+
+@dataclass(frozen=True)
+class OptionField:
+    """One field of a dataclass as an option."""
+
+    kind: Any
+    """Of one value on the command line."""
+    several: bool
+    """True for a tuple, which is written with commas."""
+    default: Any
+    help: str
+
+    def parameter(self, name: str, flags: tuple[str, ...], default: Any) -> inspect.Parameter:
+        """Return the parameter of a typer command."""
+        # A switch that is off by default has no opposite.
+        flags = flags or ((f"--{name.replace('_', '-')}",) if self.kind is bool and not default else ())
+        hint = Annotated[self.kind if default is not None else self.kind | None, typer.Option(*flags, help=self.help)]
+        return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
+
+    def value(self, given: Any) -> Any:
+        """Return what a field holds for a value of the command line."""
+        return tuple(items(given)) if self.several and given is not None else given
+
+
+@cache
+def option_fields(kind: str) -> Mapping[str, OptionField]:
+    """Return the fields of the dataclass ``package.module:Class`` by name, from its source."""
+    module, _, wanted = kind.partition(":")
+    package, *parts = module.split(".")
+    origin = getattr(find_spec(package), "origin", None)
+    assert origin is not None, kind
+    source = Path(origin).parent.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
+    (body,) = (node.body for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == wanted)
+    found = {}
+    for node, after in zip(body, [*body[1:], None], strict=True):
+        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
+            continue
+        text = ast.unparse(node.annotation)
+        said = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
+        found[node.target.id] = OptionField(
+            kind=_KINDS[(re.findall(rf"\b({'|'.join(_KINDS)})\b", text) or ["str"])[0]],
+            several=text.startswith("tuple"),
+            default=node.value.value if isinstance(node.value, ast.Constant) else None,
+            help=_plain(str(said)),
+        )
+    return found
+
+
+def with_options(
+    kind: str,
+    names: Iterable[str] | None = None,
+    *,
+    flags: Mapping[str, tuple[str, ...]] | None = None,
+    build: bool = True,
+    given: bool = False,
+    help: str | None = None,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a command so that its parameter ``options`` is filled from flags.
+
+    Args:
+        kind: The dataclass, ``package.module:Class``.
+        names: Fields that have a flag; all of them by default.
+        flags: Flags of a field, where they are not its name with hyphens.
+        build: Hand over the dataclass; else a mapping of its fields.
+        given: Hand over a mapping of the values that were given; no flag has a default then.
+        help: One help for all of them, in place of their docstrings.
+    """
+    known = option_fields(kind)
+    chosen = list(known if names is None else names)
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        parameters = []
+        for own in inspect.signature(command, eval_str=True).parameters.values():
+            if own.name != "options":
+                parameters.append(own.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+                continue
+            for name in chosen:
+                field, default = known[name], None if given else known[name].default
+                if help is not None:
+                    field = OptionField(field.kind, field.several, field.default, help)
+                parameters.append(field.parameter(name, (flags or {}).get(name, ()), default))
+
+        def run(**values: Any) -> None:
+            options = {name: known[name].value(values.pop(name)) for name in chosen}
+            if given:
+                options = {name: value for name, value in options.items() if value is not None}
+            module, _, wanted = kind.partition(":")
+            made = getattr(import_module(module), wanted)(**options) if build and not given else options
+            command(options=made, **values)
+
+        run.__doc__, run.__name__ = command.__doc__, command.__name__
+        run.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+        run.__annotations__ = {item.name: item.annotation for item in parameters}
+        return run
+
+    return decorate
+
+
+def option(kind: str, name: str, *flags: str) -> Any:
+    """Return typer's description of an option whose help is that of a field of a dataclass."""
+    return typer.Option(*flags, help=option_fields(kind)[name].help)
+
+
+def as_flags(kind: str, options: Any, flags: Mapping[str, tuple[str, ...]]) -> list[str]:
+    """Return the words of a command line that give a dataclass: the fields that differ from their defaults."""
+    words: list[str] = []
+    for field in fields(options):
+        value, told = getattr(options, field.name), option_fields(kind)[field.name]
+        if value == field.default:
+            continue
+        flag = flags.get(field.name, (f"--{field.name.replace('_', '-')}",))[0]
+        if told.kind is bool:
+            words.append(flag if value else f"--no-{flag.removeprefix('--')}")
+        else:
+            words += [flag, ",".join(value) if told.several else str(value)]
+    return words
+
+
+def items(text: str) -> list[str]:
+    """Return the texts between commas."""
+    return [item.strip() for item in text.split(",") if item.strip()]
+
+
+def numbers(text: str, what: str, kind: Callable[[str], Any] = int, *, count: int | None = None) -> tuple[Any, ...]:
+    """Return numbers written with commas (or, where there is a ``count`` of them, with x or ×) between them.
+
+    Raises:
+        UsageError: it is something else.
+    """
+    try:
+        values = tuple(kind(item) for item in (items(text) if count is None else re.split(r"[,x×]", text)))
+    except ValueError as error:
+        values, cause = None, error
+    else:
+        cause = None
+    if values is None or (count is not None and len(values) != count):
+        of = f"{count} numbers" if count is not None else "whole numbers" if kind is int else "numbers"
+        raise UsageError(f"{what} takes {of} joined by commas; received {text!r}.") from cause
+    return values
+
+
+def part_of(text: str, what: str) -> tuple[int, int]:
+    """Return the number and the count of ``NUMBER/COUNT``, the number from 0.
+
+    Raises:
+        UsageError: it is something else.
+    """
+    number, _, count = text.partition("/")
+    if not (number.isdigit() and count.isdigit() and int(number) < int(count)):
+        raise UsageError(f"{what} NUMBER/COUNT, the number from 0, such as 0/4; received {text!r}.")
+    return int(number), int(count)
+
+
+def _plain(text: str) -> str:
+    """Return a docstring without its markup."""
+    text = re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text).replace("``", "")
+    return " ".join(text.split())

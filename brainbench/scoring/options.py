@@ -1,0 +1,118 @@
+"""Options of a score, stated once.
+
+The flags of ``brainbench score``, the keywords of :func:`brainbench.score`, the ``[options]`` of a batch file of
+``brainbench leaderboard add``, and the settings in a record's provenance are these fields.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.errors import unknown_name
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from brainbench.datasets import Selection, Window
+    from brainbench.metrics import Metric
+    from brainbench.stimuli import Fidelity, Stimuli
+
+TIME_RULES = ("mean", "concatenate")
+
+_ELSEWHERE = ("recordings", "match", "explain")
+"""Fields whose effect stands in other entries of the provenance: ``recordings``, ``pairs`` and ``statistics``."""
+
+
+@dataclass(frozen=True)
+class ScoreOptions:
+    """How a model is scored against recordings.
+
+    Raises:
+        UsageError: an unknown rule for time.
+    """
+
+    recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
+    """'demo' (synthetic), an NWB or HDF5 file, a folder, or a glob; in Python also an opened data set."""
+    stimuli: str | os.PathLike[str] | Stimuli | xr.Dataset | None = None
+    """A recipe (rodgers by default), a scene file, a stimulus-set file, or an HDF5 array."""
+    conditions: str | None = None
+    """TABLE:COLUMN[,COLUMN] of the recordings that labels the trials; see 'recordings inspect'."""
+    match: Path | str | Mapping[str, str | None] | None = None
+    """JSON, TOML or CSV file: recording label → stimulus label (null drops one); equal labels need none."""
+    select: str | Selection | None = None
+    """Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name."""
+    window: str | Window | None = None
+    """Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'."""
+    whiskers: str = "all"
+    """Whiskers to simulate: all, C0-C3, C2,D1, …"""
+    fidelity: str | Fidelity | None = "balanced"
+    """Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs)."""
+    layers: tuple[str, ...] | None = None
+    """Comma-separated layers to compare; all by default."""
+    time: str = "mean"
+    """Time axis of both sides: 'mean' averages over it, 'concatenate' keeps every step."""
+    bin: float | None = None
+    """Bin width of the spike counts in seconds."""
+    estimator: str = "default"
+    """default, thesis or thesis-input (as published)."""
+    metric: str | Metric = "rsa"
+    """rsa, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, or FILE.py:CLASS of your own."""
+    normalize: bool = True
+    """Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI."""
+    seed: int = 0
+    """Seed of untrained weights, of split halves and of random features."""
+    weights_seed: int | None = None
+    """Seed of untrained weights alone; --seed then keeps that of the statistics."""
+    explain: bool = False
+    """Also walk from the published estimator to the default one, fault by fault (RSA only); MODEL may then be an .npz
+    of stored splits (arrays r_xy, r_yy and r_xx)."""
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown rule for time before anything is loaded."""
+        if self.time not in TIME_RULES:
+            raise unknown_name("time rule", self.time, TIME_RULES)
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> ScoreOptions:
+        """Return the options that a mapping of names and values states.
+
+        Raises:
+            UsageError: there is no such option.
+        """
+        known = [item.name for item in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise unknown_name("option of a score", name, known)
+        layers = values.get("layers")
+        return cls(**{**values, "layers": tuple(layers) if layers else None})
+
+    @classmethod
+    def stated_in(cls, settings: Mapping[str, Any], **others: Any) -> ScoreOptions:
+        """Return the options that the settings of a provenance state, and others that they do not hold."""
+        known = {item.name for item in fields(cls)} - {*_ELSEWHERE}
+        return cls.of({name: value for name, value in settings.items() if name in known and value is not None} | others)
+
+    @property
+    def model_seed(self) -> int:
+        """Seed of untrained weights."""
+        return self.seed if self.weights_seed is None else self.weights_seed
+
+    @property
+    def selection(self) -> dict[str, Any]:
+        """Arguments of :func:`brainbench.datasets.open_recordings`."""
+        return {"conditions": self.conditions, "select": self.select, "window": self.window, "bin": self.bin}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Options as a record states them: texts and numbers."""
+        stated = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in _ELSEWHERE}
+        # Stimuli in memory have no name; their hash stands in the provenance.
+        named = isinstance(self.stimuli, (str, os.PathLike, type(None)))
+        texts = {"select": self.select, "window": self.window, "stimuli": self.stimuli if named else "data"}
+        stated |= {name: value if value is None else str(value) for name, value in texts.items()}
+        metric = self.metric if isinstance(self.metric, str) else self.metric.name
+        return stated | {"fidelity": self.fidelity or "balanced", "metric": metric, "weights_seed": self.model_seed}

@@ -1,0 +1,45 @@
+"""Every option of a score is on the command line, in the Python call and in the provenance."""
+
+from dataclasses import fields, replace
+
+import pytest
+import typer.main
+
+import brainbench
+from brainbench.cli import app
+from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, option_fields
+from brainbench.core.errors import UsageError
+from brainbench.scoring import ScoreOptions
+
+NAMES = [item.name for item in fields(ScoreOptions)]
+ELSEWHERE = {"recordings": "recordings", "match": "pairs", "explain": "statistics"}
+"""Options whose effect stands in another entry of the provenance than its settings."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_option_is_a_flag_with_help_a_keyword_and_a_setting(name: str):
+    command = typer.main.get_command(app).commands["score"]  # pyright: ignore[reportAttributeAccessIssue]
+    flag = next(item for item in command.params if item.name == name)
+    assert flag.help
+    default = getattr(ScoreOptions(), name)
+    assert flag.default == default
+    assert ScoreOptions.of({name: default}) == ScoreOptions()
+    assert name in ELSEWHERE or name in ScoreOptions().settings
+
+
+def test_a_wrong_keyword_is_answered_with_the_nearest():
+    with pytest.raises(UsageError, match="did you mean 'metric'"):
+        brainbench.score("zhuang-small", metrik="rsa")
+
+
+def test_settings_of_a_record_give_the_options_again():
+    options = ScoreOptions(layers=("conv1",), fidelity="fast", weights_seed=3, select="outcome=correct")
+    assert ScoreOptions.stated_in({**options.settings, "estimator_version": 1, "layers": ["conv1"]}) == options
+
+
+def test_options_are_written_as_flags():
+    assert as_flags(SCORE, ScoreOptions(), SCORE_FLAGS) == []
+    options = replace(ScoreOptions(), layers=("a", "b"), normalize=False, explain=True, weights_seed=1)
+    told = ["--layers", "a,b", "--no-normalize", "--weights-seed", "1", "--explain-estimator"]
+    assert as_flags(SCORE, options, SCORE_FLAGS) == told
+    assert set(option_fields(SCORE)) == set(NAMES)
