@@ -115,6 +115,7 @@ def score_record(
     """
     from brainbench import metrics
     from brainbench.core.labels import join_labels
+    from brainbench.metrics.inference.bootstrap import DRAWS
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
 
@@ -123,8 +124,7 @@ def score_record(
         raise UsageError(f"Unknown time rule {time!r}; allowed: 'mean', 'concatenate'.")
     _prepare(model, stimuli, recordings, whiskers=whiskers, fidelity=fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
-    chosen = metrics.get_metric(metric) if isinstance(metric, str) else metric
-    metrics.check_metric(chosen)
+    chosen = metrics.get_metric(metric)
     if explain and chosen.name != "rsa":
         raise UsageError(f"The published estimator is one of RSA; the metric {chosen.name!r} has none to explain.")
     candidate = resolve_model(model, seed=seed if weights_seed is None else weights_seed)
@@ -143,7 +143,7 @@ def score_record(
     pairs = join_labels(brain.vocabulary, network.labels, match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
-    animals = brain.animals(kept, metric=chosen, time=time, seed=seed, draws=metrics.DRAWS)
+    animals = brain.animals(kept, metric=chosen, time=time, seed=seed, draws=DRAWS)
 
     def against_brain(name: str, features: Mapping[str, Any]) -> Score:
         return chosen.score(features, animals, name=name, stimuli=kept, estimator=estimator, seed=seed)

@@ -23,7 +23,7 @@ class RSA:
     name: str
     title: str
     brain_method: str = "correlation"
-    """RDM method of the animals, see :data:`brainbench.metrics.SUBJECT_METHODS`."""
+    """RDM method of the animals, see :func:`brainbench.metrics.subject_rdm`."""
     model_method: str = "correlation"
     """RDM method of the activations, which have no trial noise."""
     comparison: str = "pearson"
