@@ -19,8 +19,9 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.report import table, write_section
-from brainbench.metrics import Trials, compare, equivalence_test, rdm, score_animals, subject_rdm
+from brainbench.metrics import Trials, compare, rdm, score_animals, subject_rdm
 from brainbench.metrics.inference.bootstrap import _factors, _scores, animal_counts, ceilings
+from brainbench.metrics.inference.equivalence import equivalence_test
 from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
 from brainbench.metrics.inference.multiple import sign_flip_p, step_down
 from brainbench.metrics.inference.permutation import label_orders

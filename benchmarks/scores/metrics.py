@@ -24,8 +24,6 @@ import numpy as np
 from benchmarks.report import table, write_section
 from brainbench.metrics import (
     Trials,
-    bootstrap_ceiling,
-    bootstrap_comparisons,
     compare_models,
     noise_precision,
     permutation_test,
@@ -34,6 +32,7 @@ from brainbench.metrics import (
     score_rdms,
     subject_rdm,
 )
+from brainbench.metrics.inference.bootstrap import bootstrap_ceiling, bootstrap_comparisons
 
 STIMULI = [f"s{k}" for k in range(6)]
 

@@ -145,7 +145,7 @@ def _found(source: str) -> str:
 
 
 def _verdict(animal: SubjectRDM) -> str:
-    from brainbench.metrics import RELIABILITY_GATE
+    from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 
     if animal.problem:
         return f"undefined: {animal.problem}"

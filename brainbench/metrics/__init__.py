@@ -10,66 +10,30 @@ from __future__ import annotations
 
 from brainbench.core.trials import Trials
 from brainbench.metrics.animal_to_animal import pairwise_consistency, score_animals
-from brainbench.metrics.inference.bootstrap import (
-    DRAWS,
-    Bootstrap,
-    bootstrap_ceiling,
-    bootstrap_comparisons,
-    bootstrap_score,
-)
-from brainbench.metrics.inference.equivalence import EquivalenceTest, equivalence_test, turing_test
-from brainbench.metrics.inference.multiple import LayerTest, ModelComparison, compare_models, layer_tests
-from brainbench.metrics.inference.permutation import PermutationTest, permutation_test
+from brainbench.metrics.inference.bootstrap import bootstrap_score
+from brainbench.metrics.inference.equivalence import turing_test
+from brainbench.metrics.inference.multiple import compare_models, layer_tests
+from brainbench.metrics.inference.permutation import permutation_test
 from brainbench.metrics.measures.patterns import PatternMetric
-from brainbench.metrics.measures.registry import (
-    Metric,
-    check_metric,
-    get_metric,
-    list_metrics,
-    register_metric,
-)
-from brainbench.metrics.rdms.comparison import COMPARISONS, compare
+from brainbench.metrics.measures.registry import Metric, get_metric, list_metrics, register_metric
+from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.display import RDM
-from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm, rdm_movie, rdm_problem
+from brainbench.metrics.rdms.dissimilarity import rdm, rdm_movie
 from brainbench.metrics.rdms.noise import noise_precision
-from brainbench.metrics.reliability.ceiling import NoiseCeiling, noise_ceiling
-from brainbench.metrics.reliability.noise_correction import (
-    ESTIMATORS,
-    RELIABILITY_GATE,
-    Corrected,
-    noise_corrected,
-    spearman_brown,
-)
-from brainbench.metrics.reliability.subject_rdm import SUBJECT_METHODS, SubjectRDM, subject_rdm
-from brainbench.metrics.reliability.units import reliable_units, unit_reliability
+from brainbench.metrics.reliability.ceiling import noise_ceiling
+from brainbench.metrics.reliability.noise_correction import noise_corrected
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 from brainbench.metrics.score import score_rdms
 
 __all__ = [
-    "COMPARISONS",
-    "DRAWS",
-    "ESTIMATORS",
     "RDM",
-    "RDM_METHODS",
-    "RELIABILITY_GATE",
-    "SUBJECT_METHODS",
-    "Bootstrap",
-    "Corrected",
-    "EquivalenceTest",
-    "LayerTest",
     "Metric",
-    "ModelComparison",
-    "NoiseCeiling",
     "PatternMetric",
-    "PermutationTest",
     "SubjectRDM",
     "Trials",
-    "bootstrap_ceiling",
-    "bootstrap_comparisons",
     "bootstrap_score",
-    "check_metric",
     "compare",
     "compare_models",
-    "equivalence_test",
     "get_metric",
     "layer_tests",
     "list_metrics",
@@ -80,13 +44,9 @@ __all__ = [
     "permutation_test",
     "rdm",
     "rdm_movie",
-    "rdm_problem",
     "register_metric",
-    "reliable_units",
     "score_animals",
     "score_rdms",
-    "spearman_brown",
     "subject_rdm",
     "turing_test",
-    "unit_reliability",
 ]

@@ -81,35 +81,25 @@ def score_rdms(
         name: Name of the model.
         stimuli: Names of the K stimuli, in the order of the RDMs.
         estimator: See :func:`noise_corrected`.
-        compare: Comparison of RDMs, see :func:`brainbench.metrics.rdms.comparison`.
+        compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
         seed: Seed of random permutations (more than 8 stimuli).
         device: Torch device for the permutations, which pays from some hundred stimuli on; numpy by default.
 
     Raises:
         UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
-    return score_with_test(
-        layer_rdms,
-        subjects,
-        name=name,
-        stimuli=stimuli,
-        estimator=estimator,
-        compare=compare,
-        seed=seed,
-        device=device,
-    )[0]
+    return score_with_test(layer_rdms, subjects, name, stimuli, estimator, compare, seed, device)[0]
 
 
 def score_with_test(
     layer_rdms: Mapping[str, ArrayLike],
     subjects: Sequence[SubjectRDM],
-    *,
     name: str,
     stimuli: Sequence[str],
-    estimator: str = "default",
-    compare: str = "pearson",
-    seed: int = 0,
-    device: Any = None,
+    estimator: str,
+    compare: str,
+    seed: int,
+    device: Any,
 ) -> tuple[Score, PermutationTest | None]:
     """Return what :func:`score_rdms` does, and its permutation test with all statistics."""
     check_comparison(compare)

@@ -71,6 +71,7 @@ def score_record(
         The result record; its scores share one brain side.
     """
     from brainbench import metrics
+    from brainbench.metrics.inference.bootstrap import DRAWS
     from brainbench.scoring.model_responses import DEFAULT_STIMULI, resolve_model
     from brainbench.scoring.neural_responses import DEMO_STIMULI, open_neural_responses
     from brainbench.stimuli.sources import prepare_stimuli
@@ -84,8 +85,7 @@ def score_record(
         source = options.stimuli if options.stimuli is not None else DEFAULT_STIMULI
         prepare_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
-    metric = metrics.get_metric(options.metric) if isinstance(options.metric, str) else options.metric
-    metrics.check_metric(metric)
+    metric = metrics.get_metric(options.metric)
     if options.explain and metric.name != "rsa":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
     options = replace(options, metric=metric)
@@ -95,7 +95,7 @@ def score_record(
     pairs = join_labels(brain.vocabulary, network.labels, options.match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
-    animals = brain.animals(kept, metric=metric, time=options.time, seed=options.seed, draws=metrics.DRAWS)
+    animals = brain.animals(kept, metric=metric, time=options.time, seed=options.seed, draws=DRAWS)
 
     compared = {network.card.name: network.features(rows)}
     if baselines:

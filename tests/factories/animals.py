@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.metrics import SubjectRDM, Trials, rdm, spearman_brown
+from brainbench.metrics import SubjectRDM, Trials, rdm
+from brainbench.metrics.reliability.noise_correction import spearman_brown
 
 STIMULI = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 

@@ -14,10 +14,10 @@ from brainbench.metrics import (
     noise_corrected,
     pairwise_consistency,
     score_animals,
-    spearman_brown,
     subject_rdm,
 )
 from brainbench.metrics.rdms.pairs import permuted_pairs
+from brainbench.metrics.reliability.noise_correction import spearman_brown
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 

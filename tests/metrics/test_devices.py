@@ -8,17 +8,16 @@ import torch
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import (
-    COMPARISONS,
-    RDM_METHODS,
     compare_models,
     layer_tests,
     noise_precision,
     permutation_test,
     rdm,
     rdm_movie,
-    rdm_problem,
     score_rdms,
 )
+from brainbench.metrics.rdms.comparison import COMPARISONS
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm_problem
 from brainbench.metrics.rdms.noise import NOISE_METHODS
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 

@@ -15,11 +15,11 @@ from brainbench.metrics import (
     compare,
     noise_corrected,
     rdm,
-    rdm_problem,
     score_animals,
     score_rdms,
     subject_rdm,
 )
+from brainbench.metrics.rdms.dissimilarity import rdm_problem
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 LABELS = np.repeat(np.arange(6), 8)

@@ -106,7 +106,7 @@ def compare_models(
     if not models:
         raise UsageError("There are no models to compare; give the layers' RDMs of at least one.")
     found = {
-        name: score_with_test(layers, subjects, name=name, stimuli=stimuli, compare=compare, seed=seed, device=device)
+        name: score_with_test(layers, subjects, name, stimuli, "default", compare, seed, device)
         for name, layers in models.items()
     }
     tested = {name: test.null for name, (_, test) in found.items() if test is not None and math.isfinite(test.p)}

@@ -104,7 +104,7 @@ def permutation_test(
     Args:
         model_rdm: [P].
         brain_rdms: [A, P] or [P].
-        method: Comparison, see :func:`brainbench.metrics.rdms.comparison`.
+        method: Comparison, see :func:`brainbench.metrics.compare`.
         seed: Seed of the random orders; unused when all are taken.
         device: Torch device for the products, which pays from some hundred stimuli on; numpy by default.
 

@@ -15,18 +15,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from brainbench.core.records import Score
-from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.intervals import t_interval
 from brainbench.metrics.inference.permutation import tail_p
-from brainbench.metrics.measures.animal_patterns import AnimalPatterns, gather_patterns, subject_scores
+from brainbench.metrics.measures.animal_patterns import PatternAnimals, subject_scores
 from brainbench.metrics.measures.classifier import Decoder
 from brainbench.metrics.measures.patterns import (
     PatternMetric,
-    check_features,
-    describe,
     layer_scores,
     make_score,
     pattern_orders,
@@ -34,7 +30,6 @@ from brainbench.metrics.measures.patterns import (
 )
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.score import layer_table
-from brainbench.metrics.stimulus_labels import response_matrix
 
 ORDERS = 199
 """Random orders of the stimuli above six."""
@@ -63,24 +58,11 @@ class LabelDecoding(PatternMetric):
     name = "decoding"
     title = "accuracy of logistic regression for properties of stimuli left out, mean over properties"
 
-    def score(
-        self,
-        features: Mapping[str, ArrayLike],
-        animals: Sequence[AnimalPatterns],
-        *,
-        name: str,
-        stimuli: Sequence[str],
-        estimator: str = "default",
-        seed: int = 0,
+    def score_layers(
+        self, layers: Mapping[str, Floats], found: PatternAnimals, about: dict[str, Any], seed: int
     ) -> Score:
-        """Decode from the features of every layer; the value is that of the best, and so is every permutation's.
-
-        Raises:
-            UsageError: no layers or animals, features of another number of stimuli, or a published estimator.
-        """
-        check_features(self.name, features, stimuli, estimator)
-        found, about = gather_patterns(animals, corrected=False), describe(self, name, stimuli)
-        layers = {layer: fetch(response_matrix(values, "stimuli")).astype(float) for layer, values in features.items()}
+        """Decode from the features of every layer; the value is that of the best, and so is every permutation's."""
+        stimuli = about["stimuli"]
         usable = [layer for layer, values in layers.items() if np.isfinite(values).all()]
         properties = label_properties(stimuli)
         if not usable or not properties:
@@ -107,17 +89,10 @@ class LabelDecoding(PatternMetric):
             layers=layer_scores(layers, dict(zip(usable, means[0].tolist(), strict=True))),
         )
 
-    def score_animals(
-        self, animals: Sequence[AnimalPatterns], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
-    ) -> Score:
-        """Decode from the mean responses of each animal.
-
-        Raises:
-            UsageError: no animals, or a published estimator.
-        """
-        check_features(self.name, {"animals": None}, stimuli, estimator)
-        found = gather_patterns(animals, corrected=False)
-        about = {**describe(self, "animal-to-animal", stimuli), "layer_rule": "no layers: each animal by itself"}
+    def score_agreement(self, found: PatternAnimals, about: dict[str, Any], seed: int) -> Score:
+        """Decode from the mean responses of each animal."""
+        stimuli = about["stimuli"]
+        about["layer_rule"] = "no layers: each animal by itself"
         scored, properties = [found.animals[i] for i in found.scored], label_properties(stimuli)
         if not scored or not properties:
             return undefined(about, "no animal can be used" if properties else _no_property(stimuli), found)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
-from brainbench.metrics.measures.animal_patterns import AnimalPatterns, animal_patterns
+from brainbench.metrics.measures.animal_patterns import AnimalPatterns
 from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count, upper
@@ -177,23 +177,13 @@ class PartialRSA(PatternMetric):
     name = "rsa-partial"
     title = "correlation between RDMs without what contacts, licks and choices explain"
 
-    def animal(
-        self,
-        subject: str,
-        blocks: Sequence[Trials],
-        n_stimuli: int,
-        *,
-        stimuli: Sequence[str] | None = None,
-        seed: int = 0,
-        draws: int = 0,
-    ) -> AnimalPatterns:
-        """Return the animal's mean responses with its nuisance RDMs; without any the animal cannot be used."""
-        found = animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)
-        nuisances, lacking = _nuisances(blocks, n_stimuli)
-        if found.problem is None and not nuisances:
+    def prepare(self, animal: AnimalPatterns, blocks: Sequence[Trials]) -> AnimalPatterns:
+        """Return the animal with its nuisance RDMs; without any it cannot be used."""
+        nuisances, lacking = _nuisances(blocks, len(animal.patterns))
+        if animal.problem is None and not nuisances:
             told = f" ({', '.join(lacking)} do not)" if lacking else ""
-            return replace(found, problem=f"no contacts, licks or choices that differ between stimuli{told}")
-        return replace(found, nuisances=nuisances)
+            return replace(animal, problem=f"no contacts, licks or choices that differ between stimuli{told}")
+        return replace(animal, nuisances=nuisances)
 
     def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
         """Return values [N, A] with the model's stimuli in each order [N, K]."""

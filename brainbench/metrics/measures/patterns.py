@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval, LayerScore, Provenance, Score, Status
 from brainbench.core.trials import Trials
+from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.intervals import interval_reasons, t_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, make_test
 from brainbench.metrics.layers import choose_on_others, held_out, most_chosen
@@ -81,7 +82,11 @@ class PatternMetric:
         draws: int = 0,
     ) -> AnimalPatterns:
         """Return the animal's mean responses; nothing here is random."""
-        return animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli)
+        return self.prepare(animal_patterns(subject, blocks, n_stimuli, stimuli=stimuli), blocks)
+
+    def prepare(self, animal: AnimalPatterns, blocks: Sequence[Trials]) -> AnimalPatterns:
+        """Return the animal with what else its trials tell; as it is unless overridden."""
+        return animal
 
     def score(
         self,
@@ -93,14 +98,21 @@ class PatternMetric:
         estimator: str = "default",
         seed: int = 0,
     ) -> Score:
-        """Score a model: each animal with the layer chosen on the others, averaged.
+        """Score a model by the features [K, F] of its layers.
 
         Raises:
             UsageError: no layers or animals, features of another number of stimuli, or a published estimator.
         """
         check_features(self.name, features, stimuli, estimator)
-        found, about = gather_patterns(animals, self.corrected), describe(self, name, stimuli)
-        layers = {layer: response_matrix(values, "stimuli").astype(np.float64) for layer, values in features.items()}
+        layers = {layer: fetch(response_matrix(values, "stimuli")).astype(float) for layer, values in features.items()}
+        about = {"name": name, "metric": f"{self.name}: {self.title}", "stimuli": tuple(map(str, stimuli))}
+        return self.score_layers(layers, gather_patterns(animals, self.corrected), about, seed)
+
+    def score_layers(
+        self, layers: Mapping[str, Floats], found: PatternAnimals, about: dict[str, Any], seed: int
+    ) -> Score:
+        """Score each animal with the layer chosen on the others, averaged."""
+        stimuli = about["stimuli"]
         usable = [
             layer for layer, values in layers.items() if np.isfinite(values).all() and np.ptp(values, axis=0).any()
         ]
@@ -140,14 +152,23 @@ class PatternMetric:
     def score_animals(
         self, animals: Sequence[AnimalPatterns], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
     ) -> Score:
-        """Score each animal against the joined units of the others.
+        """Score the animals by their mean responses.
 
         Raises:
             UsageError: no animals, or a published estimator.
         """
-        check_features(self.name, {"others": None}, stimuli, estimator)
-        found = gather_patterns(animals, self.corrected)
-        about = describe(self, "animal-to-animal", stimuli, "; each animal against the joined units of the others")
+        check_features(self.name, {"animals": None}, stimuli, estimator)
+        about = {
+            "name": "animal-to-animal",
+            "metric": f"{self.name}: {self.title}",
+            "stimuli": tuple(map(str, stimuli)),
+        }
+        return self.score_agreement(gather_patterns(animals, self.corrected), about, seed)
+
+    def score_agreement(self, found: PatternAnimals, about: dict[str, Any], seed: int) -> Score:
+        """Score each animal against the joined units of the others."""
+        stimuli = about["stimuli"]
+        about["metric"] += "; each animal against the joined units of the others"
         about["layer_rule"] = "no layers: each animal against the others"
         scored = [found.animals[i] for i in found.scored]
         if len(scored) < 2:
@@ -202,11 +223,6 @@ def check_features(metric: str, features: Mapping[str, Any], stimuli: Sequence[s
 def pattern_orders(stimuli: int, seed: int, draws: int = ORDERS) -> Ints:
     """Return orders of the stimuli [N, K], the given one first: all up to six stimuli, else random ones."""
     return np.concatenate(list(label_orders(stimuli, seed, exact=_EXACT_STIMULI, draws=draws)))
-
-
-def describe(metric: PatternMetric, name: str, stimuli: Sequence[str], how: str = "") -> dict[str, Any]:
-    """Return the fields of a score that say what was compared."""
-    return {"name": name, "metric": f"{metric.name}: {metric.title}{how}", "stimuli": tuple(map(str, stimuli))}
 
 
 def undefined(about: Mapping[str, Any], reason: str, found: PatternAnimals) -> Score:

@@ -81,16 +81,19 @@ def register_metric(metric: Metric) -> Metric:
     return metric
 
 
-def get_metric(name: str) -> Metric:
+def get_metric(name: str | Metric) -> Metric:
     """Return a registered metric, or the one that ``FILE.py:NAME`` or ``package.module:NAME`` names.
 
-    NAME is a metric, or a class or function that makes one without arguments.
+    NAME is a metric, or a class or function that makes one without arguments. A metric itself is checked and returned.
 
     Raises:
         UsageError: nothing has this name, or it is no metric.
         DataFileNotFoundError: there is no such file or module.
         DataError: the file cannot be run.
     """
+    if not isinstance(name, str):
+        check_metric(name)
+        return name
     if ":" not in name:
         if name not in _METRICS:
             raise unknown_name("metric", name, list_metrics(), hint="Your own: FILE.py:CLASS.")

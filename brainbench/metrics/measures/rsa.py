@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -22,51 +23,20 @@ class RSA:
     name: str
     title: str
     brain_method: str = "correlation"
-    """RDM method of the animals, see :data:`brainbench.metrics.SUBJECT_METHODS`."""
+    """RDM method of the animals, see :func:`brainbench.metrics.subject_rdm`."""
     model_method: str = "correlation"
     """RDM method of the activations, which have no trial noise."""
     comparison: str = "pearson"
 
-    def animal(
-        self,
-        subject: str,
-        blocks: Sequence[Trials],
-        n_stimuli: int,
-        *,
-        stimuli: Sequence[str] | None = None,
-        seed: int = 0,
-        draws: int = 0,
-    ) -> SubjectRDM:
-        """Return the animal's RDM with its split halves and draws; see :func:`subject_rdm`."""
-        return subject_rdm(
-            subject,
-            blocks,
-            n_stimuli,
-            stimuli=stimuli,
-            method=self.brain_method,
-            comparison=self.comparison,
-            seed=seed,
-            draws=draws,
-        )
+    def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:
+        """Return the animal's RDM with its split halves and draws; options are those of :func:`subject_rdm`."""
+        return subject_rdm(subject, blocks, n_stimuli, method=self.brain_method, comparison=self.comparison, **options)
 
-    def score(
-        self,
-        features: Mapping[str, ArrayLike],
-        animals: Sequence[SubjectRDM],
-        *,
-        name: str,
-        stimuli: Sequence[str],
-        estimator: str = "default",
-        seed: int = 0,
-    ) -> Score:
-        """Score the RDMs of the layers' features [K, F]; see :func:`score_rdms`."""
+    def score(self, features: Mapping[str, ArrayLike], animals: Sequence[SubjectRDM], **options: Any) -> Score:
+        """Score the RDMs of the layers' features [K, F]; options are those of :func:`score_rdms`."""
         rdms = {layer: rdm(values, method=self.model_method) for layer, values in features.items()}
-        return score_rdms(
-            rdms, animals, name=name, stimuli=stimuli, estimator=estimator, compare=self.comparison, seed=seed
-        )
+        return score_rdms(rdms, animals, compare=self.comparison, **options)
 
-    def score_animals(
-        self, animals: Sequence[SubjectRDM], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
-    ) -> Score:
-        """Score the animals against one another; see :func:`brainbench.metrics.score_animals`."""
-        return score_animals(animals, stimuli=stimuli, estimator=estimator, compare=self.comparison, seed=seed)
+    def score_animals(self, animals: Sequence[SubjectRDM], **options: Any) -> Score:
+        """Score the animals against one another; options are those of :func:`brainbench.metrics.score_animals`."""
+        return score_animals(animals, compare=self.comparison, **options)

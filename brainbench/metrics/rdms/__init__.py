@@ -1,1 +1,2 @@
-"""Representational dissimilarity matrices: distances, noise precision, comparison, display."""
+"""Representational dissimilarity matrices (RDMs): ``distances`` between patterns, with ``noise`` taken out, make one
+(``dissimilarity``); ``comparison`` compares them, ``pairs`` orders their entries, ``display`` draws one."""

@@ -25,7 +25,7 @@ _DARK, _LIGHT, _MISSING = np.array([14, 77, 84]), np.array([240, 246, 245]), "#d
 class RDM:
     """Dissimilarities [P] of named stimuli, upper triangle row by row.
 
-    Takes the place of an array wherever numpy or :func:`brainbench.metrics.rdms.comparison` wants one.
+    Takes the place of an array wherever numpy or :func:`brainbench.metrics.compare` wants one.
 
     >>> named = RDM([1.0, 2.0, 3.0], ["near", "medium", "far"])
     >>> named.between("far", "near"), np.asarray(named).tolist()

@@ -1,1 +1,2 @@
-"""Reliability of the animals' RDMs: split halves, noise correction, ceilings, units."""
+"""How reliable an animal's RDM is: ``sessions`` sorts trials, ``whitening`` divides by their noise, ``halves`` and
+``resampling`` make RDMs of parts of them, ``subject_rdm`` joins these; ``noise_correction`` and ``ceiling`` use it."""

@@ -113,7 +113,7 @@ def subject_rdm(
         n_stimuli: K.
         stimuli: Names of the stimuli, for messages.
         method: RDM method: ``correlation``, ``sqeuclidean``, ``mahalanobis``, ``crossnobis`` or ``poisson``.
-        comparison: Comparison of RDMs, see :func:`brainbench.metrics.rdms.comparison`.
+        comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
         splits: Number of random split halves.
         seed: Seed of the splits and draws.
         noise: Noise covariance for ``mahalanobis`` and ``crossnobis``: ``diag``, ``none`` or another of

@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import equivalence_test, rdm, score_animals, score_rdms, subject_rdm, turing_test
+from brainbench.metrics import rdm, score_animals, score_rdms, subject_rdm, turing_test
+from brainbench.metrics.inference.equivalence import equivalence_test
 from tests.factories.animals import STIMULI, make_block, make_latent
 
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import COMPARISONS, compare
-from brainbench.metrics.rdms.comparison import compare_all
+from brainbench.metrics import compare
+from brainbench.metrics.rdms.comparison import COMPARISONS, compare_all
 from brainbench.metrics.rdms.pairs import permuted_pairs
 
 THEIRS = {

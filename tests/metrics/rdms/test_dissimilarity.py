@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.metrics import RDM_METHODS, noise_precision, rdm, rdm_problem
+from brainbench.metrics import noise_precision, rdm
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm_problem
 from brainbench.metrics.rdms.pairs import permuted_pairs, square
 
 METHODS_WITHOUT_FOLDS = [method for method in RDM_METHODS if method != "crossnobis"]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import COMPARISONS, noise_ceiling
+from brainbench.metrics import noise_ceiling
+from brainbench.metrics.rdms.comparison import COMPARISONS
 from tests.metrics.rdms.test_comparison import THEIRS
 
 

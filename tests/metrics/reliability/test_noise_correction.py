@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import RELIABILITY_GATE, compare, noise_corrected, rdm, spearman_brown, subject_rdm
-from brainbench.metrics.reliability.noise_correction import corrected_splits
+from brainbench.metrics import compare, noise_corrected, rdm, subject_rdm
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, corrected_splits, spearman_brown
 from tests.factories.animals import make_block, make_latent
 
 

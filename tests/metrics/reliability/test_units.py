@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import Trials, reliable_units, subject_rdm, unit_reliability
+from brainbench.metrics import Trials, subject_rdm
+from brainbench.metrics.reliability.units import reliable_units, unit_reliability
 
 
 def _make_block(seed=0, trials=20):
