@@ -1,4 +1,8 @@
-"""Triangle meshes: loading with units, diagnosis, repair, distances, hulls and convex decomposition. Metres inside."""
+"""Triangle meshes, in metres: files with units, diagnosis, repair, distances, hulls and convex decomposition.
+
+A mesh is loaded (``mesh``), repaired (``mesh_repair``), cut into convex pieces by a process of its own
+(``decomposition``), and the pieces are held against it (``distance``).
+"""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class DecompositionSettings:
-    """How a mesh is cut into convex pieces.
+    """Method and limits by which a mesh is cut into convex pieces.
 
     Raises:
         UsageError: a value lies outside its range.
@@ -56,7 +56,7 @@ class DecompositionSettings:
     most_pieces: int | None = None
     """Largest number of pieces; None for as many as the threshold asks for; CoACD only."""
     seed: int = 0
-    """Of CoACD's search."""
+    """Seed of CoACD's search."""
     most_faces: int = 50_000
     """A mesh of more triangles is first simplified, to a fifth of this many; the deviation of the pieces is still
     measured against the original."""
@@ -80,7 +80,7 @@ class DecompositionSettings:
             raise UsageError("The limits of time and memory must be positive.")
 
     def config(self) -> dict[str, Any]:
-        """Plain values that determine the pieces."""
+        """Return the plain values that determine the pieces."""
         if self.method == "vhacd":
             return {"method": self.method, "most_faces": self.most_faces}
         names = ("method", "threshold", "most_pieces", "seed", "most_faces")
@@ -94,14 +94,14 @@ class Decomposition:
     pieces: tuple[Mesh, ...]
     """Convex, closed, outward."""
     deviation: Deviation
-    """Of the union of the pieces from the solid inside the mesh [m]."""
+    """Deviation of the union of the pieces from the solid inside the mesh [m]."""
     notes: tuple[str, ...]
-    """What was done and how far it is from the mesh, in words; relative, so scaling keeps them true."""
+    """Sentences on what was done and how far the pieces are from the mesh; relative, so scaling keeps them true."""
     settings: DecompositionSettings = field(default_factory=DecompositionSettings)
     key: str = ""
     """Names what the pieces were computed from: the shape of the mesh, the settings, the versions of the packages."""
     cached: bool = False
-    """Whether the pieces were found in the cache."""
+    """True when the pieces were found in the cache."""
 
 
 def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cache: bool = True) -> Decomposition:

@@ -1,4 +1,4 @@
-"""How far surfaces and solids lie apart, by sampling. Lengths in the units of the meshes (metres).
+"""Distances between surfaces and between solids, by sampling. Lengths in the units of the meshes (metres).
 
 Letters: n sample, F face.
 """
@@ -22,7 +22,7 @@ _BLOCK = 4_000_000
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far an approximation of a solid departs from it, as largest distances over samples."""
+    """Largest distances over samples between a solid and its approximation."""
 
     outward: float
     """Largest distance of a point of the approximation from the solid: matter that was added [m]."""
@@ -111,7 +111,7 @@ class _Surface:
         self._owner = np.concatenate([owner, np.arange(len(mesh.faces))])
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distances [n] of points [n, 3]."""
+        """Return the distances [n] of points [n, 3]."""
         candidates = self._owner[self._tree.query(points, k=min(_NEIGHBOURS, self._tree.n))[1]]
         best = np.full(len(points), np.inf)
         for column in candidates.T:
@@ -120,29 +120,14 @@ class _Surface:
 
 
 def point_triangle_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances [n] of points [n, 3] from one triangle each [n, 3, 3]."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    normal = np.cross(b - a, c - a)
-    square = np.einsum("ni,ni->n", normal, normal)
-    flat = square <= 0
-    height = np.einsum("ni,ni->n", points - a, normal)
-    inside = ~flat
-    for start, end in ((a, b), (b, c), (c, a)):
-        inside &= np.einsum("ni,ni->n", np.cross(end - start, points - start), normal) >= 0
-    plane = np.abs(height) / np.sqrt(np.where(flat, 1.0, square))
-    edges = np.min([_segment_distance(points, s, e) for s, e in ((a, b), (b, c), (c, a))], axis=0)
-    return np.where(inside, plane, edges)
+    """Return the distances [n] of points [n, 3] from one triangle each [n, 3, 3]."""
+    from trimesh.triangles import closest_point
 
-
-def _segment_distance(points: NDArray, start: NDArray, end: NDArray) -> NDArray[np.float64]:
-    along = end - start
-    square = np.einsum("ni,ni->n", along, along)
-    share = np.einsum("ni,ni->n", points - start, along) / np.where(square > 0, square, 1.0)
-    return np.linalg.norm(points - start - np.clip(share, 0, 1)[:, None] * along, axis=1)
+    return np.linalg.norm(closest_point(triangles, points) - points, axis=1)
 
 
 def _farthest_outside(solid: Mesh, inside: Mesh, points: NDArray, rng: np.random.Generator) -> float:
-    """Largest distance from the solid of those points that lie outside it, as ``inside`` tells."""
+    """Return the largest distance from the solid of those points that lie outside it, as ``inside`` tells."""
     distance = _Surface(solid, rng).distance(points)
     order = np.argsort(-distance)
     # Most far points of a good approximation lie inside, so look at few at a time until one does not.
@@ -155,7 +140,7 @@ def _farthest_outside(solid: Mesh, inside: Mesh, points: NDArray, rng: np.random
 
 
 def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
-    """Largest distance of points [n, 3] from the union of convex pieces; 0 when all lie inside."""
+    """Return the largest distance of points [n, 3] from the union of convex pieces; 0 when all lie inside."""
     # The height over the highest face plane bounds the distance from below, and is it above that face.
     bounds = np.empty((len(points), len(pieces)))
     for index, piece in enumerate(pieces):
@@ -178,7 +163,7 @@ def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
 
 
 def _planes(piece: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A corner [F, 3] and the outward unit normal [F, 3] of every face with an area."""
+    """Return a corner [F, 3] and the outward unit normal [F, 3] of every face with an area."""
     a, b, c = np.moveaxis(piece.vertices[piece.faces], 1, 0)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -187,12 +172,13 @@ def _planes(piece: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _areas(mesh: Mesh) -> NDArray[np.float64]:
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    from trimesh.triangles import area
+
+    return area(mesh.vertices[mesh.faces])
 
 
 def _sample(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points [count, 3] and the faces [count] they lie on."""
+    """Return points [count, 3] and the faces [count] they lie on."""
     ends = np.cumsum(_areas(mesh))
     face = np.minimum(np.searchsorted(ends, rng.random(count) * ends[-1]), len(ends) - 1)
     u, v = np.sqrt(rng.random((count, 1))), rng.random((count, 1))

@@ -26,7 +26,7 @@ WRITABLE = (".obj", ".stl", ".ply", ".glb", ".off")
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong with a mesh as a solid."""
+    """Faults of a mesh as a solid."""
 
     open_edges: int
     """Edges that do not join exactly two triangles; 0 for a watertight surface."""
@@ -35,15 +35,15 @@ class Diagnosis:
     bodies: int
     """Connected pieces."""
     inconsistent: bool
-    """Whether neighbouring triangles disagree on which side is out."""
+    """True where neighbouring triangles disagree on which side is out."""
     duplicate_faces: int = 0
     """Triangles that another triangle with the same corners repeats."""
     inside_out: bool = False
-    """Whether the closed surface faces inward."""
+    """True for a closed surface that faces inward."""
 
     @property
     def watertight(self) -> bool:
-        """Whether the surface encloses a volume."""
+        """True when the surface encloses a volume."""
         return self.open_edges == 0
 
     def __str__(self) -> str:
@@ -85,11 +85,13 @@ class Mesh:
             array.setflags(write=False)
             object.__setattr__(self, name, array)
 
-    @property
+    @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner [2, 3] (m) of the used vertices."""
         used = self.vertices[np.unique(self.faces)]
-        return np.stack([used.min(axis=0), used.max(axis=0)])
+        corners = np.stack([used.min(axis=0), used.max(axis=0)])
+        corners.setflags(write=False)
+        return corners
 
     @property
     def diagonal(self) -> float:
@@ -188,14 +190,11 @@ def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
 
 
 def face_owners(mesh: Mesh) -> NDArray[np.int64]:
-    """Number [F] of the connected piece that each face belongs to."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    """Return the number [F] of the connected piece that each face belongs to."""
+    from trimesh.graph import connected_component_labels
 
-    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    size = len(mesh.vertices)
-    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
-    return connected_components(links, directed=False)[1][mesh.faces[:, 0]]
+    edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    return connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
 
 
 def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:

@@ -1,18 +1,15 @@
-"""Mend what can be mended without guessing a shape, and say what was done and what remains."""
+"""Repair of meshes without guessing a shape; what was done and what remains is said."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.core.errors import DataError
 from brainbench.geometry.distance import winding_number
 from brainbench.geometry.mesh import Mesh, face_owners
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MERGE = 1e-6
 """Vertices of an open mesh that lie closer than this part of its diagonal are taken for one."""
@@ -82,15 +79,12 @@ def _drop(mesh: Mesh, done: list[str]) -> Mesh:
 
 def _close(mesh: Mesh, done: list[str]) -> Mesh:
     """Merge nearly equal vertices and close small cracks, if that leaves fewer open edges."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    import trimesh
     from scipy.spatial import KDTree
 
     pairs = KDTree(mesh.vertices).query_pairs(MERGE * mesh.diagonal, output_type="ndarray")
     if len(pairs):
-        size = len(mesh.vertices)
-        links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
-        group = connected_components(links, directed=False)[1]
+        group = trimesh.graph.connected_component_labels(pairs, node_count=len(mesh.vertices))
         representative = np.unique(group, return_index=True)[1]
         merged = _drop(Mesh(mesh.vertices[representative], group[mesh.faces], mesh.name), [])
         if merged.diagnosis.open_edges < mesh.diagnosis.open_edges:
@@ -99,8 +93,6 @@ def _close(mesh: Mesh, done: list[str]) -> Mesh:
             mesh = merged
     if mesh.diagnosis.watertight:
         return mesh
-    import trimesh
-
     solid = mesh.to_trimesh()
     trimesh.repair.fill_holes(solid)
     added = np.asarray(solid.faces)[len(mesh.faces) :]
@@ -131,50 +123,32 @@ def _agree(mesh: Mesh, done: list[str]) -> Mesh:
 
 def _turn(mesh: Mesh, done: list[str]) -> Mesh:
     """Turn closed bodies outward; the wall of a cavity, inside another body, rightly points inward."""
-    owner = np.unique(face_owners(mesh), return_inverse=True)[1].reshape(-1)
-    volumes = _volumes(mesh, owner)
-    if (volumes >= 0).all():
-        return mesh
-    bounds = _bounds(mesh, owner)
-    outer = [body for body in np.flatnonzero(volumes < 0) if not _within_another(mesh, owner, bounds, body)]
+    owner = face_owners(mesh)
+    bodies = dict(zip(dict.fromkeys(owner.tolist()), mesh.pieces(), strict=True))
+    outer = [label for label, body in bodies.items() if body.volume < 0 and not _within_another(bodies, label)]
     if not outer:
         return mesh
     # When whatever points outward is a cavity of a body to be turned, the whole file is inside out.
-    whole = all(_within_another(mesh, owner, bounds, body) for body in np.flatnonzero(volumes > 0))
+    whole = all(_within_another(bodies, label) for label, body in bodies.items() if body.volume > 0)
     turned = np.ones(len(owner), bool) if whole else np.isin(owner, outer)
     faces = np.array(mesh.faces)
     faces[turned] = faces[turned][:, ::-1]
-    if len(volumes) == 1:
+    if len(bodies) == 1:
         done.append("the surface was inside out and was turned")
     else:
-        done.append(f"{len(np.unique(owner[turned]))} of {len(volumes)} bodies were inside out and were turned")
+        done.append(f"{len(np.unique(owner[turned]))} of {len(bodies)} bodies were inside out and were turned")
     return Mesh(mesh.vertices, faces, mesh.name)
 
 
-def _volumes(mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Signed volume of each closed body; ``owner`` [F] counts bodies from 0."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.bounds.mean(axis=0), 1, 0)
-    parts = np.einsum("fi,fi->f", a, np.cross(b, c)) / 6
-    return np.asarray(np.bincount(owner, weights=parts), dtype=np.float64)
-
-
-def _bounds(mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Lowest and highest corner [bodies, 2, 3]."""
-    corners = mesh.vertices[mesh.faces]
-    low = np.full((owner.max() + 1, 3), np.inf)
-    high = -low
-    np.minimum.at(low, owner, corners.min(axis=1))
-    np.maximum.at(high, owner, corners.max(axis=1))
-    return np.stack([low, high], axis=1)
-
-
-def _within_another(mesh: Mesh, owner: NDArray[np.int64], bounds: NDArray[np.float64], body: np.intp) -> bool:
-    """Whether a body lies inside an odd number of others."""
-    corner = mesh.vertices[mesh.faces[np.argmax(owner == body), 0]]
-    around = ((corner > bounds[:, 0]) & (corner < bounds[:, 1])).all(axis=1)
-    around = np.flatnonzero(around & (np.arange(len(bounds)) != body))
-    wraps = [winding_number(Mesh(mesh.vertices, mesh.faces[owner == other]), corner) for other in around]
-    return sum(abs(float(wrap[0])) > 0.5 for wrap in wraps) % 2 == 1
+def _within_another(bodies: Mapping[int, Mesh], label: int) -> bool:
+    """Return whether a body lies inside an odd number of the others."""
+    corner = bodies[label].vertices[bodies[label].faces[0, 0]]
+    around = [
+        body
+        for other, body in bodies.items()
+        if other != label and ((corner > body.bounds[0]) & (corner < body.bounds[1])).all()
+    ]
+    return sum(abs(float(winding_number(body, corner)[0])) > 0.5 for body in around) % 2 == 1
 
 
 def _count(number: int, what: str) -> str:

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -21,7 +21,7 @@ from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.core.files import cache_dir, content_hash, read_json, write_json
 from brainbench.datasets.whisking.files import open_shard, read_manifest, verify_shard
-from brainbench.datasets.whisking.memory import Buffers, Maps
+from brainbench.datasets.whisking.memory import Buffers, most_open
 
 if TYPE_CHECKING:
     import torch
@@ -31,7 +31,7 @@ View = Literal["grid", "raw"]
 Unstable = Literal["skip", "zero", "error"]
 
 SPLITS = ("train", "validation", "test", "all")
-"""What ``split`` may be; ``all`` is the three together."""
+"""Values of ``split``; ``all`` is the three together."""
 
 _AHEAD = 2
 _BLOCK = 64
@@ -48,7 +48,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class ChannelStatistics:
-    """What a normaliser needs to know of the six channels (Fx … Mz; N and N·m), over all whiskers and frames."""
+    """Statistics of the six channels for a normaliser (Fx … Mz; N and N·m), over all whiskers and frames."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
@@ -124,7 +124,7 @@ class WhiskingDataset:
         self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
         self._choose()
         self._buffers = Buffers(2 * (_AHEAD + 2))
-        self._maps = Maps(self._shards)
+        self._forces = lru_cache(most_open())(lambda index: self._shards[index].forces())
         self.epoch = 0
         """Number of the epoch that the next batch belongs to, from 0."""
         self._batch = 0
@@ -249,7 +249,7 @@ class WhiskingDataset:
         for place, (shard, row) in enumerate(
             zip(self._where[sweeps].tolist(), self._row[sweeps].tolist(), strict=True)
         ):
-            np.copyto(result[place], self._maps.forces(shard)[row])
+            np.copyto(result[place], self._forces(shard)[row])
         if self.unstable == "zero":
             np.nan_to_num(result, copy=False, nan=0.0)
         return result
@@ -331,7 +331,7 @@ class WhiskingDataset:
 
     @cached_property
     def _columns(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where each number of a frame's grid [C·H·W] stands in the frame [W·C], and the cells without a whisker."""
+        """Places of the numbers of a frame's grid [C·H·W] in the frame [W·C], and the cells without a whisker."""
         import torch
 
         cells, size = self._shards[0].cells, GRID_SHAPE[0] * GRID_SHAPE[1]

@@ -21,11 +21,11 @@ _UNUSABLE = 2
 
 @dataclass(frozen=True, eq=False)
 class Shard:
-    """One shard: where its forces are, and what they belong to."""
+    """One shard: the place of its forces, and what they belong to."""
 
     path: Path
     offset: int
-    """Where in the file the forces begin [bytes]."""
+    """Place in the file where the forces begin [bytes]."""
     sweeps: int
     shape: tuple[int, int, int]
     """(frames, whiskers, channels) of one sweep."""
@@ -35,11 +35,16 @@ class Shard:
     objects: NDArray[np.str_]
     indices: NDArray[np.int64]
     broken: NDArray[np.bool_]
-    """[sweep] whether any whisker is not ok."""
+    """[sweep] true where any whisker is not ok."""
     empty: NDArray[np.bool_]
-    """[sweep] whether there are no forces at all."""
+    """[sweep] true where there are no forces at all."""
     content_hash: str
     """As the manifest has it."""
+
+    def forces(self) -> NDArray[np.float32]:
+        """Return the forces [sweep, frame, whisker, channel] (N, N·m), mapped into memory."""
+        shape = (self.sweeps, *self.shape)
+        return np.memmap(self.path, "<f4", "r", self.offset, shape).view(np.ndarray)
 
 
 def read_manifest(folder: Path) -> Mapping[str, Any]:
@@ -126,7 +131,7 @@ def verify_shard(shard: Shard) -> None:
             arrays = {name: file[name][()] for name in file if name != "wrench"}
     except (OSError, KeyError) as error:
         raise DataError(f"The shard {str(shard.path)!r} is damaged ({error}); generate it again.") from error
-    arrays["wrench"] = np.memmap(shard.path, "<f4", "r", shard.offset, (shard.sweeps, *shard.shape))
+    arrays["wrench"] = shard.forces()
     if hash_arrays(arrays) != shard.content_hash:
         raise DataError(
             f"The numbers in {str(shard.path)!r} do not match the hash in the manifest: it was damaged or edited; "

@@ -1,42 +1,15 @@
-"""Memory behind a data set of sweeps: mapped shards, and batches that are used again."""
+"""Memory behind a data set of sweeps: batches that are used again, and the limit of files mapped at a time."""
 
 from __future__ import annotations
 
 import sys
 import threading
-from collections import OrderedDict
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from brainbench.datasets.whisking.files import Shard
-
-
-class Maps:
-    """The forces of shards, mapped into memory when they are asked for; the oldest maps are given up first."""
-
-    def __init__(self, shards: Sequence[Shard], most: int | None = None) -> None:
-        self._shards = shards
-        self._most = most_open() if most is None else most
-        self._maps: OrderedDict[int, NDArray[np.float32]] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._maps)
-
-    def forces(self, index: int) -> NDArray[np.float32]:
-        """Return the forces [sweep, frame, whisker, channel] of a shard (N, N·m)."""
-        mapped = self._maps.get(index)
-        if mapped is None:
-            shard = self._shards[index]
-            mapped = np.memmap(shard.path, "<f4", "r", shard.offset, (shard.sweeps, *shard.shape)).view(np.ndarray)
-            self._maps[index] = mapped
-            if len(self._maps) > self._most:
-                self._maps.popitem(last=False)
-        return mapped
 
 
 class Buffers:
@@ -67,7 +40,7 @@ class Buffers:
 
 
 def most_open() -> int:
-    """Shards that may be mapped at a time: each takes one of the files that a process may open."""
+    """Return how many shards may be mapped at a time: each takes one of the files that a process may open."""
     try:
         import resource
     except ImportError:

@@ -1,4 +1,4 @@
-"""Can classes of objects be told apart by what the whiskers feel? Support vector machines on two, three, four classes.
+"""Separability of object classes by whisker forces: support vector machines on two, three and four classes.
 
 The check of Figure 3.1(b) of the thesis. Sweeps of one object never stand on both sides of a test: what is measured
 is telling a new chair from a new mug, not recognising a chair that was met before.
@@ -7,7 +7,7 @@ is telling a new chair from a new mug, not recognising a chair that was met befo
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,7 @@ _PENALTY = 10.0
 
 @dataclass(frozen=True)
 class Separability:
-    """How well so many classes are told apart."""
+    """Accuracy with which classes are told apart, so many at a time."""
 
     count: int
     """Classes that are told apart at a time."""
@@ -52,7 +52,7 @@ class Separability:
 
     @property
     def above_chance(self) -> bool:
-        """Whether the whole interval lies above chance."""
+        """True when the whole interval lies above chance."""
         return self.interval.low > self.chance
 
 
@@ -121,7 +121,8 @@ def separate(
         MissingDependencyError: scikit-learn is not installed.
     """
     try:
-        from sklearn.model_selection import StratifiedGroupKFold
+        from sklearn.metrics.pairwise import rbf_kernel
+        from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict
         from sklearn.svm import SVC
     except ImportError as error:
         raise missing_dependency("scikit-learn", extra="learn", purpose="Separability") from error
@@ -135,25 +136,26 @@ def separate(
             f"The class {poor!r} has {fewest} object; telling classes apart needs two objects of each, one to learn "
             "from and one to be tested with."
         )
-    kernel = _kernel(features)
+    values = np.asarray(features, dtype=np.float32)
+    # As gamma="scale" would take it, but once for all choices and folds.
+    kernel = rbf_kernel(values, gamma=1 / (max(float(values.var()), np.finfo(np.float32).tiny) * values.shape[1]))
+    folds = StratifiedGroupKFold(min(FOLDS, fewest), shuffle=True, random_state=seed)
     choices = list(itertools.combinations(range(len(names)), count))
-    right = []
+    tallies = []
     for choice in choices:
         mine = np.flatnonzero(np.isin(labels, choice))
-        kind, group = labels[mine], objects[mine]
-        folds = StratifiedGroupKFold(min(FOLDS, fewest), shuffle=True, random_state=seed)
-        hit = np.zeros(len(mine))
-        for train, test in folds.split(mine, kind, group):
-            learned, asked = mine[train], mine[test]
-            machine = SVC(C=_PENALTY, kernel="precomputed").fit(kernel[np.ix_(learned, learned)], kind[train])
-            hit[test] = machine.predict(kernel[np.ix_(asked, learned)]) == kind[test]
-        right.append({name: (hit[group == name].sum(), (group == name).sum()) for name in np.unique(group)})
-    accuracies = tuple(_accuracy(choice, members, hits) for choice, hits in zip(choices, right, strict=True))
+        kind, machine = labels[mine], SVC(C=_PENALTY, kernel="precomputed")
+        found = cross_val_predict(machine, kernel[np.ix_(mine, mine)], kind, groups=objects[mine], cv=folds)
+        hit = np.asarray(found == kind)
+        tallies.append({number: _by_object(objects[mine[kind == number]], hit[kind == number]) for number in choice})
+    accuracies = tuple(
+        float(np.mean([rows[:, 0].sum() / rows[:, 1].sum() for rows in tally.values()])) for tally in tallies
+    )
     few = fewest < FEW_OBJECTS
     return Separability(
         count=count,
         accuracy=float(np.mean(accuracies)),
-        interval=_interval(choices, members, right, seed),
+        interval=_interval(tallies, [len(found) for found in members], seed),
         chance=1 / count,
         choices=tuple(tuple(names[number] for number in choice) for choice in choices),
         accuracies=accuracies,
@@ -214,42 +216,31 @@ def _features(data: WhiskingDataset, where: NDArray[np.intp], progress: Progress
     return (steps / np.where(scale > 0, scale, 1.0)).astype(np.float32).reshape(len(where), -1)
 
 
-def _kernel(features: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the radial kernel [n, n] of features [n, F], once for all choices and folds."""
-    values = np.asarray(features, dtype=np.float32)
-    squares = np.einsum("ij,ij->i", values, values)
-    distance = squares[:, None] + squares[None] - 2 * values @ values.T
-    width = max(float(values.var()), np.finfo(np.float32).tiny) * values.shape[1]
-    return np.exp(-np.maximum(distance, 0.0) / width)
+def _by_object(objects: NDArray[np.str_], hit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Count the sweeps told right and all sweeps of each object [object, 2]."""
+    owner = np.unique(objects, return_inverse=True)[1]
+    return np.array([np.bincount(owner, weights=hit), np.bincount(owner)], dtype=np.float64).T
 
 
-def _accuracy(choice: Sequence[int], members: Sequence[NDArray[np.str_]], hits: dict[str, tuple[int, int]]) -> float:
-    """Mean over classes of the share of right answers."""
-    shares = []
-    for number in choice:
-        counts = np.array([hits[name] for name in members[number]])
-        shares.append(counts[:, 0].sum() / counts[:, 1].sum())
-    return float(np.mean(shares))
+def _interval(tallies: Sequence[Mapping[int, NDArray[np.float64]]], sizes: Sequence[int], seed: int) -> Interval:
+    """Resample the objects of each class, the same ones in every choice, and take the middle 95 %.
 
-
-def _interval(
-    choices: Sequence[tuple[int, ...]],
-    members: Sequence[NDArray[np.str_]],
-    right: Sequence[dict[str, tuple[int, int]]],
-    seed: int,
-) -> Interval:
-    """Resample the objects of each class, the same ones in every choice, and take the middle 95 %."""
+    Args:
+        tallies: of each choice, class → right and all sweeps of its objects [object, 2].
+        sizes: number of objects of each class.
+        seed: of the resampling.
+    """
     generator = np.random.default_rng([seed, 1])
-    drawn = [generator.integers(len(names), size=(RESAMPLES, len(names))) for names in members]
+    drawn = [generator.integers(size, size=(RESAMPLES, size)) for size in sizes]
     means = np.zeros(RESAMPLES)
-    for choice, hits in zip(choices, right, strict=True):
-        for number in choice:
-            counts = np.array([hits[name] for name in members[number]])[drawn[number]].sum(axis=1)
-            means += counts[:, 0] / counts[:, 1] / len(choice) / len(choices)
+    for tally in tallies:
+        for number, rows in tally.items():
+            counts = rows[drawn[number]].sum(axis=1)
+            means += counts[:, 0] / counts[:, 1] / len(tally) / len(tallies)
     low, high = np.quantile(means, [0.025, 0.975])
     if np.ptp(means) == 0 and means[0] in (0.0, 1.0):
         # Resampling cannot show the doubt that is left when every object is right: the exact bound of n of n does.
-        doubt = 0.025 ** (1 / sum(map(len, members)))
+        doubt = 0.025 ** (1 / sum(sizes))
         low, high = (doubt, 1.0) if means[0] == 1 else (0.0, 1 - doubt)
         return Interval(low, high, 0.95, "exact binomial (Clopper and Pearson) over objects, which are all alike")
     return Interval(float(low), float(high), 0.95, f"bootstrap over objects within classes, {RESAMPLES} resamples")

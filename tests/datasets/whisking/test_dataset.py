@@ -236,7 +236,7 @@ def test_many_shards_are_read_with_few_open_files(tmp_path, monkeypatch):
     plan = GenerationPlan("still", grid, resolve_objects(["brick:40"], collision="hull"),
                           Settings(Fidelity.preset("fast"), shard_size=1), "C3")  # fmt: skip
     generate(plan, tmp_path, workers=1)
-    monkeypatch.setattr("brainbench.datasets.whisking.memory.most_open", lambda: 5)
+    monkeypatch.setattr("brainbench.datasets.whisking.dataset.most_open", lambda: 5)
     data = WhiskingDataset(tmp_path, split="all", batch_size=7)
     assert sum(len(y) for _, y in data) == 40
-    assert len(data._maps) == 5
+    assert data._forces.cache_info().currsize == 5

@@ -59,14 +59,15 @@ def test_the_interval_covers_the_true_accuracy_of_two_gaussians():
     assert covered >= 6
 
 
-def test_the_kernel_is_that_of_scikit_learn():
-    from sklearn.metrics.pairwise import rbf_kernel
+def test_the_accuracy_is_that_of_a_scaled_radial_svc():
+    from sklearn.model_selection import StratifiedGroupKFold, cross_val_score
+    from sklearn.svm import SVC
 
-    from brainbench.datasets.whisking.separability import _kernel
-
-    values = np.random.default_rng(0).normal(size=(40, 30)) * 3 + 1
-    expected = rbf_kernel(values, gamma=1 / (30 * values.var()))  # what SVC(gamma="scale") takes
-    np.testing.assert_allclose(_kernel(values), expected, rtol=1e-4)
+    features, labels, objects = _made(by_class=0.6, seed=2)
+    found = separate(features, labels, objects, count=4, names=NAMES, seed=3)
+    folds = StratifiedGroupKFold(5, shuffle=True, random_state=3)
+    expected = cross_val_score(SVC(C=10.0), features, labels, groups=objects, cv=folds)
+    assert found.accuracies[0] == pytest.approx(expected.mean(), abs=0.01)
 
 
 def test_when_every_object_is_right_the_interval_is_that_of_n_of_n():
