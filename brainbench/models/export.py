@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.errors import DataError, missing_dependency, unknown_name
 
 if TYPE_CHECKING:
-    import torch
     from torch import nn
 
 SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
@@ -66,12 +65,13 @@ def export_model(
 
     if format not in SUFFIXES:
         raise unknown_name("export format", format, SUFFIXES)
-    _require(format)
+    if format == "onnx":
+        require_onnx()
     target = Path(path)
     target = target if target.suffix else target.with_suffix(SUFFIXES[format])
     step = StreamingStep(copy.deepcopy(model).cpu().float().eval()).eval()
     with atomic_path(target) as temporary:
-        (_write_onnx if format == "onnx" else _write_torch)(step, temporary, opset)
+        _write(step, temporary, format, opset)
         difference = _difference(step, READERS[format](temporary))
         if not difference <= TOLERANCE:
             raise DataError(
@@ -100,9 +100,8 @@ def export_model(
     return Export(target, file, format, step.state_size, step.model.features, difference)
 
 
-def _require(format: str) -> None:
-    if format != "onnx":
-        return
+def require_onnx() -> None:
+    """Raise :class:`MissingDependencyError` unless files of ONNX can be written and read."""
     for package in ("onnx", "onnxscript", "onnxruntime"):
         try:
             __import__(package)
@@ -110,43 +109,34 @@ def _require(format: str) -> None:
             raise missing_dependency(package, extra="export", purpose="Exporting to ONNX") from error
 
 
-def _example(step: Any, batch: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _write(step: Any, path: Path, format: str, opset: int) -> None:
     import torch
 
-    return torch.zeros(batch, *step.model.spec.input_shape), step.init_state(batch)
-
-
-def _write_onnx(step: Any, path: Path, opset: int) -> None:
-    import torch
-
+    example = torch.zeros(2, *step.model.spec.input_shape), step.init_state(2)
     batch = torch.export.Dim("batch", min=1, max=4096)
+    shapes: dict[str, Any] = {"dynamic_shapes": ({0: batch}, {0: batch})}
     with warnings.catch_warnings(), torch.no_grad():
-        # The exporter warns of its own parts' deprecations, which nobody here can act on.
+        # The exporters warn of their own parts' deprecations, which nobody here can act on.
         warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            step,
-            _example(step, 2),
-            dynamo=True,
-            opset_version=opset,
-            input_names=list(INPUTS),
-            output_names=list(OUTPUTS),
-            dynamic_shapes=({0: batch}, {0: batch}),
-            verbose=False,
-        )
+        if format == "torch":
+            torch.export.save(torch.export.export(step, example, **shapes), path)
+            return
+        names: dict[str, Any] = {"input_names": list(INPUTS), "output_names": list(OUTPUTS)}
+        program = torch.onnx.export(step, example, dynamo=True, opset_version=opset, verbose=False, **names, **shapes)
     if program is None:
         raise DataError("PyTorch gave no ONNX program for this network.")
     program.save(str(path), external_data=False)
 
 
-def _write_torch(step: Any, path: Path, opset: int) -> None:
-    import torch
+def onnx_session(path: str | Path, threads: int | None = None) -> Any:
+    """Return ONNX Runtime's session of a file on the CPU, with its own choice of threads if None."""
+    import onnxruntime
 
-    del opset
-    batch = torch.export.Dim("batch", min=1, max=4096)
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")
-        program = torch.export.export(step, _example(step, 2), dynamic_shapes=({0: batch}, {0: batch}))
-        torch.export.save(program, path)
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    if threads is not None:
+        options.intra_op_num_threads = options.inter_op_num_threads = threads
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def read_onnx(path: str | Path, *, threads: int | None = None) -> Callable[[Any, Any], tuple[Any, Any]]:
@@ -156,13 +146,7 @@ def read_onnx(path: str | Path, *, threads: int | None = None) -> Callable[[Any,
         path: The file.
         threads: Threads that ONNX Runtime computes with; its own choice if None.
     """
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    if threads is not None:
-        options.intra_op_num_threads = options.inter_op_num_threads = threads
-    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    session = onnx_session(path, threads)
 
     def run(obs: Any, h_in: Any) -> tuple[Any, Any]:
         features, h_out = session.run(list(OUTPUTS), dict(zip(INPUTS, (obs, h_in), strict=True)))

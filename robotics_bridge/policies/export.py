@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from brainbench.core.errors import DataError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, unknown_name
 from brainbench.core.files import atomic_path, provenance, write_json
 from brainbench.models.activations import evaluating
+from brainbench.models.export import onnx_session, require_onnx
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -104,11 +105,7 @@ def _write(policy: TactilePolicy, path: Path, format: str) -> None:
     if format == "jit":
         torch.jit.script(policy.as_jit()).save(str(path))
         return
-    for package in ("onnx", "onnxscript", "onnxruntime"):
-        try:
-            __import__(package)
-        except ImportError as error:
-            raise missing_dependency(package, extra="export", purpose="Exporting to ONNX") from error
+    require_onnx()
     step: Any = policy.as_onnx()
     batch = torch.export.Dim("batch", min=1, max=8192)
     names = step.input_names
@@ -143,14 +140,8 @@ def read_policy(
 
 class _OnnxRunner:
     def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]], threads: int | None) -> None:
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3
-        if threads is not None:
-            options.intra_op_num_threads = options.inter_op_num_threads = threads
         try:
-            self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self.session = onnx_session(path, threads)
         except Exception as error:  # ONNX Runtime's own classes of errors have no common public base
             raise DataError(f"{str(path)!r} cannot be read as an ONNX policy ({error}).") from error
         inputs = {item.name: item.shape for item in self.session.get_inputs()}

@@ -56,7 +56,7 @@ def test_every_layer_of_ours_comes_with_its_time_steps(stimuli):
 def test_layers_can_be_chosen_and_unknown_ones_name_the_nearest(stimuli):
     model = load_model("zhuang-small")
     assert list(extract(model, stimuli, layers=["decoder", "encoder.fc7"])) == ["encoder.fc7", "decoder"]
-    with pytest.raises(UsageError, match=r"Unknown layer 'fc7'; did you mean 'encoder\.fc7'"):
+    with pytest.raises(UsageError, match=r"'fc7'.*'encoder\.fc7'"):
         extract(model, stimuli, layers=["fc7"])
 
 
@@ -159,7 +159,7 @@ def test_submodules_can_be_asked_for_by_name(stimuli):
     assert list(extract(model, stimuli)) == ["0", "1.0", "1.1", "output"]
     chosen = extract(model, stimuli, layers=["1"])
     np.testing.assert_array_equal(chosen["1"], extract(model, stimuli)["1.1"])
-    with pytest.raises(UsageError, match=r"Unknown layer '1\.2'; did you mean '1"):
+    with pytest.raises(UsageError, match=r"'1\.2'; did you mean '1"):
         extract(model, stimuli, layers=["1.2"])
 
 
@@ -173,9 +173,9 @@ def test_a_layer_that_knows_no_stimuli_is_an_error_only_when_asked_for(stimuli):
             return self.head(x.flatten(2)) + self.bias(torch.tensor([1]))
 
     assert list(extract(Biased(), stimuli)) == ["head", "output"]
-    with pytest.raises(UsageError, match=r"Layer 'bias' gave \[\[1, 3\]\] for 5 stimuli of 4 steps"):
+    with pytest.raises(UsageError, match=r"'bias' gave \[\[1, 3\]\]"):
         extract(Biased(), stimuli, layers=["bias"])
-    with pytest.raises(UsageError, match="Layer 'unused' gave nothing for 5 stimuli"):
+    with pytest.raises(UsageError, match="'unused' gave nothing"):
         extract(Biased(), stimuli, layers=["unused"])
 
 
@@ -231,7 +231,7 @@ def test_a_model_that_forgets_its_stimuli_says_what_to_return(stimuli):
         def forward(self, x):
             return x.mean()
 
-    with pytest.raises(UsageError, match=r"Nothing in Mean gives an activation per stimulus.*Return \[B, \.\.\.\]"):
+    with pytest.raises(UsageError, match=r"Nothing in Mean .*\[B, \.\.\.\]"):
         extract(Mean(), stimuli)
 
 

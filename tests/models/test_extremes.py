@@ -42,7 +42,7 @@ def test_ten_thousand_steps_in_half_precision_are_finite(name):
 
 @torch.no_grad()
 def test_more_steps_than_a_transformer_remembers_are_refused():
-    with pytest.raises(UsageError, match="remembers at most 32 steps"):
+    with pytest.raises(UsageError, match="at most 32 steps"):
         load_model("zhuang-small+gpt")(torch.zeros(1, 10_000, 30, 5, 7))
 
 
@@ -50,7 +50,7 @@ def test_more_steps_than_a_transformer_remembers_are_refused():
 def test_a_stimulus_that_is_not_finite_is_refused(value):
     x = torch.zeros(1, 3, 30, 5, 7)
     x[0, 1, 2, 3, 4] = value
-    with pytest.raises(UsageError, match="1 of 3,150 values of the stimulus are not finite"):
+    with pytest.raises(UsageError, match="1 of 3,150 values"):
         load_model("zhuang-small")(x)
 
 

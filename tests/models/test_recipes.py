@@ -63,5 +63,5 @@ def test_a_small_model_is_trained_like_the_full_one_and_others_like_their_relati
 def test_an_unknown_recipe_names_the_nearest():
     with pytest.raises(UsageError, match=r"did you mean 'zhuang-lstm\.simclr'"):
         find_recipe("zhuang-lstn.simclr")
-    with pytest.raises(UsageError, match="Unknown objective 'simclear'; did you mean 'simclr'"):
+    with pytest.raises(UsageError, match=r"'simclear'.*'simclr'"):
         recipe_for("zhuang", "simclear")

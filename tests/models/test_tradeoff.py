@@ -53,11 +53,11 @@ def test_a_reduced_network_is_scored_like_the_network():
 
 
 def test_wrong_settings_are_refused():
-    with pytest.raises(UsageError, match="Unknown precision 'int4'"):
+    with pytest.raises(UsageError, match="precision 'int4'"):
         ModelSetting("int4")
-    with pytest.raises(UsageError, match="at least 1 step; received 0"):
+    with pytest.raises(UsageError, match="1 step; received 0"):
         ModelSetting(steps=0)
-    with pytest.raises(UsageError, match="knows one unrolling only"):
+    with pytest.raises(UsageError, match="one unrolling only"):
         Reduced("s4-small", ModelSetting(unroll="full"))
-    with pytest.raises(UsageError, match="22 steps cannot be taken"):
+    with pytest.raises(UsageError, match="22 steps cannot"):
         measure(NAME, ModelSetting(), _sweeps())

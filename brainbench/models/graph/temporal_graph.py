@@ -23,7 +23,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.models.graph.node import NodeModule
 from brainbench.models.graph.spec import GraphSpec, Shape, Unroll, check_unroll
 from brainbench.models.graph.tnn_import import read_graph
-from brainbench.models.graph.unrolling import Sweep, needed_steps
+from brainbench.models.graph.unrolling import UnrolledSweep, needed_steps
 from brainbench.models.ops.layers import Conv2d, Linear
 from brainbench.models.ops.parameters import check_named, copy_named
 
@@ -293,7 +293,7 @@ class TemporalGraph(nn.Module):
         output = self.spec.output
         whole, final = (wanted, {output}) if last else (wanted | {output}, set())
         steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
-        kept = Sweep(self, x, unroll, steps).run(whole | final)
+        kept = UnrolledSweep(self, x, unroll, steps).run(whole | final)
         y = kept[output][1]
         y = y[:, -1] if last else y
         if return_activations is False:

@@ -61,7 +61,7 @@ def needed_steps(
     return {name: (first[name], stop[name]) if stop[name] else (0, 0) for name in first}
 
 
-class Sweep:
+class UnrolledSweep:
     """One sweep through a graph. Kept outputs are (first step, [B, steps, ...])."""
 
     def __init__(

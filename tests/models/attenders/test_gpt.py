@@ -66,12 +66,12 @@ def test_a_step_equals_the_sweep():
 
 def test_a_full_context_is_announced():
     attender = _attender()
-    with pytest.raises(UsageError, match=r"at most 5 steps \(context 11 tokens, two per step\); received step 6"):
+    with pytest.raises(UsageError, match=r"at most 5 steps .* step 6"):
         attender(torch.zeros(1, 6, 12))
     state = attender.init_state(1)
     for _ in range(5):
         _, state = attender.step(torch.zeros(1, 12), state)
-    with pytest.raises(UsageError, match=r"received step 6\. Shorten the sweep or start again from init_state"):
+    with pytest.raises(UsageError, match=r"step 6.* init_state"):
         attender.step(torch.zeros(1, 12), state)
 
 
@@ -96,5 +96,5 @@ def test_dropout_acts_in_training_alone():
 
 
 def test_a_width_that_heads_cannot_share_is_refused():
-    with pytest.raises(UsageError, match="multiple of its 4 heads; received 10"):
+    with pytest.raises(UsageError, match="4 heads; received 10"):
         GPTAttender(12, 10)

@@ -21,7 +21,7 @@ def test_nodes_are_sorted_along_the_feedforward_edges():
 
 
 def test_a_feedforward_cycle_is_refused_by_name():
-    with pytest.raises(UsageError, match="among 'b', 'c' form a cycle; mark the edges that lead back"):
+    with pytest.raises(UsageError, match="among 'b', 'c' form a cycle"):
         _spec([Edge("a", "b"), Edge("b", "c"), Edge("c", "b")])
 
 
@@ -122,5 +122,5 @@ def test_an_unknown_memory_names_the_nearest():
 
 
 def test_an_unknown_unrolling_names_the_choices():
-    with pytest.raises(UsageError, match="Allowed: 'biological', 'full'"):
+    with pytest.raises(UsageError, match="'biological', 'full'"):
         _spec([Edge("a", "b"), Edge("b", "c")]).first_response("fully")

@@ -68,7 +68,7 @@ def test_weights_for_another_stimulus_shape_are_announced_and_checked(published,
     assert "not made for the stimulus shape [3, 6, 6]" in caplog.text
     with pytest.raises(UsageError, match="shape is still open"):
         graph.init_state(1)
-    with pytest.raises(UsageError, match=r"do not fit steps of shape \[6, 9, 9\]: node 'fc7' would receive"):
+    with pytest.raises(UsageError, match=r"\[6, 9, 9\]: node 'fc7'"):
         graph(torch.zeros(1, 2, 6, 9, 9))
     graph(torch.zeros(1, 2, 6, 5, 7))
     assert graph.input_shape == (6, 5, 7)
@@ -205,7 +205,7 @@ def test_only_the_nodes_asked_for_are_returned():
     y, activations = graph(torch.randn(1, 2, 30, 5, 7), return_activations=("fc7", "conv3"))
     assert list(activations) == ["conv3", "fc7"]
     assert y.shape == (1, 2, 96)
-    with pytest.raises(UsageError, match="Unknown node 'conv33'; did you mean 'conv3'"):
+    with pytest.raises(UsageError, match=r"'conv33'.*'conv3'"):
         graph(torch.randn(1, 2, 30, 5, 7), return_activations=("conv33",))
 
 
@@ -218,13 +218,13 @@ def test_dropout_acts_in_training_alone():
 
 @pytest.mark.parametrize("shape", [(1, 30, 5, 7), (1, 0, 30, 5, 7), (30, 5, 7)])
 def test_a_sweep_without_time_is_refused(shape):
-    with pytest.raises(UsageError, match=r"expects \[batch, time, channels, rows, columns\]; received"):
+    with pytest.raises(UsageError, match=r"\[batch, time, channels"):
         _small()(torch.zeros(shape))
 
 
 def test_a_step_with_time_is_refused():
     graph = _small()
-    with pytest.raises(UsageError, match=r"A step expects \[batch, channels, rows, columns\]"):
+    with pytest.raises(UsageError, match=r"\[batch, channels, rows"):
         graph.step(torch.zeros(1, 1, 30, 5, 7), graph.init_state(1))
 
 

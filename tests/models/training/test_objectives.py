@@ -86,7 +86,7 @@ def test_a_few_steps_on_one_batch_lower_the_loss(objective):
 def test_the_autoencoder_compares_features_with_the_step_they_can_know():
     learner = _learner("ae")
     assert learner.model.spec.latency == 3
-    with pytest.raises(UsageError, match="longer than the encoder's latency of 3 steps; received 3"):
+    with pytest.raises(UsageError, match="3 steps; received 3"):
         learner(*_batch(learner, steps=3))
 
 
@@ -96,7 +96,7 @@ def test_a_plain_network_can_only_be_trained_supervised():
             return x.flatten(1)[:, :3]
 
     assert make_learner("supervised", Plain())((torch.zeros(2, 1, 6, 5, 7),), torch.tensor([0, 1]))[0] > 0
-    with pytest.raises(UsageError, match="SimCLR learns from features, which Plain does not name"):
+    with pytest.raises(UsageError, match=r"SimCLR .* Plain"):
         make_learner("simclr", Plain())
-    with pytest.raises(UsageError, match="Unknown objective 'simclear'"):
+    with pytest.raises(UsageError, match="objective 'simclear'"):
         make_learner("simclear", Plain())

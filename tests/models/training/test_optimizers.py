@@ -55,13 +55,13 @@ def test_every_optimiser_descends_a_bowl(name):
 
 
 def test_wrong_choices_are_refused():
-    with pytest.raises(UsageError, match="Unknown optimizer 'larz'; did you mean 'lars'"):
+    with pytest.raises(UsageError, match=r"'larz'.*'lars'"):
         make_optimizer("larz", [], 0.1)
-    with pytest.raises(UsageError, match="must be a positive number; received nan"):
+    with pytest.raises(UsageError, match="received nan"):
         make_optimizer("sgd", [nn.Parameter(torch.zeros(1))], math.nan)
-    with pytest.raises(UsageError, match="numbers of 0 or more; received lr -1"):
+    with pytest.raises(UsageError, match="received lr -1"):
         LARS([nn.Parameter(torch.zeros(1))], lr=-1)
-    with pytest.raises(UsageError, match="Unknown schedule 'stepp'; did you mean 'step'"):
+    with pytest.raises(UsageError, match=r"'stepp'.*'step'"):
         rate_factor("stepp", 0, epochs=1)
 
 

@@ -141,14 +141,14 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_last_good_model(tm
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
     train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
-    with pytest.raises(UsageError, match=r"holds another run: learning_rate 0\.001 \(now 0\.01\)"):
+    with pytest.raises(UsageError, match=r"learning_rate 0\.001 \(now 0\.01"):
         train(_config(epochs=1, learning_rate=0.01), tiny(), out=tmp_path, device="cpu")
 
 
 def test_a_damaged_state_is_named(tmp_path):
     train(_config(), tiny(), out=tmp_path, device="cpu", stop_after=0.0)
     (tmp_path / "state.safetensors").write_bytes(b"nothing")
-    with pytest.raises(DataError, match="not a readable training state"):
+    with pytest.raises(DataError, match="readable training state"):
         train(_config(), tiny(), out=tmp_path, device="cpu")
 
 
