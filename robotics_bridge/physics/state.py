@@ -5,7 +5,8 @@ Letters: B environment, L link, C contact. Metres, seconds, newtons, world axes;
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,6 +93,16 @@ class HandState:
             status=wp.zeros(num_envs, dtype=wp.int32, device=device),
         )
 
+    @cached_property
+    def arrays(self) -> Any:
+        """The Warp structure of the buffers that kernels take."""
+        from robotics_bridge.physics.kernels.state import StateArrays
+
+        struct = StateArrays()
+        for name in StateArrays.vars:
+            setattr(struct, name, getattr(self, name))
+        return struct
+
     @property
     def device(self) -> Any:
         """The Warp device of the buffers."""
@@ -170,13 +181,10 @@ class HandState:
         """Refresh :attr:`status`: which environments diverged, and whether contacts were lost."""
         from robotics_bridge.physics.kernels.state import check_state
 
-        inputs = [self.pose, self.velocity, self.contact_count, self.contact_env.shape[0], self.status]
-        warp().launch(check_state, dim=self.num_envs, inputs=inputs, device=self.device)
+        warp().launch(check_state, dim=self.num_envs, inputs=[self.arrays], device=self.device)
 
     def aliasing(self, buffers: Mapping[str, Any]) -> HandState:
         """Return a state that uses an engine's own arrays for some of the buffers."""
-        from dataclasses import replace
-
         return replace(self, **buffers)
 
     def _write(self, view: torch.Tensor, values: Any, what: str) -> None:

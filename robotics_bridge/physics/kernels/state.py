@@ -8,13 +8,37 @@ from brainbench.core.devices import warp
 wp = warp()
 
 
+@wp.struct
+class StateArrays:
+    """Arrays of a ``HandState``, as kernels take them."""
+
+    pose: wp.array2d(dtype=wp.transformf)
+    """[B, L]."""
+    velocity: wp.array2d(dtype=wp.spatial_vectorf)
+    """[B, L] of the origin, then angular."""
+    contact_count: wp.array(dtype=wp.int32)
+    """[1] contacts found, which may exceed C."""
+    contact_env: wp.array(dtype=wp.int32)
+    """[C]."""
+    contact_geom: wp.array(dtype=wp.vec2i)
+    """[C]."""
+    contact_distance: wp.array(dtype=wp.float32)
+    """[C] gap, negative for overlap."""
+    contact_position: wp.array(dtype=wp.vec3f)
+    """[C]."""
+    contact_normal: wp.array(dtype=wp.vec3f)
+    """[C] from the first geometry to the second."""
+    contact_force: wp.array(dtype=wp.float32)
+    """[C] normal force; NaN where the engine does not tell."""
+    status: wp.array(dtype=wp.int32)
+    """[B] bits: 1 diverged, 2 more contacts than room."""
+
+
 @wp.func
-def link_fails(
-    pose: wp.array2d(dtype=wp.transformf), velocity: wp.array2d(dtype=wp.spatial_vectorf), env: int, link: int
-) -> bool:
+def link_fails(state: StateArrays, env: int, link: int) -> bool:
     """Return whether a pose or a velocity holds a number that is not finite."""
-    at = pose[env, link]
-    speed = velocity[env, link]
+    at = state.pose[env, link]
+    speed = state.velocity[env, link]
     total = float(0.0)
     # Adding zeros keeps a NaN and turns an infinity into one.
     for k in range(7):
@@ -25,34 +49,22 @@ def link_fails(
 
 
 @wp.func
-def status_of(
-    pose: wp.array2d(dtype=wp.transformf),
-    velocity: wp.array2d(dtype=wp.spatial_vectorf),
-    env: int,
-    contacts: int,
-    room: int,
-) -> int:
-    """Return the status bits of an environment: 1 diverged, 2 more contacts than room."""
+def status_of(state: StateArrays, env: int) -> int:
+    """Return the status bits of an environment."""
     bits = int(0)
-    for link in range(pose.shape[1]):
-        if link_fails(pose, velocity, env, link):
+    for link in range(state.pose.shape[1]):
+        if link_fails(state, env, link):
             bits = 1
-    if contacts > room:
+    if state.contact_count[0] > state.contact_env.shape[0]:
         bits = bits + 2
     return bits
 
 
 @wp.kernel
-def check_state(
-    pose: wp.array2d(dtype=wp.transformf),
-    velocity: wp.array2d(dtype=wp.spatial_vectorf),
-    count: wp.array(dtype=wp.int32),
-    room: int,
-    status: wp.array(dtype=wp.int32),
-):
+def check_state(state: StateArrays):
     """Refresh the status. Thread: environment [B]."""
     env = wp.tid()
-    status[env] = status_of(pose, velocity, env, count[0], room)
+    state.status[env] = status_of(state, env)
 
 
 @wp.kernel

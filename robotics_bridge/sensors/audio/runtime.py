@@ -10,6 +10,8 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.audio.kernels.sound import (
+    ContactSoundArrays,
+    DriveSoundArrays,
     DriveSoundParams,
     SourceParams,
     excite_modes,
@@ -45,11 +47,13 @@ class ContactAudioRuntime(ReadoutRuntime):
         super().__init__(sensors, self.samples, context, fusable=False)
         count, envs = len(sensors), context.num_envs
         self._dt = math.nan
-        self._coefficients = [context.zeros((self._quads, count), wp.vec4) for _ in range(3)]
-        self._structures = context.zeros(count, SourceParams)
-        self._drive = context.zeros((self.samples, envs, count))
-        self._y1, self._y2 = (context.zeros((self._quads, envs, count), wp.vec4) for _ in range(2))
-        self._force, self._before, self._rubbing = (context.zeros((envs, count)) for _ in range(3))
+        own, quads = ContactSoundArrays(), self._quads
+        own.sources, own.link_of = context.zeros(count, SourceParams), context.solids.struct.link
+        own.force, own.before, own.rubbing = (context.zeros((envs, count)) for _ in range(3))
+        own.drive = context.zeros((self.samples, envs, count))
+        own.first, own.second, own.gain = (context.zeros((quads, count), wp.vec4) for _ in range(3))
+        own.y1, own.y2 = (context.zeros((quads, envs, count), wp.vec4) for _ in range(2))
+        self._own = own
 
     def _set_step(self, dt: float) -> None:
         """Compute the poles for a sample rate of K / dt; modes beyond its half stay silent."""
@@ -74,25 +78,19 @@ class ContactAudioRuntime(ReadoutRuntime):
             item.threshold, item.impact, item.scrape = sensor.threshold, sensor.impact, sensor.scrape
             item.pulse = int(np.clip(round(sensor.contact_time / step), 1, self.samples))
             sources.append(item)
-        for array, values in zip(self._coefficients, poles, strict=True):
+        for array, values in zip((self._own.first, self._own.second, self._own.gain), poles, strict=True):
             quads = values.reshape(self._quads, 4, -1).transpose(0, 2, 1)
             array.assign(np.ascontiguousarray(quads, dtype=np.float32))
-        self._structures.assign(self.context.array(sources, SourceParams))
+        self._own.sources.assign(self.context.array(sources, SourceParams))
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the contacts and make the next block."""
         self._set_step(dt)
-        c, many, clock = self.context, (self.context.num_envs, len(self._sensors)), self.context.clock
-        sums = [self._force, self._before, self._rubbing]
-        c.launch(
-            gather_contacts, state.contact_env.shape[0], state.contact_count, state.contact_env, state.contact_geom,
-            state.contact_position, state.contact_normal, state.contact_force, c.solids.struct.link, self._structures,
-            state.pose, state.velocity, self._force, self._rubbing,
-        )  # fmt: skip
-        inputs = [self._structures, clock.age, clock.episode, clock.env_offset, dt, self.samples]
-        c.launch(excite_modes, (self.samples, *many), *inputs, *sums, self._drive)
-        inputs = [clock.age, state.status, self.samples, self._quads, *self._coefficients, self._drive]
-        c.launch(ring_modes, many, *inputs, self._y1, self._y2, *sums, self._truth, self._measured)
+        self.begin(state, dt)
+        c, own, many = self.context, self._own, (self.context.num_envs, len(self._sensors))
+        c.launch(gather_contacts, state.contact_env.shape[0], state.arrays, own)
+        c.launch(excite_modes, (self.samples, *many), own, self.io, self.samples)
+        c.launch(ring_modes, many, own, self.io, self.samples)
         self.finish(dt)
 
     @property
@@ -114,17 +112,17 @@ class DriveAudioRuntime(ReadoutRuntime):
             for knob in ("load", "power", "pitch", "partials", "rolloff", "friction", "hum", "hum_frequency"):
                 setattr(item, knob, getattr(sensor, knob))
             settings.append(item)
-        self._settings = context.array(settings, DriveSoundParams)
-        fields = [context.zeros((context.num_envs, self.count)) for _ in range(6)]
-        self.effort, self.speed, *self._memory = fields
+        own, shape = DriveSoundArrays(), (context.num_envs, self.count)
+        own.settings, own.part, own.number = context.array(settings, DriveSoundParams), self.part, self.probe
+        for name in ("effort", "speed", "last_loud", "last_speed", "phase", "hum_phase"):
+            setattr(own, name, context.zeros(shape))
+        self._own, self.effort, self.speed = own, own.effort, own.speed
 
     def update(self, state: HandState, dt: float) -> None:
         """Make the next block from the torques and speeds that were written."""
-        del state
+        self.begin(state, dt)
         c = self.context
-        inputs = [self._settings, self.part, self.probe, c.clock.age, c.clock.episode, c.clock.env_offset, dt]
-        inputs += [self.samples, self.effort, self.speed, *self._memory, self._truth, self._measured]
-        c.launch(sound_drives, (c.num_envs, self.count), *inputs)
+        c.launch(sound_drives, (c.num_envs, self.count), self._own, self.io, self.samples)
         self.finish(dt)
 
     @property

@@ -115,18 +115,15 @@ class PairTable:
 
     def start(self, state: HandState, age: Any) -> None:
         """Count an update, refresh the state's status and mark contacts."""
-        wp, contacts = warp(), self.contacts_needed
-        room = state.contact_env.shape[0]
-        inputs = [self.plan, state.pose, state.velocity, state.contact_count]
-        inputs += [state.contact_geom, state.contact_env, self._words, self._bits, state.status, age]
+        contacts, room = self.contacts_needed, state.contact_env.shape[0]
+        inputs = [self.plan, state.arrays, self._words, self._bits, age]
         dim = max(self._num_envs, -(-room // CONTACTS)) if contacts else self._num_envs
-        wp.launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
+        warp().launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
 
     def update(self, state: HandState) -> None:
         """List what every slot meets now; contacts were marked by :meth:`start`."""
         if not self._slots:
             return
-        wp, solids = warp(), self._solids.struct
-        inputs = [self.plan, solids, state.pose, state.velocity, self._words, self._bits, self.struct, self.crowded]
-        dim = self._num_envs * (len(self._slots) + self._apart * state.pose.shape[1])
-        wp.launch(pair_kernel(self._apart), dim=dim, inputs=[*inputs, state.status], device=self._device)
+        inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct, self.crowded]
+        dim = self._num_envs * (len(self._slots) + self._apart * state.num_links)
+        warp().launch(pair_kernel(self._apart), dim=dim, inputs=inputs, device=self._device)

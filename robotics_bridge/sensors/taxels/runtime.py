@@ -12,7 +12,7 @@ from robotics_bridge.sensors.probes.kernels.probe import KinematicParams, kinema
 from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
 from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
-from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityParams, proximity_kernel
+from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityArrays, ProximityParams, proximity_kernel
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.state import HandState
@@ -63,11 +63,9 @@ class KinematicRuntime(ProbeRuntime):
         """Make the field push as the engine does."""
         c, plan = self.context, self.context.pairs.plan
         self._loads.zero_()
-        contacts = [state.contact_count, state.contact_geom, state.contact_env]
-        contacts += [state.contact_normal, state.contact_force]
         room = state.contact_env.shape[0]
-        c.launch(gather_loads, room, self._spans, plan, c.solids.struct.link, *contacts, self._loads)
-        inputs = [self._spans, plan, state.pose, self._truth, self._loads, self._scales]
+        c.launch(gather_loads, room, self._spans, plan, c.solids.struct.link, state.arrays, self._loads)
+        inputs = [self._spans, plan, state.arrays, self._truth, self._loads, self._scales]
         c.launch(weigh_field, self._loads.shape, *inputs)
         self.launch(scale_field, self.part, self._scales, self._truth, self._measured, int(self.noisy))
 
@@ -86,31 +84,30 @@ class ProximityRuntime(ProbeRuntime):
             law.stiffness, law.coupling = sensor.stiffness, sensor.coupling
             laws.append(law)
             row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
-        self._laws, self._densities = context.array(laws, ProximityParams), context.array(densities, float)
-        self._links = context.array([context.scene.link_index(sensor.link) for sensor in sensors.values()], int)
         # A processor walks through all probes of an environment anyway, so it may list their points in between.
         self.gathered = not context.device.is_cuda
         self._options = (first.convention == "physical", self.mode, *self.stores)
-        room = self.cloud.total + len(tracked) + 1
-        self._near = context.zeros((context.num_envs, room) if self.gathered else (1, 1), int)
-        self._cells = self._cluster(list(sensors.values())) if self.gathered else ()
+        own, room = ProximityArrays(), self.cloud.total + len(tracked) + 1
+        own.laws, own.densities = context.array(laws, ProximityParams), context.array(densities, float)
+        own.links = context.array([context.scene.link_index(sensor.link) for sensor in sensors.values()], int)
+        own.near = context.zeros((context.num_envs, room) if self.gathered else (1, 1), int)
+        if self.gathered:
+            own.members, own.cells, own.around = self._cluster(list(sensors.values()))
+        self._own = own
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
         self.begin(state, dt)
         kernel, c = proximity_kernel(*self._options, self.gathered), self.context
-        inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self.knobs, self._laws, self._densities]
-        inputs += [self._links, state.pose, state.velocity, self._near]
-        if self.gathered:
-            c.launch(kernel, c.num_envs, *inputs, *self._cells)
-        else:
-            self.launch(kernel, *inputs)
+        dim = c.num_envs if self.gathered else (c.num_envs, self.count)
+        inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self.knobs, self._own, state.arrays]
+        c.launch(kernel, dim, *inputs)
         self.finish(dt)
 
     @property
     def scratch_bytes(self) -> int:
         """Memory per environment [bytes] that every update writes anew: points near a cell of probes."""
-        return 4 * self._near.shape[1] if self.gathered else 0
+        return 4 * self._own.near.shape[1] if self.gathered else 0
 
     def _cluster(self, sensors: list[ProximityTaxel]) -> tuple[Any, Any, Any]:
         """Return the probes [N] by cell, cells (first, end, slot) [C, 3], and spheres [C, 4] around their reach."""

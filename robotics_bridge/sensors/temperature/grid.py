@@ -131,7 +131,7 @@ def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
     Raises:
         UsageError: the suite has no such temperature grid.
     """
-    return warp().to_torch(_runtime_of(suite, name).link_temperature)
+    return warp().to_torch(_runtime_of(suite, name).heat.link_temperature)
 
 
 def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
@@ -144,7 +144,7 @@ def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
 
     runtime = _runtime_of(suite, name)
     column = list(runtime.slices).index(name)
-    return (warp().to_torch(runtime.found_contacts)[:, column] - CAPACITY).clamp(min=0)
+    return (warp().to_torch(runtime.heat.number)[:, column] - CAPACITY).clamp(min=0)
 
 
 def _runtime_of(suite: SensorSuite, name: str) -> TemperatureRuntime:

@@ -12,6 +12,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.sensors.runtime import ReadoutRuntime
 from robotics_bridge.sensors.temperature.kernels.heat import (
     CAPACITY,
+    HeatArrays,
     ThermalParams,
     collect_contacts,
     conduct_contacts,
@@ -46,26 +47,27 @@ class TemperatureRuntime(ReadoutRuntime):
             edges = self._edges[-1]
             exposed.append(_exposed(sensor.cells, edges).ravel())
             source.append((np.broadcast_to(np.asarray(sensor.source, float), sensor.cells) * edges.prod()).ravel())
-        self._structures = context.array(structures, ThermalParams)
-        self._exposed = context.array(np.concatenate(exposed), float)
-        self._source = context.array(np.concatenate(source), float)
         links = [_body(self._sensors, name) for name in scene.links]
         materials = [material(body.material) for body in links]
-        self._conductivity = context.array([item.conductivity for item in materials], float)
-        self._diffusivity = context.array([item.diffusivity for item in materials], float)
         temperatures = np.tile([body.temperature for body in links], (context.num_envs, 1))
-        self.link_temperature = context.array(temperatures, float)
-        """Warp array [B, L] (°C) of the bodies that may be touched."""
         shape, many = (context.num_envs, self.count), (context.num_envs, len(structures))
-        self.found_contacts = context.zeros(many, int)
-        """Warp array [B, S]: contacts of each grid at the last update."""
-        self._kept = context.zeros((*many, CAPACITY), int)
-        self.field, self._first, self._second, self._element = (context.zeros(shape, wp.float64) for _ in range(4))
-        """Warp array [B, N]: temperature of every cell (°C)."""
-        self._touched, self._g, self._inflow = (context.zeros(shape) for _ in range(3))
+        heat = HeatArrays()
+        heat.sensors, heat.part = context.array(structures, ThermalParams), self.part
+        heat.exposed = context.array(np.concatenate(exposed), float)
+        heat.source = context.array(np.concatenate(source), float)
+        heat.link_of = context.solids.struct.link
+        heat.link_conductivity = context.array([item.conductivity for item in materials], float)
+        heat.link_diffusivity = context.array([item.diffusivity for item in materials], float)
+        heat.link_temperature = context.array(temperatures, float)
+        heat.number, heat.kept = context.zeros(many, int), context.zeros((*many, CAPACITY), int)
+        heat.touched, heat.conductance, heat.inflow = (context.zeros(shape) for _ in range(3))
+        heat.temperature, heat.element = (context.zeros(shape, wp.float64) for _ in range(2))
+        self.heat = heat
+        """Warp structure of contacts, bodies and fields."""
+        self._buffers = [context.zeros(shape, wp.float64) for _ in range(2)]
         self._axes = [axis for axis in range(3) if any(sensor.cells[axis] > 1 for sensor in self._sensors)]
         if not self.noisy and any(_lags(sensor) for sensor in self._sensors):
-            self._measured = wp.zeros_like(self._truth)
+            self._measured = self.io.measured = wp.zeros_like(self._truth)
         self._dt = math.nan
         self._set_step(1e-2)
 
@@ -107,39 +109,31 @@ class TemperatureRuntime(ReadoutRuntime):
             offsets.append(row)
         values = np.concatenate(matrices).astype(np.float32)
         if math.isnan(self._dt):
-            self._matrix, self._offset = self.context.array(values, float), self.context.array(offsets, int)
+            self.heat.matrix, self.heat.offset = self.context.array(values, float), self.context.array(offsets, int)
         else:
-            self._matrix.assign(values)
+            self.heat.matrix.assign(values)
         self._dt = dt
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; a new time step re-computes the diffusion matrices first."""
         self._set_step(dt)
-        c, age = self.context, self.context.clock.age
-        cells, grids = (c.num_envs, self.count), self._structures
-        lists = [c.solids.struct.link, grids, self.found_contacts, self._kept]
-        self.found_contacts.zero_()
-        contacts = [state.contact_count, state.contact_env, state.contact_geom]
-        c.launch(collect_contacts, state.contact_env.shape[0], *contacts, *lists)
-        c.launch(
-            conduct_contacts, self._kept.shape, state.contact_geom, state.contact_distance, state.contact_position,
-            state.contact_normal, *lists, state.status, state.pose, self._conductivity, self._diffusivity,
-            self.link_temperature, self._touched, dt, self._g, self._inflow,
-        )  # fmt: skip
-        inputs = [grids, self.part, self._exposed, self._source, age, state.status, dt, self._g, self._inflow]
-        c.launch(exchange_heat, cells, *inputs, self._touched, self.field, self._first)
-        now, spare = self._first, self._second
+        self.begin(state, dt)
+        c, heat, cells = self.context, self.heat, (self.context.num_envs, self.count)
+        heat.number.zero_()
+        c.launch(collect_contacts, state.contact_env.shape[0], state.arrays, heat)
+        c.launch(conduct_contacts, heat.kept.shape, state.arrays, heat, self.io)
+        now, spare = self._buffers
+        c.launch(exchange_heat, cells, heat, self.io, now)
         for axis in self._axes:
-            c.launch(diffuse_heat, cells, axis, grids, self.part, self._offset, self._matrix, now, spare)
+            c.launch(diffuse_heat, cells, axis, heat, now, spare)
             now, spare = spare, now
-        inputs = [grids, self.part, age, state.status, dt, now, self.field, self._element]
-        c.launch(sense_temperature, cells, *inputs, self._truth, self._measured)
+        c.launch(sense_temperature, cells, heat, self.io, now)
         self.finish(dt)
 
     @property
     def state_bytes(self) -> int:
         """Lasting memory per environment [bytes]."""
-        lists = len(self._sensors) * (1 + CAPACITY) * 4 + 4 * self.link_temperature.shape[1]
+        lists = len(self._sensors) * (1 + CAPACITY) * 4 + 4 * self.heat.link_temperature.shape[1]
         return super().state_bytes + (4 * 8 + 3 * 4) * self.count + lists
 
 

@@ -4,6 +4,8 @@ Letters: B environment, S source or sensor, K sample of a block, M mode, J joint
 """
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 from robotics_bridge.sensors.noise.kernels.noise import normals, philox
 
 wp = warp()
@@ -28,135 +30,123 @@ class SourceParams:
     """Samples over which an impact spreads."""
 
 
+@wp.struct
+class ContactSoundArrays:
+    """Arrays of the contact sounds of a group; Q quads of modes."""
+
+    sources: wp.array(dtype=SourceParams)
+    """[S]."""
+    link_of: wp.array(dtype=wp.int32)
+    """[G] link of a geometry."""
+    force: wp.array2d(dtype=wp.float32)
+    """[B, S] summed normal force (N)."""
+    before: wp.array2d(dtype=wp.float32)
+    """[B, S] that of the last update (N)."""
+    rubbing: wp.array2d(dtype=wp.float32)
+    """[B, S] summed force times slip speed (N m/s)."""
+    drive: wp.array3d(dtype=wp.float32)
+    """[K, B, S] impulse of every sample (N s)."""
+    first: wp.array2d(dtype=wp.vec4)
+    """[Q, S] 2 r cos θ of each mode."""
+    second: wp.array2d(dtype=wp.vec4)
+    """[Q, S] r²."""
+    gain: wp.array2d(dtype=wp.vec4)
+    """[Q, S] weight in the sum."""
+    y1: wp.array3d(dtype=wp.vec4)
+    """[Q, B, S] last output of each resonator."""
+    y2: wp.array3d(dtype=wp.vec4)
+    """[Q, B, S] the one before."""
+
+
 @wp.kernel
-def gather_contacts(
-    count: wp.array(dtype=wp.int32),
-    env_of: wp.array(dtype=wp.int32),
-    geom: wp.array(dtype=wp.vec2i),
-    position: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    strength: wp.array(dtype=wp.float32),
-    link_of: wp.array(dtype=wp.int32),
-    sources: wp.array(dtype=SourceParams),
-    pose: wp.array2d(dtype=wp.transformf),
-    velocity: wp.array2d(dtype=wp.spatial_vectorf),
-    force: wp.array2d(dtype=wp.float32),
-    rubbing: wp.array2d(dtype=wp.float32),
-):
+def gather_contacts(state: StateArrays, own: ContactSoundArrays):
     """Sum normal force and force times slip speed of the contacts of each source. Dim [contacts]."""
     c = wp.tid()
-    if c >= wp.min(count[0], env_of.shape[0]):
+    if c >= wp.min(state.contact_count[0], state.contact_env.shape[0]):
         return
-    env = env_of[c]
-    a = link_of[geom[c][0]]
-    b = link_of[geom[c][1]]
-    f = strength[c]
+    env = state.contact_env[c]
+    a = own.link_of[state.contact_geom[c][0]]
+    b = own.link_of[state.contact_geom[c][1]]
+    f = state.contact_force[c]
     if not (f > float(0.0)) or not wp.isfinite(f):
         return
-    p = position[c]
-    va = velocity[env, a]
-    vb = velocity[env, b]
-    oa = wp.transform_get_translation(pose[env, a])
-    ob = wp.transform_get_translation(pose[env, b])
+    p = state.contact_position[c]
+    va = state.velocity[env, a]
+    vb = state.velocity[env, b]
+    oa = wp.transform_get_translation(state.pose[env, a])
+    ob = wp.transform_get_translation(state.pose[env, b])
     slip = wp.spatial_top(va) + wp.cross(wp.spatial_bottom(va), p - oa)
     slip = slip - wp.spatial_top(vb) - wp.cross(wp.spatial_bottom(vb), p - ob)
-    n = normal[c]
+    n = state.contact_normal[c]
     speed = wp.length(slip - n * wp.dot(n, slip))
-    for s in range(sources.shape[0]):
-        link = sources[s].link
+    for s in range(own.sources.shape[0]):
+        link = own.sources[s].link
         if (a == link) != (b == link):
-            wp.atomic_add(force, env, s, f)
-            wp.atomic_add(rubbing, env, s, f * speed)
+            wp.atomic_add(own.force, env, s, f)
+            wp.atomic_add(own.rubbing, env, s, f * speed)
 
 
 @wp.kernel
-def excite_modes(
-    sources: wp.array(dtype=SourceParams),
-    age: wp.array(dtype=wp.int32),
-    episode: wp.array(dtype=wp.int32),
-    env_offset: int,
-    dt: float,
-    samples: int,
-    force: wp.array2d(dtype=wp.float32),
-    before: wp.array2d(dtype=wp.float32),
-    rubbing: wp.array2d(dtype=wp.float32),
-    drive: wp.array3d(dtype=wp.float32),
-):
+def excite_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     """Write the impulse of every sample (N s). Dim [K, B, S]; impacts start at the first sample."""
     k, env, s = wp.tid()
-    source = sources[s]
-    earlier = before[env, s]
-    if age[env] == 0:
+    source = own.sources[s]
+    earlier = own.before[env, s]
+    if io.age[env] == 0:
         earlier = float(0.0)
-    rise = force[env, s] - earlier
+    rise = own.force[env, s] - earlier
     u = float(0.0)
     if rise > source.threshold and k < source.pulse:
         # A raised cosine whose samples sum to one.
         phase = wp.tau * (float(k) + float(1.0)) / (float(source.pulse) + float(1.0))
-        u = source.impact * rise * dt * (float(1.0) - wp.cos(phase)) / (float(source.pulse) + float(1.0))
-    rub = rubbing[env, s]
+        u = source.impact * rise * io.dt * (float(1.0) - wp.cos(phase)) / (float(source.pulse) + float(1.0))
+    rub = own.rubbing[env, s]
     if rub > float(0.0) and source.scrape > float(0.0):
-        last = (wp.uint32(episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(SCRAPE))
+        last = (wp.uint32(io.episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(SCRAPE))
         w0, w1, _w2, _w3 = philox(
-            wp.uint32(k), wp.uint32(env_offset + env), wp.uint32(age[env]), last, source.key_low, source.key_high
+            wp.uint32(k), wp.uint32(io.env_offset + env), wp.uint32(io.age[env]), last, source.key_low, source.key_high
         )
         z = normals(w0, w1)
         # White noise of a density that does not depend on the sample rate.
-        u = u + source.scrape * rub * z[0] * wp.sqrt(dt / float(samples))
-    drive[k, env, s] = u
+        u = u + source.scrape * rub * z[0] * wp.sqrt(io.dt / float(samples))
+    own.drive[k, env, s] = u
 
 
 @wp.kernel
-def ring_modes(
-    age: wp.array(dtype=wp.int32),
-    status: wp.array(dtype=wp.int32),
-    samples: int,
-    quads: int,
-    first: wp.array2d(dtype=wp.vec4),
-    second: wp.array2d(dtype=wp.vec4),
-    gain: wp.array2d(dtype=wp.vec4),
-    drive: wp.array3d(dtype=wp.float32),
-    y1: wp.array3d(dtype=wp.vec4),
-    y2: wp.array3d(dtype=wp.vec4),
-    force: wp.array2d(dtype=wp.float32),
-    before: wp.array2d(dtype=wp.float32),
-    rubbing: wp.array2d(dtype=wp.float32),
-    truth: wp.array3d(dtype=wp.float32),
-    measured: wp.array3d(dtype=wp.float32),
-):
+def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     """Advance the two-pole resonators (4.32), four at a time, over a block. Dim [B, S]."""
     env, s = wp.tid()
-    before[env, s] = force[env, s]
-    force[env, s] = float(0.0)
-    rubbing[env, s] = float(0.0)
-    broken = (status[env] & 1) != 0
-    for q in range(quads):
-        a = y1[q, env, s]
-        b = y2[q, env, s]
-        if age[env] == 0:
+    own.before[env, s] = own.force[env, s]
+    own.force[env, s] = float(0.0)
+    own.rubbing[env, s] = float(0.0)
+    broken = (io.status[env] & 1) != 0
+    for q in range(own.first.shape[0]):
+        a = own.y1[q, env, s]
+        b = own.y2[q, env, s]
+        if io.age[env] == 0:
             a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
             b = a
-        c1 = first[q, s]
-        c2 = second[q, s]
-        g = gain[q, s]
+        c1 = own.first[q, s]
+        c2 = own.second[q, s]
+        g = own.gain[q, s]
         for k in range(samples):
-            u = drive[k, env, s]
+            u = own.drive[k, env, s]
             y = wp.cw_mul(c1, a) - wp.cw_mul(c2, b) + wp.vec4(u, u, u, u)
             b = a
             a = y
             total = wp.dot(g, y)
             if q > 0:
-                total = total + truth[k, env, s]
-            truth[k, env, s] = total
+                total = total + io.truth[k, env, s]
+            io.truth[k, env, s] = total
         if broken or not wp.isfinite(wp.dot(a, a)):
             a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
             b = a
-        y1[q, env, s] = a
-        y2[q, env, s] = b
+        own.y1[q, env, s] = a
+        own.y2[q, env, s] = b
     for k in range(samples):
         if broken:
-            truth[k, env, s] = wp.nan
-        measured[k, env, s] = truth[k, env, s]
+            io.truth[k, env, s] = wp.nan
+        io.measured[k, env, s] = io.truth[k, env, s]
 
 
 @wp.struct
@@ -176,42 +166,49 @@ class DriveSoundParams:
     hum_frequency: wp.float32
 
 
+@wp.struct
+class DriveSoundArrays:
+    """Arrays of the drives of a group."""
+
+    settings: wp.array(dtype=DriveSoundParams)
+    """One per sensor."""
+    part: wp.array(dtype=wp.int32)
+    """[J] number of the sensor."""
+    number: wp.array(dtype=wp.int32)
+    """[J] number of the joint within it."""
+    effort: wp.array2d(dtype=wp.float32)
+    """[B, J] torque (N m), written by the user."""
+    speed: wp.array2d(dtype=wp.float32)
+    """[B, J] (rad/s), written by the user."""
+    last_loud: wp.array2d(dtype=wp.float32)
+    """[B, J] loudness at the end of the last block."""
+    last_speed: wp.array2d(dtype=wp.float32)
+    """[B, J] (rad/s)."""
+    phase: wp.array2d(dtype=wp.float32)
+    """[B, J] of the fundamental (turns)."""
+    hum_phase: wp.array2d(dtype=wp.float32)
+    """[B, J] of the hum (turns)."""
+
+
 @wp.kernel
-def sound_drives(
-    settings: wp.array(dtype=DriveSoundParams),
-    part: wp.array(dtype=wp.int32),
-    number: wp.array(dtype=wp.int32),
-    age: wp.array(dtype=wp.int32),
-    episode: wp.array(dtype=wp.int32),
-    env_offset: int,
-    dt: float,
-    samples: int,
-    effort: wp.array2d(dtype=wp.float32),
-    speed: wp.array2d(dtype=wp.float32),
-    last_loud: wp.array2d(dtype=wp.float32),
-    last_speed: wp.array2d(dtype=wp.float32),
-    phase: wp.array2d(dtype=wp.float32),
-    hum_phase: wp.array2d(dtype=wp.float32),
-    truth: wp.array3d(dtype=wp.float32),
-    measured: wp.array3d(dtype=wp.float32),
-):
+def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
     """Sound the drives (4.34): partials of the mesh frequency, friction noise and hum. Thread: joint [B, J]."""
     env, j = wp.tid()
-    d = settings[part[j]]
-    loud = d.load * wp.abs(effort[env, j]) + d.power * wp.abs(effort[env, j] * speed[env, j])
-    fast = wp.abs(speed[env, j])
-    loud0 = last_loud[env, j]
-    fast0 = last_speed[env, j]
-    turn = phase[env, j]
-    hum = hum_phase[env, j]
-    if age[env] == 0:
+    d = own.settings[own.part[j]]
+    loud = d.load * wp.abs(own.effort[env, j]) + d.power * wp.abs(own.effort[env, j] * own.speed[env, j])
+    fast = wp.abs(own.speed[env, j])
+    loud0 = own.last_loud[env, j]
+    fast0 = own.last_speed[env, j]
+    turn = own.phase[env, j]
+    hum = own.hum_phase[env, j]
+    if io.age[env] == 0:
         loud0 = loud
         fast0 = fast
         turn = float(0.0)
         hum = float(0.0)
-    h = dt / float(samples)
+    h = io.dt / float(samples)
     nyquist = float(0.5) / h
-    last = (wp.uint32(episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(FRICTION))
+    last = (wp.uint32(io.episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(FRICTION))
     for k in range(samples):
         share = (float(k) + float(1.0)) / float(samples)
         now = fast0 + share * (fast - fast0)
@@ -226,19 +223,21 @@ def sound_drives(
             weight = weight * d.rolloff
         value = (loud0 + share * (loud - loud0)) * tone
         if d.friction > float(0.0) and now > float(0.0):
-            at = wp.uint32(number[j]) + wp.uint32(k) * wp.uint32(4096)
-            w0, w1, _w2, _w3 = philox(at, wp.uint32(env_offset + env), wp.uint32(age[env]), last, d.key_low, d.key_high)
+            at = wp.uint32(own.number[j]) + wp.uint32(k) * wp.uint32(4096)
+            w0, w1, _w2, _w3 = philox(
+                at, wp.uint32(io.env_offset + env), wp.uint32(io.age[env]), last, d.key_low, d.key_high
+            )
             z = normals(w0, w1)
             value = value + d.friction * now * z[0]
         hum = hum + d.hum_frequency * h
         hum = hum - wp.floor(hum)
         value = value + d.hum * wp.sin(wp.tau * hum)
-        truth[k, env, j] = value
-        measured[k, env, j] = value
-    last_loud[env, j] = loud
-    last_speed[env, j] = fast
-    phase[env, j] = turn
-    hum_phase[env, j] = hum
+        io.truth[k, env, j] = value
+        io.measured[k, env, j] = value
+    own.last_loud[env, j] = loud
+    own.last_speed[env, j] = fast
+    own.phase[env, j] = turn
+    own.hum_phase[env, j] = hum
 
 
 @wp.kernel

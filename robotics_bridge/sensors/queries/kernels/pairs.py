@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import link_fails, status_of
+from robotics_bridge.physics.kernels.state import StateArrays, link_fails, status_of
 from robotics_bridge.sensors.queries.kernels.distance import PLANE, SolidArrays
 
 wp = warp()
@@ -108,43 +108,40 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
     @wp.kernel(module="unique", grid_stride=False)
     def start(
         slots: SlotArrays,
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
-        count: wp.array(dtype=wp.int32),
-        geometry: wp.array(dtype=wp.vec2i),
-        owner: wp.array(dtype=wp.int32),
+        state: StateArrays,
         words: int,
         bits: wp.array2d(dtype=wp.int32),
-        status: wp.array(dtype=wp.int32),
         age: wp.array(dtype=wp.int32),
     ):
         tid = wp.tid()
-        if tid < pose.shape[0]:
+        room = state.contact_env.shape[0]
+        count = state.contact_count[0]
+        if tid < state.pose.shape[0]:
             age[tid] = age[tid] + 1
             if wp.static(apart):
-                status[tid] = wp.where(count[0] > owner.shape[0], 2, 0)
+                state.status[tid] = wp.where(count > room, 2, 0)
             else:
-                status[tid] = status_of(pose, velocity, tid, count[0], owner.shape[0])
+                state.status[tid] = status_of(state, tid)
         if wp.static(contacts):
             # All is asked for before anything is looked at; neighbouring threads read neighbouring contacts.
-            threads = (owner.shape[0] + wp.static(CONTACTS - 1)) // wp.static(CONTACTS)
+            threads = (room + wp.static(CONTACTS - 1)) // wp.static(CONTACTS)
             if tid < threads:
                 one = wp.vec4i(-1)
                 two = wp.vec4i(-1)
                 envs = wp.vec4i(0)
                 for k in range(wp.static(CONTACTS)):
                     at = tid + k * threads
-                    if at < owner.shape[0]:
-                        pair = geometry[at]
+                    if at < room:
+                        pair = state.contact_geom[at]
                         one[k] = pair[0]
                         two[k] = pair[1]
-                        envs[k] = owner[at]
+                        envs[k] = state.contact_env[at]
                 first = wp.vec4i(-1)
                 second = wp.vec4i(-1)
                 # Two bits for each contact: whose contact with what is to be marked.
                 todo = int(0)
                 for k in range(wp.static(CONTACTS)):
-                    if tid + k * threads < count[0] and one[k] >= 0 and two[k] >= 0:
+                    if tid + k * threads < count and one[k] >= 0 and two[k] >= 0:
                         first[k] = slots.watched[one[k]]
                         second[k] = slots.watched[two[k]]
                         if first[k] >= 0:
@@ -183,30 +180,28 @@ def pair_kernel(apart: bool) -> Any:
     def pairs(
         slots: SlotArrays,
         solids: SolidArrays,
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
+        state: StateArrays,
         words: int,
         bits: wp.array2d(dtype=wp.int32),
         out: PairArrays,
         crowded: wp.array(dtype=wp.int32),
-        status: wp.array(dtype=wp.int32),
     ):
         tid = wp.tid()
-        listed = pose.shape[0] * slots.link.shape[0]
+        listed = state.pose.shape[0] * slots.link.shape[0]
         if wp.static(apart):
             if tid >= listed:
-                owner = (tid - listed) // pose.shape[1]
-                if link_fails(pose, velocity, owner, (tid - listed) % pose.shape[1]):
-                    wp.atomic_or(status, owner, 1)
+                owner = (tid - listed) // state.pose.shape[1]
+                if link_fails(state, owner, (tid - listed) % state.pose.shape[1]):
+                    wp.atomic_or(state.status, owner, 1)
                 return
         env = tid // slots.link.shape[0]
         slot = tid % slots.link.shape[0]
         row = env % solids.kind.shape[0]
         link = slots.link[slot]
-        here = pose[env, link]
+        here = state.pose[env, link]
         origin = wp.transform_get_translation(here)
         turn = wp.transform_get_rotation(here)
-        twist = velocity[env, link]
+        twist = state.velocity[env, link]
         own_velocity = wp.vec3f(twist[0], twist[1], twist[2])
         own_spin = wp.vec3f(twist[3], twist[4], twist[5])
         first = slots.first[slot]
@@ -225,7 +220,7 @@ def pair_kernel(apart: bool) -> Any:
                 wanted = (word >> wp.int32(place % 32)) & 1
             if wanted == 1:
                 geometry = slots.members[members + place]
-                there = pose[env, solids.link[geometry]]
+                there = state.pose[env, solids.link[geometry]]
                 frame = wp.transform_multiply(there, solids.frame[row, geometry])
                 relative = wp.transform_multiply(wp.transform_inverse(frame), here)
                 near = True
@@ -236,7 +231,7 @@ def pair_kernel(apart: bool) -> Any:
                     near = gap < bound[3] + slots.reach[slot]
                 if near:
                     if found < room:
-                        other = velocity[env, solids.link[geometry]]
+                        other = state.velocity[env, solids.link[geometry]]
                         spin = wp.vec3f(other[3], other[4], other[5])
                         lever = origin - wp.transform_get_translation(there)
                         speed = wp.vec3f(other[0], other[1], other[2]) + wp.cross(spin, lever) - own_velocity

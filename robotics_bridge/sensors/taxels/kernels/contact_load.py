@@ -5,6 +5,7 @@ Letters: B environment, S sensor, C contact, N taxel.
 """
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.queries.kernels.pairs import SlotArrays
 
 wp = warp()
@@ -32,31 +33,28 @@ def gather_loads(
     spans: wp.array(dtype=wp.vec3i),
     slots: SlotArrays,
     link_of: wp.array(dtype=wp.int32),
-    count: wp.array(dtype=wp.int32),
-    geometry: wp.array(dtype=wp.vec2i),
-    env: wp.array(dtype=wp.int32),
-    normal: wp.array(dtype=wp.vec3f),
-    force: wp.array(dtype=wp.float32),
+    state: StateArrays,
     loads: wp.array2d(dtype=wp.vec3f),
 ):
     """Sum the engine's contact forces on each sensor. Thread: contact [C]."""
     c = wp.tid()
-    if c >= count[0]:
+    if c >= state.contact_count[0]:
         return
-    pair = geometry[c]
+    pair = state.contact_geom[c]
+    env = state.contact_env[c]
     if pair[0] < 0 or pair[1] < 0:
         return
     # The normal leads from the first to the second, which it pushes away.
-    push = force[c] * normal[c]
-    add_load(spans, slots, env[c], link_of[pair[0]], pair[1], -push, loads)
-    add_load(spans, slots, env[c], link_of[pair[1]], pair[0], push, loads)
+    push = state.contact_force[c] * state.contact_normal[c]
+    add_load(spans, slots, env, link_of[pair[0]], pair[1], -push, loads)
+    add_load(spans, slots, env, link_of[pair[1]], pair[0], push, loads)
 
 
 @wp.kernel
 def weigh_field(
     spans: wp.array(dtype=wp.vec3i),
     slots: SlotArrays,
-    pose: wp.array2d(dtype=wp.transformf),
+    state: StateArrays,
     truth: wp.array3d(dtype=wp.float32),
     loads: wp.array2d(dtype=wp.vec3f),
     scales: wp.array2d(dtype=wp.float32),
@@ -64,7 +62,7 @@ def weigh_field(
     """Compare the sum of a field with its load. Thread: sensor and environment [S, B]."""
     sensor, env = wp.tid()
     span = spans[sensor]
-    turn = wp.transform_get_rotation(pose[env, slots.link[span[2]]])
+    turn = wp.transform_get_rotation(state.pose[env, slots.link[span[2]]])
     load = wp.quat_rotate_inv(turn, loads[sensor, env])
     size = wp.length(load)
     total = wp.vec3f(0.0)

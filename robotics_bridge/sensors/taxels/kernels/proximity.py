@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, idle, lost, readout_functions
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
@@ -35,8 +36,30 @@ class CloudArrays:
 
 @wp.struct
 class ProximityParams:
+    """Law of one taxel sensor; units as in ``ProximityTaxel``."""
+
     stiffness: wp.float32
     coupling: wp.float32
+
+
+@wp.struct
+class ProximityArrays:
+    """Arrays of the proximity taxels of a group."""
+
+    laws: wp.array(dtype=ProximityParams)
+    """[S]."""
+    densities: wp.array2d(dtype=wp.float32)
+    """[S, R] weight of a point."""
+    links: wp.array(dtype=wp.int32)
+    """[S]."""
+    near: wp.array2d(dtype=wp.int32)
+    """[B, …] points near a cell by pair, each list ended by −1; only where points are gathered."""
+    members: wp.array(dtype=wp.int32)
+    """[N] taxels, cell by cell."""
+    cells: wp.array(dtype=wp.vec3i)
+    """First and last member of a cell, and its slot."""
+    around: wp.array(dtype=wp.vec4f)
+    """Sphere around all that a cell senses (m)."""
 
 
 @cache
@@ -64,7 +87,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         moment: wp.vec3f,
         slip: wp.vec3f,
     ) -> wp.spatial_vectorf:
-        """Force and torque of the summed overlaps: ``mass`` ΣP, ``moment`` ΣP (p − x), ``slip`` ΣP v."""
+        """Return force and torque of the summed overlaps: ``mass`` ΣP, ``moment`` ΣP (p − x), ``slip`` ΣP v."""
         push = law.stiffness * density * mass
         drag = law.coupling * density * (slip - wp.dot(slip, normal) * normal)
         turn = law.stiffness * density * wp.cross(moment, normal)
@@ -76,7 +99,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
 
     @wp.func
     def overlap(far: float, radius: float, noisy: float) -> wp.vec2f:
-        """Overlap of a point with the sensing sphere, and with that of the measured branch."""
+        """Return the overlap of a point with the sensing sphere, and with that of the measured branch."""
         if wp.static(mode == CLEAN):
             return wp.vec2f(wp.max(radius - far, 0.0), 0.0)
         return wp.vec2f(wp.max(radius - far, 0.0), wp.max(noisy - far, 0.0))
@@ -88,16 +111,12 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         cloud: CloudArrays,
         io: ReadoutArrays,
         knobs: wp.array(dtype=NoiseParams),
-        laws: wp.array(dtype=ProximityParams),
-        densities: wp.array2d(dtype=wp.float32),
-        links: wp.array(dtype=wp.int32),
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
-        near: wp.array2d(dtype=wp.int32),
+        own: ProximityArrays,
+        state: StateArrays,
         env: int,
         n: int,
     ):
-        """Read one probe. ``near`` lists its points by pair, each list ended by −1; only read if gathered."""
+        """Read one probe."""
         radius = probes.radius[n]
         if radius <= 0.0:
             idle(io, 6, env, n)
@@ -115,7 +134,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             if wp.static(mode != CLEAN):
                 noisy = wp.max(radius + radius_noise(knobs[part], env + io.env_offset, probe, age, episode), 0.0)
             reach = wp.max(radius, noisy)
-            own = wp.vec3f(0.0)
+            turning = wp.vec3f(0.0)
             mass = wp.vec2f(0.0)
             moment = wp.vec3f(0.0)
             moment_noisy = wp.vec3f(0.0)
@@ -131,7 +150,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                 lever = wp.vec3f(0.0)
                 lever_noisy = wp.vec3f(0.0)
                 if wp.static(gathered):
-                    index = near[env, cursor]
+                    index = own.near[env, cursor]
                     cursor += 1
                     while index >= 0:
                         away = cloud.point[index] - here
@@ -142,7 +161,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                             lever += overlaps[0] * away
                             if wp.static(mode != CLEAN):
                                 lever_noisy += overlaps[1] * away
-                        index = near[env, cursor]
+                        index = own.near[env, cursor]
                         cursor += 1
                 else:
                     first = cloud.first[row, geometry]
@@ -162,12 +181,12 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                                     if wp.static(mode != CLEAN):
                                         lever_noisy += overlaps[1] * away
                 if own_mass[0] > 0.0 or own_mass[1] > 0.0:
-                    link = links[part]
-                    twist = velocity[env, link]
-                    turn = wp.transform_get_rotation(pose[env, link])
-                    own = wp.quat_rotate_inv(turn, wp.vec3f(twist[3], twist[4], twist[5]))
+                    link = own.links[part]
+                    twist = state.velocity[env, link]
+                    turn = wp.transform_get_rotation(state.pose[env, link])
+                    turning = wp.quat_rotate_inv(turn, wp.vec3f(twist[3], twist[4], twist[5]))
                     # Points turn with their own link, not with the difference of both.
-                    spin = pairs.spin[env, at] + own
+                    spin = pairs.spin[env, at] + turning
                     speed = pairs.velocity[env, at] + wp.cross(pairs.spin[env, at], x)
                     lever = wp.transpose(rotation) @ lever
                     mass += own_mass
@@ -177,14 +196,14 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                         lever_noisy = wp.transpose(rotation) @ lever_noisy
                         moment_noisy += lever_noisy
                         slip_noisy += own_mass[1] * speed + wp.cross(spin, lever_noisy)
-            density = densities[part, row]
+            density = own.densities[part, row]
             normal = probes.normal[n]
-            truth = wrench(laws[part], density, x, normal, mass[0], moment, slip)
+            truth = wrench(own.laws[part], density, x, normal, mass[0], moment, slip)
             signal = truth
             fixed = wp.vec3f(1.0, 0.0, 0.0)
             if wp.static(mode != CLEAN):
                 fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
-                signal = fixed[0] * wrench(laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
+                signal = fixed[0] * wrench(own.laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
             lag, drift = recall_six(io, env, n, age)
             emit_six(io, knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
 
@@ -195,15 +214,11 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         cloud: CloudArrays,
         io: ReadoutArrays,
         knobs: wp.array(dtype=NoiseParams),
-        laws: wp.array(dtype=ProximityParams),
-        densities: wp.array2d(dtype=wp.float32),
-        links: wp.array(dtype=wp.int32),
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
-        near: wp.array2d(dtype=wp.int32),
+        own: ProximityArrays,
+        state: StateArrays,
     ):
         env, n = wp.tid()
-        feel(probes, pairs, cloud, io, knobs, laws, densities, links, pose, velocity, near, env, n)
+        feel(probes, pairs, cloud, io, knobs, own, state, env, n)
 
     @wp.kernel(module="unique")
     def proximity_gathered(
@@ -212,21 +227,14 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         cloud: CloudArrays,
         io: ReadoutArrays,
         knobs: wp.array(dtype=NoiseParams),
-        laws: wp.array(dtype=ProximityParams),
-        densities: wp.array2d(dtype=wp.float32),
-        links: wp.array(dtype=wp.int32),
-        pose: wp.array2d(dtype=wp.transformf),
-        velocity: wp.array2d(dtype=wp.spatial_vectorf),
-        near: wp.array2d(dtype=wp.int32),
-        members: wp.array(dtype=wp.int32),
-        cells: wp.array(dtype=wp.vec3i),
-        around: wp.array(dtype=wp.vec4f),
+        own: ProximityArrays,
+        state: StateArrays,
     ):
         env = wp.tid()
         row = env % cloud.first.shape[0]
-        for c in range(cells.shape[0]):
-            cell = cells[c]
-            bound = around[c]
+        for c in range(own.cells.shape[0]):
+            cell = own.cells[c]
+            bound = own.around[c]
             middle = wp.vec3f(bound[0], bound[1], bound[2])
             found = int(0)
             for k in range(pairs.count[env, cell[2]]):
@@ -243,11 +251,11 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                             index = (first + block) * wp.static(BLOCK) + i
                             away = cloud.point[index] - here
                             if wp.dot(away, away) < bound[3] * bound[3]:
-                                near[env, found] = index
+                                own.near[env, found] = index
                                 found += 1
-                near[env, found] = -1
+                own.near[env, found] = -1
                 found += 1
             for m in range(cell[0], cell[1]):
-                feel(probes, pairs, cloud, io, knobs, laws, densities, links, pose, velocity, near, env, members[m])
+                feel(probes, pairs, cloud, io, knobs, own, state, env, own.members[m])
 
     return proximity_gathered if gathered else proximity

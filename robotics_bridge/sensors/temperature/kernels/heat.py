@@ -4,6 +4,8 @@ Letters: B environment, S sensor, N cell of all sensors, L link, M contacts kept
 """
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 
 wp = warp()
 # Contracted products would change how a level field rounds.
@@ -51,30 +53,62 @@ class ThermalParams:
     warm: wp.float32
 
 
+@wp.struct
+class HeatArrays:
+    """Arrays of the grids of a group."""
+
+    sensors: wp.array(dtype=ThermalParams)
+    """[S]."""
+    part: wp.array(dtype=wp.int32)
+    """[N] number of the grid."""
+    exposed: wp.array(dtype=wp.float32)
+    """[N] outer surface of a cell (m²)."""
+    source: wp.array(dtype=wp.float32)
+    """[N] power of a cell (W)."""
+    link_of: wp.array(dtype=wp.int32)
+    """[G] link of a geometry."""
+    link_conductivity: wp.array(dtype=wp.float32)
+    """[L] (W/(m K))."""
+    link_diffusivity: wp.array(dtype=wp.float32)
+    """[L] (m²/s)."""
+    link_temperature: wp.array2d(dtype=wp.float32)
+    """[B, L] (°C)."""
+    number: wp.array2d(dtype=wp.int32)
+    """[B, S] contacts of a grid."""
+    kept: wp.array3d(dtype=wp.int32)
+    """[B, S, M] their numbers in the state."""
+    touched: wp.array2d(dtype=wp.float32)
+    """[B, N] time since a contact began (s)."""
+    conductance: wp.array2d(dtype=wp.float32)
+    """[B, N] of the contacts of a cell (W/K)."""
+    inflow: wp.array2d(dtype=wp.float32)
+    """[B, N] Σ conductance · temperature of what is touched (W)."""
+    temperature: wp.array2d(dtype=wp.float64)
+    """[B, N] (°C)."""
+    element: wp.array2d(dtype=wp.float64)
+    """[B, N] of the sensing elements (°C)."""
+    matrix: wp.array(dtype=wp.float32)
+    """Exponentials of the diffusion along each axis of each grid."""
+    offset: wp.array2d(dtype=wp.int32)
+    """[S, 3] where each begins."""
+
+
 @wp.kernel
-def collect_contacts(
-    contact_count: wp.array(dtype=wp.int32),
-    contact_env: wp.array(dtype=wp.int32),
-    contact_geom: wp.array(dtype=wp.vec2i),
-    link_of: wp.array(dtype=wp.int32),
-    sensors: wp.array(dtype=ThermalParams),
-    number: wp.array2d(dtype=wp.int32),
-    kept: wp.array3d(dtype=wp.int32),
-):
-    """List the contacts of each sensor. Thread: contact; ``number`` [B, S] was set to zero."""
+def collect_contacts(state: StateArrays, heat: HeatArrays):
+    """List the contacts of each sensor. Thread: contact [C]; their numbers were set to zero."""
     c = wp.tid()
-    if c >= wp.min(contact_count[0], contact_env.shape[0]):
+    if c >= wp.min(state.contact_count[0], state.contact_env.shape[0]):
         return
-    env = contact_env[c]
-    pair = contact_geom[c]
-    a = link_of[pair[0]]
-    b = link_of[pair[1]]
-    for s in range(sensors.shape[0]):
-        link = sensors[s].link
+    env = state.contact_env[c]
+    pair = state.contact_geom[c]
+    a = heat.link_of[pair[0]]
+    b = heat.link_of[pair[1]]
+    for s in range(heat.sensors.shape[0]):
+        link = heat.sensors[s].link
         if (a == link) != (b == link):
-            place = wp.atomic_add(number, env, s, 1)
-            if place < kept.shape[2]:
-                kept[env, s, place] = c
+            place = wp.atomic_add(heat.number, env, s, 1)
+            if place < heat.kept.shape[2]:
+                heat.kept[env, s, place] = c
 
 
 @wp.func
@@ -94,34 +128,16 @@ def spot_area(distance: float, radius: float) -> float:
 
 
 @wp.kernel
-def conduct_contacts(
-    contact_geom: wp.array(dtype=wp.vec2i),
-    contact_distance: wp.array(dtype=wp.float32),
-    contact_position: wp.array(dtype=wp.vec3f),
-    contact_normal: wp.array(dtype=wp.vec3f),
-    link_of: wp.array(dtype=wp.int32),
-    sensors: wp.array(dtype=ThermalParams),
-    number: wp.array2d(dtype=wp.int32),
-    kept: wp.array3d(dtype=wp.int32),
-    status: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.transformf),
-    link_conductivity: wp.array(dtype=wp.float32),
-    link_diffusivity: wp.array(dtype=wp.float32),
-    link_temperature: wp.array2d(dtype=wp.float32),
-    touched: wp.array2d(dtype=wp.float32),
-    dt: float,
-    conductance: wp.array2d(dtype=wp.float32),
-    inflow: wp.array2d(dtype=wp.float32),
-):
+def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
     """Add the conductance of every contact (W/K) to the cell it lies in. Thread: a kept contact [B, S, M]."""
     env, s, i = wp.tid()
-    count = wp.min(number[env, s], kept.shape[2])
-    if i >= count or (status[env] & 1) != 0:
+    count = wp.min(heat.number[env, s], heat.kept.shape[2])
+    if i >= count or (io.status[env] & 1) != 0:
         return
-    grid = sensors[s]
-    frame = pose[env, grid.link]
-    c = kept[env, s, i]
-    other = other_link(contact_geom[c], link_of, grid.link)
+    grid = heat.sensors[s]
+    frame = state.pose[env, grid.link]
+    c = heat.kept[env, s, i]
+    other = other_link(state.contact_geom[c], heat.link_of, grid.link)
     # The points that share the other link: their number, centre and mean normal.
     points = int(0)
     center = wp.vec3f(float(0.0), float(0.0), float(0.0))
@@ -129,16 +145,16 @@ def conduct_contacts(
     spots = float(0.0)
     deepest = float(0.0)
     for j in range(count):
-        d = kept[env, s, j]
-        if other_link(contact_geom[d], link_of, grid.link) == other:
+        d = heat.kept[env, s, j]
+        if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
             points = points + 1
-            center = center + contact_position[d]
-            side = contact_normal[d]
-            if wp.dot(side, contact_normal[c]) < float(0.0):
+            center = center + state.contact_position[d]
+            side = state.contact_normal[d]
+            if wp.dot(side, state.contact_normal[c]) < float(0.0):
                 side = -side
             normal = normal + side
-            spots = spots + spot_area(contact_distance[d], grid.bluntness)
-            deepest = wp.max(deepest, -contact_distance[d])
+            spots = spots + spot_area(state.contact_distance[d], grid.bluntness)
+            deepest = wp.max(deepest, -state.contact_distance[d])
     center = center / float(points)
     area = spots
     if points >= 3:
@@ -151,9 +167,9 @@ def conduct_contacts(
         v = wp.cross(n, u)
         polygon = float(0.0)
         for j in range(count):
-            d = kept[env, s, j]
-            if other_link(contact_geom[d], link_of, grid.link) == other:
-                p = contact_position[d] - center
+            d = heat.kept[env, s, j]
+            if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
+                p = state.contact_position[d] - center
                 x = wp.dot(p, u)
                 y = wp.dot(p, v)
                 angle = wp.atan2(y, x)
@@ -161,9 +177,9 @@ def conduct_contacts(
                 nx = x
                 ny = y
                 for k in range(count):
-                    e = kept[env, s, k]
-                    if k != j and other_link(contact_geom[e], link_of, grid.link) == other:
-                        q = contact_position[e] - center
+                    e = heat.kept[env, s, k]
+                    if k != j and other_link(state.contact_geom[e], heat.link_of, grid.link) == other:
+                        q = state.contact_position[e] - center
                         qx = wp.dot(q, u)
                         qy = wp.dot(q, v)
                         turn = wp.atan2(qy, qx) - angle
@@ -181,20 +197,20 @@ def conduct_contacts(
     whole = area
     area = area / float(points)
     if area > float(0.0):
-        local = wp.transform_point(wp.transform_inverse(frame), contact_position[c])
+        local = wp.transform_point(wp.transform_inverse(frame), state.contact_position[c])
         index = int(0)
         for axis in range(3):
             cell = int(wp.floor((local[axis] - grid.low[axis]) / grid.cell[axis]))
             index = index * grid.shape[axis] + wp.clamp(cell, 0, grid.shape[axis] - 1)
         index = grid.first + index
         k_own = grid.conductivity
-        k_other = link_conductivity[other]
+        k_other = heat.link_conductivity[other]
         g = float(0.0)
         if grid.published == 1:
             volume = grid.cell[0] * grid.cell[1] * grid.cell[2]
             g = float(2.0) * k_own * k_other / (k_own + k_other) * whole * area / volume
         else:
-            facing = wp.quat_rotate_inv(wp.transform_get_rotation(frame), contact_normal[c])
+            facing = wp.quat_rotate_inv(wp.transform_get_rotation(frame), state.contact_normal[c])
             across = wp.abs(facing[0]) * grid.cell[0] + wp.abs(facing[1]) * grid.cell[1]
             across = across + wp.abs(facing[2]) * grid.cell[2]
             # The spot spreads within its cell as it does in the touched body.
@@ -203,12 +219,12 @@ def conduct_contacts(
             if grid.contact > float(0.0):
                 resistance = resistance + float(1.0) / (grid.contact * area)
             # A half-space that gives heat through a disc: planar at first, spreading later.
-            time = touched[env, index] + float(0.5) * dt
-            planar = area / wp.sqrt(wp.pi * link_diffusivity[other] * time)
+            time = heat.touched[env, index] + float(0.5) * io.dt
+            planar = area / wp.sqrt(wp.pi * heat.link_diffusivity[other] * time)
             resistance = resistance + float(1.0) / (k_other * (planar + disc))
             g = float(1.0) / resistance
-        wp.atomic_add(conductance, env, index, g)
-        wp.atomic_add(inflow, env, index, g * link_temperature[env, other])
+        wp.atomic_add(heat.conductance, env, index, g)
+        wp.atomic_add(heat.inflow, env, index, g * heat.link_temperature[env, other])
 
 
 @wp.func
@@ -220,53 +236,37 @@ def mean_decay(x: wp.float64) -> wp.float64:
 
 
 @wp.kernel
-def exchange_heat(
-    sensors: wp.array(dtype=ThermalParams),
-    part: wp.array(dtype=wp.int32),
-    exposed: wp.array(dtype=wp.float32),
-    source: wp.array(dtype=wp.float32),
-    age: wp.array(dtype=wp.int32),
-    status: wp.array(dtype=wp.int32),
-    dt: float,
-    conductance: wp.array2d(dtype=wp.float32),
-    inflow: wp.array2d(dtype=wp.float32),
-    touched: wp.array2d(dtype=wp.float32),
-    temperature: wp.array2d(dtype=wp.float64),
-    out: wp.array2d(dtype=wp.float64),
-):
-    """Exchange heat with contacts, surroundings and source, exponentially. Thread: cell [B, N].
-
-    ``exposed`` [N] is the outer surface of a cell (m²), ``source`` [N] its power (W).
-    """
+def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.float64)):
+    """Exchange heat with contacts, surroundings and source, exponentially. Thread: cell [B, N]."""
     env, n = wp.tid()
-    grid = sensors[part[n]]
-    t = temperature[env, n]
-    if age[env] == 0:
+    grid = heat.sensors[heat.part[n]]
+    t = heat.temperature[env, n]
+    if io.age[env] == 0:
         t = wp.float64(grid.base)
-    g = conductance[env, n]
-    heat = inflow[env, n]
-    conductance[env, n] = float(0.0)
-    inflow[env, n] = float(0.0)
-    if (status[env] & 1) != 0 or not wp.isfinite(heat):
+    g = heat.conductance[env, n]
+    inflow = heat.inflow[env, n]
+    heat.conductance[env, n] = float(0.0)
+    heat.inflow[env, n] = float(0.0)
+    if (io.status[env] & 1) != 0 or not wp.isfinite(inflow):
         out[env, n] = t
         return
-    if g > float(0.0) and age[env] > 0:
-        touched[env, n] = touched[env, n] + dt
+    if g > float(0.0) and io.age[env] > 0:
+        heat.touched[env, n] = heat.touched[env, n] + io.dt
     elif g > float(0.0):
-        touched[env, n] = dt
+        heat.touched[env, n] = io.dt
     else:
-        touched[env, n] = float(0.0)
+        heat.touched[env, n] = float(0.0)
     # Steps as short as 1e-5 s change less than single precision can hold.
     surroundings = grid.ambient + float(273.15)
     start = t
-    step = wp.float64(dt) / wp.float64(grid.capacity)
+    step = wp.float64(io.dt) / wp.float64(grid.capacity)
     # Radiation through its secant, q = G (T − T_ambient), taken half way on the second pass.
     for _ in range(2):
         kelvin = float(wp.float64(0.5) * (start + t)) + float(273.15)
         radiation = grid.emissivity * float(5.670374419e-8) * (kelvin * kelvin + surroundings * surroundings)
-        loss = exposed[n] * (grid.convection + radiation * (kelvin + surroundings))
+        loss = heat.exposed[n] * (grid.convection + radiation * (kelvin + surroundings))
         total = wp.float64(g + loss)
-        power = wp.float64(heat) - wp.float64(g) * start + wp.float64(source[n])
+        power = wp.float64(inflow) - wp.float64(g) * start + wp.float64(heat.source[n])
         power = power + wp.float64(loss) * (wp.float64(grid.ambient) - start)
         t = start + power * step * mean_decay(total * step)
     out[env, n] = t
@@ -274,17 +274,11 @@ def exchange_heat(
 
 @wp.kernel
 def diffuse_heat(
-    axis: int,
-    sensors: wp.array(dtype=ThermalParams),
-    part: wp.array(dtype=wp.int32),
-    offset: wp.array2d(dtype=wp.int32),
-    matrix: wp.array(dtype=wp.float32),
-    temperature: wp.array2d(dtype=wp.float64),
-    out: wp.array2d(dtype=wp.float64),
+    axis: int, heat: HeatArrays, temperature: wp.array2d(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)
 ):
     """Spread heat along one axis by a matrix [n, n] that was exponentiated beforehand. Thread: cell [B, N]."""
     env, n = wp.tid()
-    grid = sensors[part[n]]
+    grid = heat.sensors[heat.part[n]]
     length = grid.shape[axis]
     stride = 1
     if axis == 0:
@@ -293,46 +287,35 @@ def diffuse_heat(
         stride = grid.shape[2]
     row = ((n - grid.first) // stride) % length
     start = n - row * stride
-    base = offset[part[n], axis] + row * length
+    base = heat.offset[heat.part[n], axis] + row * length
     # Differences from the cell's own value: a level field stays level to the last digit.
     own = temperature[env, n]
     total = own
     for j in range(length):
-        total = total + wp.float64(matrix[base + j]) * (temperature[env, start + j * stride] - own)
+        total = total + wp.float64(heat.matrix[base + j]) * (temperature[env, start + j * stride] - own)
     out[env, n] = total
 
 
 @wp.kernel
-def sense_temperature(
-    sensors: wp.array(dtype=ThermalParams),
-    part: wp.array(dtype=wp.int32),
-    age: wp.array(dtype=wp.int32),
-    status: wp.array(dtype=wp.int32),
-    dt: float,
-    fresh: wp.array2d(dtype=wp.float64),
-    temperature: wp.array2d(dtype=wp.float64),
-    element: wp.array2d(dtype=wp.float64),
-    truth: wp.array3d(dtype=wp.float32),
-    measured: wp.array3d(dtype=wp.float32),
-):
+def sense_temperature(heat: HeatArrays, io: ReadoutArrays, fresh: wp.array2d(dtype=wp.float64)):
     """Keep the new field, let the sensing element follow it, and write both readings. Thread: cell [B, N]."""
     env, n = wp.tid()
-    grid = sensors[part[n]]
+    grid = heat.sensors[heat.part[n]]
     t = fresh[env, n]
-    temperature[env, n] = t
+    heat.temperature[env, n] = t
     lagged = t
     if grid.tau > float(0.0):
-        before = element[env, n]
-        if age[env] == 0:
+        before = heat.element[env, n]
+        if io.age[env] == 0:
             before = wp.float64(grid.base)
-        part_of = wp.float64(dt) / wp.float64(grid.tau)
+        part_of = wp.float64(io.dt) / wp.float64(grid.tau)
         lagged = before + (t - before) * part_of * mean_decay(part_of)
-        element[env, n] = lagged
+        heat.element[env, n] = lagged
     seen = grid.base + wp.clamp(float(lagged - wp.float64(grid.base)), -grid.cold, grid.warm)
     true = float(t)
     # What an environment that diverged reads is marked; its field waits.
-    if (status[env] & 1) != 0:
+    if (io.status[env] & 1) != 0:
         true = wp.nan
         seen = wp.nan
-    truth[0, env, n] = true
-    measured[0, env, n] = seen
+    io.truth[0, env, n] = true
+    io.measured[0, env, n] = seen

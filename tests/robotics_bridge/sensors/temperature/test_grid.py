@@ -39,7 +39,7 @@ def _make(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), 
 
 def _field(suite: SensorSuite, values: np.ndarray) -> None:
     runtime = suite.runtimes[0]
-    runtime.field.assign(np.broadcast_to(values.ravel(), runtime.field.shape).astype(np.float64))
+    runtime.heat.temperature.assign(np.broadcast_to(values.ravel(), runtime.heat.temperature.shape).astype(np.float64))
 
 
 def _face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: float = 0.03) -> None:
