@@ -42,8 +42,8 @@ def deploy(
     Exit status 1: it was stopped for safety.
     """
     from robotics_bridge.deploy import session
-    from robotics_bridge.deploy.realtime import realtime
     from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
+    from robotics_bridge.deploy.timing import realtime
     from robotics_bridge.deploy.udp import UdpDriver
 
     deployed = session.read_deployed(policy)
