@@ -22,7 +22,7 @@ from brainbench.models.registry import list_models
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.calibration import HandCalibration
-from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, PictureGRU
+from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, ConvGRUProducts
 from robotics_bridge.policies.encoders.front_end import FrontEnd, Learning
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.encoders.timing import Time
@@ -328,7 +328,7 @@ class _ConvRecurrent(_Images):
         self.head = nn.Linear(_CHANNELS[0] * places, self.features)
         self.state_size = self.images * _CHANNELS[0] * self.rows * self.columns
         small = self.rows * self.columns <= MOST_CELLS
-        self.products: PictureGRU | None = PictureGRU(self.rows, self.columns, _KERNEL) if small else None
+        self.products: ConvGRUProducts | None = ConvGRUProducts(self.rows, self.columns, _KERNEL) if small else None
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         state = h_in.reshape(-1, _CHANNELS[0], self.rows, self.columns)
@@ -346,7 +346,7 @@ class _ConvRecurrent(_Images):
     def unroll_as_products(
         self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what :meth:`unroll` returns, by :class:`~robotics_bridge.policies.encoders.conv_gru.PictureGRU`."""
+        """Return what :meth:`unroll` returns, by :class:`~robotics_bridge.policies.encoders.conv_gru.ConvGRUProducts`."""
         assert self.products is not None
         steps, batch = taxels.shape[:2]
         pictures = self.pictures(taxels.flatten(0, 1)).flatten(1).unflatten(0, (steps, -1))
