@@ -156,7 +156,7 @@ def _corners(chain: tuple[str, ...], place: Mapping[str, Any], reference: Layout
 def _along(
     corners: NDArray[np.float64], segment: int, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how far from the far end of a finger axis points [N, 3] lie along one segment, and their distance from it."""
+    """Return how far along one segment points [N, 3] lie from the axis's far end, and their distance from it."""
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     rest = lengths[segment + 1 :].sum()
     step = corners[segment + 1] - corners[segment]
