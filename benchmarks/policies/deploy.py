@@ -17,9 +17,9 @@ from tensordict import TensorDict
 
 from benchmarks.report import table, write_section
 from robotics_bridge import hands
-from robotics_bridge.deploy.realtime import realtime
 from robotics_bridge.deploy.session import read_deployed
 from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
+from robotics_bridge.deploy.timing import realtime
 from robotics_bridge.deploy.udp import UdpDriver
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.student import TactilePolicy

@@ -1,7 +1,7 @@
 """Policies on hands: drivers, safety, the control loop, recorded episodes.
 
-``driver`` says what a hand must offer, ``udp`` speaks to one over a socket, ``sim_hand`` is a simulated XHand1 behind
-that socket, ``touch`` turns real readings into the observation of the simulator, ``shadow`` simulates the rest,
-``safety`` and ``monitor`` watch, ``controller`` runs the loop, ``session`` builds it from an exported policy,
-``lerobot`` writes episodes for robot-learning tools.
+``driver`` says what a hand offers, ``udp`` speaks to one over a socket, ``simulated_hand`` stands behind that socket.
+``session`` builds a ``controller`` from an exported policy; it reads the hand, makes observations (``touch`` of what
+the hand measures, ``shadow`` of what it does not), checks ``safety`` and ``timing``, and sends targets. ``episodes``
+are written for LeRobot.
 """

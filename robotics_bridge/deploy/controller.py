@@ -15,40 +15,43 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.deploy.monitor import LatencyHistogram, RateMonitor
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
+from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
+from robotics_bridge.envs import ActionMap
+from robotics_bridge.envs.observations import VELOCITY
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robotics_bridge.deploy.driver import Driver, HandReading
-    from robotics_bridge.deploy.touch import RealTouch
     from robotics_bridge.policies.export import Runner
 
 _log = logging.getLogger(__name__)
 
-VELOCITY = 0.2
-"""Factor on joint velocities in the group ``proprio``, as in the tasks."""
 Source = Callable[["HandReading"], "NDArray[np.floating]"]
-"""A further group of observations for a report, such as the goal."""
+"""A group of observations for a report: touch, or the goal."""
+
+
+class Clock:
+    """The time of a control loop; tests have one of their own."""
+
+    def __call__(self) -> float:
+        """Return the time (s)."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
 
 
 @dataclass(frozen=True, eq=False)
 class Actuation:
-    """From actions to targets, as the policy was trained; of an exported policy's contract."""
+    """The way from actions to targets, as the policy was trained; of an exported policy's contract."""
 
     joints: tuple[str, ...]
     """All driven joints J, in the order of ``proprio``."""
-    names: tuple[str, ...]
-    """Joints A that actions move."""
-    default: NDArray[np.float64]
-    """[A] targets of zero actions (rad)."""
-    scale: NDArray[np.float64]
-    """[A] change of the target per unit of action (rad)."""
-    low: NDArray[np.float64]
-    """[A] least targets (rad)."""
-    high: NDArray[np.float64]
-    """[A] greatest targets (rad)."""
+    actions: ActionMap
+    """From actions to targets of the joints A that they move."""
     frozen: Mapping[str, float] = field(default_factory=dict)
     """Joint → position (rad) of those that actions do not move."""
 
@@ -62,9 +65,8 @@ class Actuation:
         try:
             mapping = deployment["action_map"]
             arrays = {key: np.asarray(mapping[key], dtype=float) for key in ("default", "scale", "low", "high")}
-            return cls(
-                tuple(deployment["joints"]), tuple(mapping["names"]), **arrays, frozen=dict(deployment["frozen"])
-            )
+            actions = ActionMap(tuple(mapping["names"]), **arrays)
+            return cls(tuple(deployment["joints"]), actions, dict(deployment["frozen"]))
         except (KeyError, TypeError) as error:
             raise UsageError(
                 f"The contract of the policy lacks {error} in 'deployment'; export it with brainbench policy export."
@@ -72,13 +74,13 @@ class Actuation:
 
     def targets(self, action: NDArray[np.floating]) -> dict[str, float]:
         """Return joint → target (rad) of an action [A]."""
-        moved = np.clip(self.default + self.scale * action, self.low, self.high)
-        return {**self.frozen, **dict(zip(self.names, moved.tolist(), strict=True))}
+        moved = self.actions.targets(action).tolist()
+        return {**self.frozen, **dict(zip(self.actions.names, moved, strict=True))}
 
 
 @dataclass
 class Report:
-    """How a session went."""
+    """Outcome of a session."""
 
     status: str
     """``finished`` or ``stopped``."""
@@ -112,10 +114,9 @@ class Controller:
         limits: In the order of the driver's joints.
         groups: Names of the groups that the policy reads.
         rate: Control steps per second.
-        touch: Makes the tactile group; needed when the policy reads it.
-        sources: Group → what gives it, for groups other than ``proprio`` and ``tactile``.
-        clock: Seconds.
-        sleep: Waits for so many seconds.
+        sources: Group → what gives it, for groups other than ``proprio``: for ``tactile`` a
+            :class:`~robotics_bridge.deploy.touch.RealTouch`.
+        clock: Tells the time and waits.
         record: Called after each tick with (reading, groups, action, targets [J]).
 
     Raises:
@@ -131,23 +132,19 @@ class Controller:
         *,
         groups: tuple[str, ...],
         rate: float = 40.0,
-        touch: RealTouch | None = None,
         sources: Mapping[str, Source] | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        clock: Clock | None = None,
         record: Callable[..., None] | None = None,
     ) -> None:
         self.run_policy, self.driver, self.actuation, self.limits = run, driver, actuation, limits
-        self.rate, self.touch, self.sources = rate, touch, dict(sources or {})
-        self.clock, self.sleep, self.record = clock, sleep, record
-        given = {"proprio", *self.sources, *(["tactile"] if touch is not None else [])}
-        if missing := [name for name in groups if name not in given]:
+        self.rate, self.sources, self.clock, self.record = rate, dict(sources or {}), clock or Clock(), record
+        if missing := [name for name in groups if name not in {"proprio", *self.sources}]:
             raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
         if missing := [name for name in actuation.joints if name not in driver.joints]:
             raise UsageError(f"The policy moves the joint {missing[0]!r}, which the hand does not have.")
         self.groups = groups
         self._order = [driver.joints.index(name) for name in actuation.joints]
-        self._action = np.zeros(len(actuation.names), np.float32)
+        self._action = np.zeros(len(actuation.actions.names), np.float32)
         self._targets: NDArray[np.float64] | None = None
         self._offset, self._monitor = ClockOffset(), RateMonitor(rate, limits.rate_window)
         self.latency, self.processor = LatencyHistogram(), LatencyHistogram()
@@ -167,7 +164,7 @@ class Controller:
                 spent = self.clock() - before
                 self.overruns += spent > 1 / self.rate
                 due = max(due + 1 / self.rate, self.clock() - 1 / self.rate)
-                self.sleep(max(0.0, due - self.clock()))
+                self.clock.sleep(max(0.0, due - self.clock()))
         finally:
             # Whatever happened, an exception included: the hand holds.
             self.driver.stop()
@@ -186,7 +183,7 @@ class Controller:
         while self.driver.read() is None:
             if self.clock() - start > self.limits.start_timeout:
                 return f"the hand said nothing for {self.limits.start_timeout:g} s"
-            self.sleep(0.005)
+            self.clock.sleep(0.005)
         return None
 
     def _tick(self, now: float) -> str | None:
@@ -218,12 +215,10 @@ class Controller:
 
     def _observe(self, reading: HandReading) -> dict[str, NDArray[np.float32]]:
         position, velocity = reading.position[self._order], reading.velocity[self._order]
-        obs = {"proprio": np.concatenate([position, VELOCITY * velocity, self._action]).astype(np.float32)}
-        if self.touch is not None and "tactile" in self.groups:
-            obs["tactile"] = self.touch(reading)
-        for name, source in self.sources.items():
-            obs[name] = np.asarray(source(reading), np.float32)
-        return {name: obs[name] for name in self.groups}
+        proprio = np.concatenate([position, VELOCITY * velocity, self._action]).astype(np.float32)
+        sources = {name: source for name, source in self.sources.items() if name in self.groups}
+        found = {name: np.asarray(source(reading), np.float32) for name, source in sources.items()}
+        return {name: found.get(name, proprio) for name in self.groups}
 
     def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:
         wanted = np.array([targets.get(name, reading.position[i]) for i, name in enumerate(self.driver.joints)])

@@ -22,7 +22,7 @@ from brainbench.core.files import atomic_path, write_json
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from robotics_bridge.policies.encoders.finger_axes import Rays
+    from robotics_bridge.policies.encoders.finger_axes import FingerAxes
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -87,12 +87,14 @@ class Episode:
             store.append(np.array(value, dtype=np.float32))
 
 
-def total_wrench(points: NDArray[np.floating], links: Sequence[str], link: NDArray[np.int64], rays: Rays) -> NDArray:
+def total_wrench(
+    points: NDArray[np.floating], links: Sequence[str], link: NDArray[np.int64], axes: FingerAxes
+) -> NDArray:
     """Return the sum [6] of points' wrenches [N, 6] in the palm's frame, about its origin, fingers at reference."""
     total = np.zeros(6)
     for number, name in enumerate(links):
         force, torque = np.split(points[link == number].sum(axis=0), 2)
-        turn, origin = rays.place[name]
+        turn, origin = axes.place[name]
         total[:3] += turn @ force
         total[3:] += turn @ torque + np.cross(origin, turn @ force)
     return total

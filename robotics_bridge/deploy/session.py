@@ -69,18 +69,18 @@ class DeployedPolicy:
             UsageError: the hand or the sources do not fit the policy.
         """
         body = hands.load(self.hand)
-        touch = None
+        sources = dict(sources or {})
         if "tactile" in self.groups:
             slots, items, channels = self.groups["tactile"]
             tips = {chain[-1]: finger for finger, chain in body.fingers.items()}
-            touch = RealTouch(
+            sources["tactile"] = RealTouch(
                 str(self.deployment["observe"]), tuple(self.deployment["links"]), (slots, items, channels), tips=tips,
                 fingers=driver.fingers, calibration=calibration, fallback=fallback,
             )  # fmt: skip
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))
         run = read_policy(self.path, self.groups, format=self.format, threads=threads)
         return Controller(
-            run, driver, Actuation.of(self.deployment), safe, groups=tuple(self.groups), rate=self.rate, touch=touch,
+            run, driver, Actuation.of(self.deployment), safe, groups=tuple(self.groups), rate=self.rate,
             sources=sources, **settings,
         )  # fmt: skip
 

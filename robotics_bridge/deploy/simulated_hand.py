@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
-from robotics_bridge.deploy.messages import COMMAND, STATE, STOP, decode, encode
 from robotics_bridge.deploy.touch import PressureCalibration
+from robotics_bridge.deploy.udp import COMMAND, STATE, STOP, decode, encode
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -6,8 +6,8 @@
 
 from __future__ import annotations
 
-from robotics_bridge.envs.actions import ActionMap
 from robotics_bridge.envs.env import Env
 from robotics_bridge.envs.options import ENGINES, EnvOptions
+from robotics_bridge.envs.step import ActionMap
 
 __all__ = ["ENGINES", "ActionMap", "Env", "EnvOptions"]

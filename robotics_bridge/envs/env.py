@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.envs.actions import ActionMap
 from robotics_bridge.envs.checkpoint import load_state, save_state
 from robotics_bridge.envs.observations import observe
 from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.state import EnvState
-from robotics_bridge.envs.step import STATISTICS, apply_action, compute_step, run_physics
+from robotics_bridge.envs.step import STATISTICS, ActionMap, apply_action, compute_step, run_physics
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
 
@@ -142,7 +141,7 @@ class Env:
 
     @property
     def action_map(self) -> ActionMap:
-        """How actions become joint targets."""
+        """The map from actions to joint targets."""
         columns = [self.model.joints.index(name) for name in self.model.moved]
         low, high = self.model.low[columns], self.model.high[columns]
         return ActionMap(self.model.moved, self.model.rest[columns], self.task.action_ratio * (high - low), low, high)

@@ -1,11 +1,14 @@
 """The parts of a control step, in their order: targets of the actuators, physics and senses, reward and resets.
 
-Letters: B environment, K object.
+Letters: B environment, A action, K object.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from robotics_bridge.envs.observations import observe
 from robotics_bridge.tasks.step_context import StepContext
@@ -20,6 +23,26 @@ if TYPE_CHECKING:
 
 _DIVERGED_SPEED = 1e4
 """Speed (m/s or rad/s) beyond which an environment counts as diverged."""
+
+
+@dataclass(frozen=True, eq=False)
+class ActionMap:
+    """The map from actions to targets of the actuators: target = clip(default + scale · action, low, high)."""
+
+    names: tuple[str, ...]
+    """Names of the joints A."""
+    default: np.ndarray
+    """[A] targets of zero actions (rad)."""
+    scale: np.ndarray
+    """[A] (rad per unit of action)."""
+    low: np.ndarray
+    """[A] least targets (rad)."""
+    high: np.ndarray
+    """[A] greatest targets (rad)."""
+
+    def targets(self, action: np.ndarray) -> np.ndarray:
+        """Return the targets [..., A] (rad) of actions [..., A]."""
+        return np.clip(self.default + self.scale * action, self.low, self.high)
 
 
 def apply_action(state: EnvState) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -57,14 +58,6 @@ class GroupEncoder(nn.Module):
         elif kind == "lstm":
             self.cell, self.net = nn.LSTMCell(size, _LSTM), nn.Linear(_LSTM, _EMBEDDING)
             self.state_size = 2 * _LSTM
-
-    def forward(self, x: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (embedding, h_out)."""
-        if self.cell is None:
-            return self.net(x), h_in
-        hidden, memory = h_in.chunk(2, 1)
-        hidden, memory = self.cell(x, (hidden, memory))
-        return self.net(hidden), torch.cat((hidden, memory), 1)
 
     def unroll(
         self, x: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None
@@ -139,7 +132,7 @@ class PolicyCore(nn.Module):
             parts.append(y)
         if self.tactile is not None and taxels is not None:
             mixed = self.precision is not None
-            with torch.autocast(taxels.device.type, self.precision, enabled=mixed, cache_enabled=False):
+            with torch.autocast(taxels.device.type, self.precision, cache_enabled=False) if mixed else nullcontext():
                 if kept:
                     y = self.tactile.embed(taxels)
                 else:
@@ -148,28 +141,17 @@ class PolicyCore(nn.Module):
         return torch.cat(parts, -1), torch.cat([state.to(h_in.dtype) for state in states], 1)
 
     def forward(
-        self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor, *, kept: bool = False
+        self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latent [B, D], h_out [B, H]).
+        """Return (latent [B, D], h_out [B, H]) of one step.
 
         Args:
-            flat: Normalised flat groups.
-            taxels: Readings [B, S, N, C]; or the features that a frozen encoder gave for them, with ``kept``.
+            flat: Normalised flat groups [B, n].
+            taxels: Readings [B, S, N, C].
             h_in: Memory.
-            kept: ``taxels`` holds features; the memory of touch is then left as it is.
         """
-        states = list(h_in.split(self.splits, 1))
-        parts = []
-        for index, (embed, x) in enumerate(zip(self.embedders, flat, strict=True)):
-            y, states[index] = embed(x, states[index])
-            parts.append(y)
-        if self.tactile is not None and taxels is not None:
-            if kept:
-                parts.append(self.tactile.embed(taxels))
-            else:
-                y, states[-2] = self.tactile(taxels, states[-2])
-                parts.append(y)
-        return torch.cat(parts, 1), torch.cat(states, 1)
+        latents, h_out = self.unroll([x[None] for x in flat], None if taxels is None else taxels[None], h_in)
+        return latents[0], h_out
 
 
 class TactilePolicy(MLPModel):
@@ -262,10 +244,10 @@ class TactilePolicy(MLPModel):
             h_in: Memory [B, H]; zeros before the first step.
             features: What the frozen encoder gave for this step, instead of its readings.
         """
-        flat = self._normalised(obs)
-        if features is not None:
-            return self.core(flat, features, h_in, kept=True)
-        return self.core(flat, obs[TACTILE] if self.touch else None, h_in)
+        read = self.shapes if features is None else self.obs_groups
+        kept = None if features is None else features[None]
+        latents, h_out = self.unroll({name: obs[name][None] for name in read}, h_in, None, kept)
+        return latents[0], h_out
 
     def unroll(
         self,
@@ -274,7 +256,7 @@ class TactilePolicy(MLPModel):
         ended: torch.Tensor | None = None,
         features: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latents [L, B, D], h_out [B, H]) of L steps, faster than L calls of :meth:`advance`.
+        """Return (latents [L, B, D], h_out [B, H]) of L steps.
 
         Args:
             obs: Groups [L, B, …].
@@ -308,16 +290,13 @@ class TactilePolicy(MLPModel):
         if masks is None:
             if self._state is None:
                 self._state = self.zeros(len(obs[next(iter(self.shapes))]))[None]
-            latents, state = self.unroll({name: obs[name][None] for name in self.shapes}, self._state[0])
+            latent, state = self.advance(obs, self._state[0])
             self._state = state[None]
-            return latents[0]
+            return latent
         if hidden_state is None:
             raise UsageError("Sequences need the hidden state in which they begin.")
-        state, found = hidden_state[0], []
-        for step in range(masks.shape[0]):
-            latent, state = self.advance({name: obs[name][step] for name in self.shapes}, state)
-            found.append(latent)
-        return unpad_trajectories(torch.stack(found), masks)  # type: ignore[return-value]
+        latents, _ = self.unroll({name: obs[name] for name in self.shapes}, hidden_state[0])
+        return unpad_trajectories(latents, masks)  # type: ignore[return-value]
 
     def reset(self, dones: torch.Tensor | None = None, hidden_state: Any = None) -> None:
         """Forget: all environments, or those that are done; or take a given memory [1, B, H]."""

@@ -65,8 +65,8 @@ def deploy(
     Exit status 1: it was stopped for safety.
     """
     from robotics_bridge.deploy import session
-    from robotics_bridge.deploy.realtime import realtime
     from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
+    from robotics_bridge.deploy.timing import realtime
     from robotics_bridge.deploy.udp import UdpDriver
 
     deployed = session.read_deployed(policy)
@@ -134,11 +134,11 @@ class _Tape:
     def __init__(self, deployed: DeployedPolicy) -> None:
         from robotics_bridge import hands
         from robotics_bridge.deploy.episodes import Episode, TactilePoints
-        from robotics_bridge.policies.encoders.finger_axes import rays_of
+        from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 
         self.hand, self.rate = hands.load(deployed.hand), deployed.rate
         layout = self.hand.layout("med", "tips")
-        self.rays = rays_of(self.hand, self.hand.layout("med", "hand"))
+        self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
         import numpy as np
 
         fingers = tuple(self.hand.fingers)
@@ -161,7 +161,7 @@ class _Tape:
         force = -reading.pressure[self.rows][:, ::-1]
         torque = np.cross(self.points.position, force).astype(float)
         points = np.concatenate([force, torque], axis=1)
-        wrench = total_wrench(points, self.points.links, self.points.link, self.rays)
+        wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
         self.episode.add(reading.position, reading.velocity, targets, points, wrench)
 
     def write(self, folder: Path, joints: tuple[str, ...]) -> Path:

@@ -22,7 +22,7 @@ from brainbench.models.registry import list_models
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.calibration import HandCalibration
-from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, PictureGRU
+from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, ConvGRUProducts
 from robotics_bridge.policies.encoders.front_end import FrontEnd, Learning
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.encoders.timing import Time
@@ -197,6 +197,15 @@ class _Learned(TactileEncoder):
     def observe_scale(self, taxels: torch.Tensor) -> None:
         self.scale.update(taxels)
 
+    def unroll(
+        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        if self.state_size:
+            return super().unroll(taxels, h_in, ended)
+        # Without memory all steps are one batch.
+        y, _ = self(taxels.flatten(0, 1), h_in)
+        return y.unflatten(0, taxels.shape[:2]), h_in
+
 
 class _Flat(_Learned):
     """A multilayer perceptron on all values; published hidden sizes 64 and 64."""
@@ -211,11 +220,6 @@ class _Flat(_Learned):
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return self.net(self.scale(taxels).flatten(1)), h_in
-
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        return _at_once(self, taxels, h_in)
 
 
 class _Recurrent(_Learned):
@@ -308,11 +312,6 @@ class _Convolution(_Images):
         values = maps if self.canvas else maps.mean((2, 3))
         return self.head(values.reshape(taxels.shape[0], -1)), h_in
 
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        return _at_once(self, taxels, h_in)
-
 
 class _ConvolutionCanvas(_Convolution):
     canvas = True
@@ -328,7 +327,7 @@ class _ConvRecurrent(_Images):
         self.head = nn.Linear(_CHANNELS[0] * places, self.features)
         self.state_size = self.images * _CHANNELS[0] * self.rows * self.columns
         small = self.rows * self.columns <= MOST_CELLS
-        self.products: PictureGRU | None = PictureGRU(self.rows, self.columns, _KERNEL) if small else None
+        self.products: ConvGRUProducts | None = ConvGRUProducts(self.rows, self.columns, _KERNEL) if small else None
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         state = h_in.reshape(-1, _CHANNELS[0], self.rows, self.columns)
@@ -346,7 +345,7 @@ class _ConvRecurrent(_Images):
     def unroll_as_products(
         self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what :meth:`unroll` returns, by :class:`~robotics_bridge.policies.encoders.conv_gru.PictureGRU`."""
+        """Return what :meth:`unroll` returns, by matrix products."""
         assert self.products is not None
         steps, batch = taxels.shape[:2]
         pictures = self.pictures(taxels.flatten(0, 1)).flatten(1).unflatten(0, (steps, -1))
@@ -388,12 +387,6 @@ class _Network(TactileEncoder):
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         features, h_out = self.front(taxels, h_in)
         return self.embed(features), h_out
-
-
-def _at_once(encoder: TactileEncoder, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what ``unroll`` returns for an encoder without memory."""
-    y, _ = encoder(taxels.flatten(0, 1), h_in)
-    return y.unflatten(0, taxels.shape[:2]), h_in
 
 
 ARMS: Mapping[str, Callable[[EncoderConfig], TactileEncoder]] = {

@@ -22,7 +22,7 @@ MOST_CELLS = 64
 """Cells of a picture beyond which the products outweigh what they save (they grow with the square of P)."""
 
 
-class PictureGRU(nn.Module):
+class ConvGRUProducts(nn.Module):
     """Steps of a :class:`~brainbench.models.cells.GRU` with layer norm and an odd square kernel; it has no weights.
 
     Args:

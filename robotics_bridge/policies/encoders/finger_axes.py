@@ -1,4 +1,4 @@
-"""Fingers as rays from tip to wrist: which of 5 × 7 sites of the hand a point of its skin belongs to.
+"""Axes of fingers from tip to wrist: which of 5 × 7 sites of the hand a point of its skin belongs to.
 
 Lengths in metres, in the frame of the palm with every joint at its reference position. Letters: N point, L link.
 """
@@ -33,7 +33,7 @@ _WORDS = {
     "pinky": ("pinky", "little", "lf", "small"),
 }
 _SAME = 1e-4
-"""Points nearer along a ray than this (m) are never parted."""
+"""Points nearer along a finger axis than this (m) are never parted."""
 
 
 def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
@@ -61,10 +61,10 @@ def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
 
 
 @dataclass(frozen=True, eq=False)
-class Rays:
+class FingerAxes:
     """The fingers of a hand in its reference posture, and where their sites begin.
 
-    Args are made by :func:`rays_of`.
+    Made by :func:`finger_axes_of`.
     """
 
     place: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -72,10 +72,10 @@ class Rays:
     chains: Mapping[int, tuple[str, ...]]
     """Row → links from palm to tip."""
     joints: Mapping[int, NDArray[np.float64]]
-    """Row → corners [n, 3] of its ray: the wrist, the origins of its links, and a point beyond the tip."""
+    """Row → corners [n, 3] of its axis: the wrist, the origins of its links, and a point beyond the tip."""
     palm: str
     edges: NDArray[np.float64]
-    """[5, 6]: lengths along the ray, counted from the far end, at which one site ends and the next begins."""
+    """[5, 6]: lengths along the axis, counted from the far end, at which one site ends and the next begins."""
     centers: NDArray[np.float64]
     """[5, 7, 3]: middle of every site; the palm's origin where a site is empty."""
 
@@ -90,15 +90,15 @@ class Rays:
         Raises:
             UsageError: the link is neither the palm nor part of a finger.
         """
-        rows, lengths = self._locate(link, self.to_palm(link, points))
+        rows, lengths = self.locate(link, self.to_palm(link, points))
         columns = np.array(
             [np.searchsorted(self.edges[row], length, side="right") for row, length in zip(rows, lengths, strict=True)],
             dtype=np.int64,
         )
         return rows, columns
 
-    def _locate(self, link: str, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the ray [N] of points (palm frame) and their lengths [N] along it from its far end."""
+    def locate(self, link: str, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the row [N] of points (palm frame) and their lengths [N] along it from its far end."""
         for row, chain in self.chains.items():
             if link in chain:
                 start = 1 + chain.index(link)
@@ -112,8 +112,8 @@ class Rays:
         return np.array(order)[nearest], lengths
 
 
-def rays_of(hand: Hand, reference: Layout) -> Rays:
-    """Return the rays of a hand; sites are the seven quantiles of a reference layout's taxels along each ray.
+def finger_axes_of(hand: Hand, reference: Layout) -> FingerAxes:
+    """Return the finger axes of a hand; sites are the seven quantiles of a reference layout's taxels along each axis.
 
     Raises:
         UsageError: the hand has more than five fingers, or a taxel sits on a link that is no part of it.
@@ -131,13 +131,14 @@ def rays_of(hand: Hand, reference: Layout) -> Rays:
     chains = {rows[finger]: tuple(chain) for finger, chain in hand.fingers.items()}
     joints = {row: _corners(chain, place, reference) for row, chain in chains.items()}
     shape = (*GRID_SHAPE, 3)
-    rays = Rays(place, chains, joints, hand.palm, np.full((GRID_SHAPE[0], GRID_SHAPE[1] - 1), np.inf), np.zeros(shape))
-    _lay_sites(rays, reference)
-    return rays
+    edges = np.full((GRID_SHAPE[0], GRID_SHAPE[1] - 1), np.inf)
+    axes = FingerAxes(place, chains, joints, hand.palm, edges, np.zeros(shape))
+    _lay_sites(axes, reference)
+    return axes
 
 
 def _corners(chain: tuple[str, ...], place: Mapping[str, Any], reference: Layout) -> NDArray[np.float64]:
-    """Return the corners of a ray: wrist, joints, and a point beyond the tip in line with the last phalanx."""
+    """Return the corners of a finger axis: wrist, joints, and a point beyond the tip in line with the last phalanx."""
     corners = [np.zeros(3), *(place[link][1] for link in chain)]
     steps = [after - before for before, after in pairwise(corners[1:])]
     long = [step for step in steps if np.linalg.norm(step) > _SAME]
@@ -155,7 +156,7 @@ def _corners(chain: tuple[str, ...], place: Mapping[str, Any], reference: Layout
 def _along(
     corners: NDArray[np.float64], segment: int, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how far from the ray's far end points [N, 3] lie along one segment, and their distance from it."""
+    """Return how far along one segment points [N, 3] lie from the axis's far end, and their distance from it."""
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     rest = lengths[segment + 1 :].sum()
     step = corners[segment + 1] - corners[segment]
@@ -165,16 +166,16 @@ def _along(
     return rest + (1 - share) * size, distance
 
 
-def _lay_sites(rays: Rays, reference: Layout) -> None:
+def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
     """Fill in edges and centres."""
     columns = GRID_SHAPE[1]
     parts = []
     for link, probes in reference.items():
-        points = rays.to_palm(link, probes.position[probes.active])
-        row, length = rays._locate(link, points)
+        points = axes.to_palm(link, probes.position[probes.active])
+        row, length = axes.locate(link, points)
         parts.append(np.column_stack([row, length, points]))
     table = np.concatenate(parts) if parts else np.zeros((0, 5))
-    for row in rays.chains:
+    for row in axes.chains:
         mine = table[table[:, 0] == row]
         if not len(mine):
             continue
@@ -186,8 +187,8 @@ def _lay_sites(rays: Rays, reference: Layout) -> None:
             before, after = values[site < column], values[site >= column]
             low = before.max() if len(before) else values.min()
             high = after.min() if len(after) else np.inf
-            rays.edges[row, column - 1] = _SAME * (low + high) / 2 if len(before) else 0.0
+            axes.edges[row, column - 1] = _SAME * (low + high) / 2 if len(before) else 0.0
         for column in range(columns):
             members = np.isin(steps, values[site == column])
             if members.any():
-                rays.centers[row, column] = mine[members, 2:].mean(axis=0)
+                axes.centers[row, column] = mine[members, 2:].mean(axis=0)

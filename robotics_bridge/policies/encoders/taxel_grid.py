@@ -1,9 +1,9 @@
 """From the taxels of a hand to the input of an encoder: one fixed linear map [B, S, N, C] → [B, S·6, 5, 7].
 
 Rows are fingers (thumb, index, middle, ring, pinky; the row of an absent finger stays zero), columns seven sites along
-each finger's ray from its tip to the wrist. Sites are quantiles of the arc length of the taxels of the whole hand at
+each finger's axis from its tip to the wrist. Sites are quantiles of the arc length of the taxels of the whole hand at
 medium resolution, so a spot of skin lights one and the same cell at every placement and resolution; taxels of the palm
-belong to the nearest ray. A site carries the sum of its taxels' forces and their moments about its centre,
+belong to the nearest axis. A site carries the sum of its taxels' forces and their moments about its centre,
 
     F_site = Σ f_i,    M_site = Σ m_i + (x_i − x_site) × f_i,
 
@@ -28,7 +28,7 @@ from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type, observe
-from robotics_bridge.policies.encoders.finger_axes import rays_of
+from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 
 if TYPE_CHECKING:
     import os
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from robotics_bridge.hands import Hand
     from robotics_bridge.hands.layouts import Layout
-    from robotics_bridge.policies.encoders.finger_axes import Rays
+    from robotics_bridge.policies.encoders.finger_axes import FingerAxes
     from robotics_bridge.sensors.probes.placement import Probes
 
 SITES = GRID_SHAPE[0] * GRID_SHAPE[1]
@@ -81,8 +81,8 @@ class TaxelGrid(nn.Module):
         self.channels: int = kind.channels
         """C."""
         own = resolution not in hands.RESOLUTIONS
-        self.rays: Rays = rays_of(body, body.layout(resolution if own else "med", "hand"))
-        parts = [_scatter(self.rays, link, probes, observe) for link, probes in self.layout.items()]
+        self.axes: FingerAxes = finger_axes_of(body, body.layout(resolution if own else "med", "hand"))
+        parts = [_scatter(self.axes, link, probes, observe) for link, probes in self.layout.items()]
         if not parts:
             raise UsageError(f"The hand {body.name!r} has no taxels at the placement {placement!r}.")
         full = np.concatenate(parts, axis=2)
@@ -127,7 +127,7 @@ class TaxelGrid(nn.Module):
         return f"{self.observe}: {self.items} × {self.channels} → {SITES} sites"
 
 
-def _scatter(rays: Rays, link: str, probes: Probes, observe: str) -> NDArray[np.float64]:
+def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArray[np.float64]:
     """Return the part [SITES, 6, items, C] of a link's items."""
     points, normals = probes.position[probes.active], probes.normal[probes.active]
     if not len(points):
@@ -136,13 +136,13 @@ def _scatter(rays: Rays, link: str, probes: Probes, observe: str) -> NDArray[np.
         normal = normals.mean(axis=0, keepdims=True)
         length = np.linalg.norm(normal)
         points, normals = points.mean(axis=0, keepdims=True), normal / length if length > 1e-9 else normals[:1]
-    turn, origin = rays.place[link]
-    rows, columns = rays.sites(link, points)
+    turn, origin = axes.place[link]
+    rows, columns = axes.sites(link, points)
     wrench = _WRENCHES[observe](points, normals)
     part = np.zeros((SITES, 6, len(points), wrench.shape[2]))
     for index, (row, column) in enumerate(zip(rows, columns, strict=True)):
         force = turn @ wrench[index, :3]
-        lever = origin - rays.centers[row, column]
+        lever = origin - axes.centers[row, column]
         moment = turn @ wrench[index, 3:] + _cross(lever) @ force
         part[row * GRID_SHAPE[1] + column, :, index] = np.concatenate([force, moment])
     return part

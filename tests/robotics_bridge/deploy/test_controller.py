@@ -9,16 +9,17 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import Actuation, Controller
+from robotics_bridge.deploy.controller import Actuation, Clock, Controller
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
-from robotics_bridge.deploy.monitor import LatencyHistogram, RateMonitor
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
+from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
 from robotics_bridge.deploy.touch import PressureCalibration, RealTouch
+from robotics_bridge.envs import ActionMap
 
 JOINTS = ("a", "b", "c")
 
 
-class Clock:
+class OwnClock(Clock):
     def __init__(self) -> None:
         self.now = 100.0
 
@@ -32,7 +33,7 @@ class Clock:
 class PaperHand:
     """Follows its targets at once; ``spoil(reading number, fields)`` may change what it reports."""
 
-    def __init__(self, clock: Clock, spoil=None) -> None:
+    def __init__(self, clock: OwnClock, spoil=None) -> None:
         self.joints, self.fingers = JOINTS, ("thumb", "index")
         self.counters = LinkCounters()
         self.clock, self.spoil = clock, spoil
@@ -65,8 +66,9 @@ class PaperHand:
 
 
 ACTUATION = Actuation(
-    JOINTS, ("a", "c"), default=np.array([0.1, 0.2]), scale=np.array([0.5, 0.5]), low=np.array([-1.0, 0.0]),
-    high=np.array([1.0, 0.4]), frozen={"b": 0.3},
+    JOINTS,
+    ActionMap(("a", "c"), np.array([0.1, 0.2]), np.array([0.5, 0.5]), np.array([-1.0, 0.0]), np.array([1.0, 0.4])),
+    frozen={"b": 0.3},
 )  # fmt: skip
 
 
@@ -75,11 +77,11 @@ def _limits(**changes) -> SafetyLimits:
 
 
 def _control(spoil=None, *, policy=None, seconds=2.0, clock=None, **changes):
-    clock = clock or Clock()
+    clock = clock or OwnClock()
     hand = PaperHand(clock, spoil)
     controller = Controller(
         policy or (lambda obs, forget: np.array([0.2, 0.1], np.float32)), hand, ACTUATION, _limits(),
-        groups=changes.pop("groups", ("proprio",)), clock=clock, sleep=clock.sleep, **changes,
+        groups=changes.pop("groups", ("proprio",)), clock=clock, **changes,
     )  # fmt: skip
     return controller.run(seconds), hand, controller
 
@@ -159,22 +161,20 @@ def test_a_policy_that_gives_no_numbers_or_fails_leaves_the_hand_holding() -> No
     report, hand, _ = _control(policy=lambda obs, forget: next(calls))
     assert "policy gave values that are no numbers" in report.reason
     assert len(hand.sent) == 2
-    clock = Clock()
+    clock = OwnClock()
     hand = PaperHand(clock)
 
     def broken(obs, forget):
         raise RuntimeError("boom")
 
-    controller = Controller(
-        broken, hand, ACTUATION, _limits(), groups=("proprio",), clock=clock, sleep=clock.sleep
-    )  # fmt: skip
+    controller = Controller(broken, hand, ACTUATION, _limits(), groups=("proprio",), clock=clock)
     with pytest.raises(RuntimeError, match="boom"):
         controller.run(1.0)
     assert hand.stops == 1
 
 
 def test_slow_control_is_noticed() -> None:
-    clock = Clock()
+    clock = OwnClock()
 
     def slow(obs, forget):
         clock.now += 0.05

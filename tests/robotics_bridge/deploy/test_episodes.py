@@ -12,7 +12,7 @@ from pyarrow import parquet
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.episodes import Episode, TactilePoints, total_wrench, write_lerobot
-from robotics_bridge.policies.encoders.finger_axes import rays_of
+from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
 HAND = hands.load("xhand1")
@@ -73,16 +73,16 @@ def test_episodes_and_tasks_are_found_as_lerobot_looks_for_them(folder) -> None:
 
 
 def test_the_wrench_is_the_sum_of_the_points() -> None:
-    rays = rays_of(HAND, HAND.layout("med", "hand"))
+    axes = finger_axes_of(HAND, HAND.layout("med", "hand"))
     rng = np.random.default_rng(2)
     points = rng.normal(size=(45, 6))
-    total = total_wrench(points, POINTS.links, POINTS.link, rays)
+    total = total_wrench(points, POINTS.links, POINTS.link, axes)
     import torch
 
     grid = TaxelGrid("xhand1", placement="tips", resolution="low")
     image = grid(torch.from_numpy(points).float()[None, None])[0].numpy().astype(float)
     force = image[:3].sum((1, 2))
-    moment = (image[3:] + np.cross(grid.rays.centers.transpose(2, 0, 1), image[:3], axis=0)).sum((1, 2))
+    moment = (image[3:] + np.cross(grid.axes.centers.transpose(2, 0, 1), image[:3], axis=0)).sum((1, 2))
     np.testing.assert_allclose(total, [*force, *moment], atol=1e-4)
 
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.deploy.controller import Actuation, Controller
-from robotics_bridge.deploy.messages import STATE, decode, encode
 from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.deploy.simulated_hand import Faults, SimulatedHand, serve, simulated_hand
-from robotics_bridge.deploy.udp import UdpDriver
+from robotics_bridge.deploy.udp import STATE, UdpDriver, decode, encode
+from robotics_bridge.envs import ActionMap
 
 JOINTS, FINGERS = ("a", "b"), ("thumb",)
 
@@ -68,7 +68,7 @@ def _until(condition, seconds: float = 1.2) -> None:
 
 
 def _control(driver, seconds=0.6, **limits):
-    actuation = Actuation(JOINTS, JOINTS, np.zeros(2), np.ones(2), -np.ones(2), np.ones(2))
+    actuation = Actuation(JOINTS, ActionMap(JOINTS, np.zeros(2), np.ones(2), -np.ones(2), np.ones(2)))
     safe = SafetyLimits(-np.ones(2), np.ones(2), np.full(2, 8.0), rate_share=0.2, **limits)
     policy = lambda obs, forget: np.full(2, 0.4)  # noqa: E731
     return Controller(policy, driver, actuation, safe, groups=("proprio",)).run(seconds)
@@ -194,7 +194,7 @@ def test_the_simulated_xhand1_follows_and_feels_the_ball_it_holds() -> None:
 def test_a_process_of_its_own_serves_the_simulated_xhand1() -> None:
     with simulated_hand(seconds=60) as (address, joints, fingers), UdpDriver(address, joints, fingers) as driver:
         limits = SafetyLimits(np.full(12, -1.0), np.full(12, 2.2), np.full(12, 8.0), timeout=1.0, rate_share=0.2)
-        actuation = Actuation(joints, joints, np.full(12, 0.3), np.ones(12), np.zeros(12), np.ones(12))
+        actuation = Actuation(joints, ActionMap(joints, np.full(12, 0.3), np.ones(12), np.zeros(12), np.ones(12)))
         policy = lambda obs, forget: np.zeros(12)  # noqa: E731
         report = Controller(policy, driver, actuation, limits, groups=("proprio",)).run(1.5)
         assert report.status == "finished", report.reason

@@ -39,7 +39,7 @@ def _base_poses(name: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def _total(grid: TaxelGrid, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Force and moment about the palm's origin of a grid [6, 5, 7]."""
     force, moment = image[:3], image[3:]
-    centers = grid.rays.centers.transpose(2, 0, 1)
+    centers = grid.axes.centers.transpose(2, 0, 1)
     about = moment + np.cross(centers, force, axis=0)
     return force.sum((1, 2)), about.sum((1, 2))
 
@@ -77,13 +77,13 @@ def test_one_taxel_gives_its_wrench_about_the_centre_of_its_one_site(name, item,
     readings = torch.zeros(1, 1, grid.items, 6)
     links = [link for link, probes in grid.layout.items() for _ in range(int(probes.active.sum()))]
     points = np.concatenate([probes.position[probes.active] for probes in grid.layout.values()])
-    turn, origin = grid.rays.place[links[item]]
+    turn, origin = grid.axes.place[links[item]]
     # A taxel reads its own torque and the moment of its force about the link's origin.
     readings[0, 0, item] = torch.tensor([*force, *(np.array(torque) + np.cross(points[item], force))])
     image = grid(readings)[0].numpy()
-    rows, columns = grid.rays.sites(links[item], points[item][None])
+    rows, columns = grid.axes.sites(links[item], points[item][None])
     site = image[:, rows[0], columns[0]]
-    lever = turn @ points[item] + origin - grid.rays.centers[rows[0], columns[0]]
+    lever = turn @ points[item] + origin - grid.axes.centers[rows[0], columns[0]]
     expected = np.cross(lever, turn @ force) + turn @ torque
     np.testing.assert_allclose(site[:3], turn @ force, atol=1e-5)
     np.testing.assert_allclose(site[3:], expected, atol=1e-5)
@@ -98,7 +98,7 @@ _GRIDS = {name: TaxelGrid(name) for name in HANDS}
 def test_medium_resolution_fills_every_site_and_sites_run_from_tip_to_wrist(name) -> None:
     grid = _GRIDS[name]
     assert bool(grid.occupied.all())
-    centers = grid.rays.centers
+    centers = grid.axes.centers
     for row in range(1, 5):  # the fingers point along z of the palm, the thumb does not
         assert (np.diff(centers[row, :, 2]) < 0).all()
     # Fingers lie side by side along y, from the radial side on.
@@ -111,8 +111,8 @@ def test_a_spot_of_skin_keeps_its_cell_at_every_placement_and_resolution(name) -
     for resolution in hands.RESOLUTIONS:
         for placement in ("tips", "fingers"):
             part = TaxelGrid(name, placement=placement, resolution=resolution)
-            np.testing.assert_array_equal(part.rays.edges, whole.rays.edges)
-            np.testing.assert_array_equal(part.rays.centers, whole.rays.centers)
+            np.testing.assert_array_equal(part.axes.edges, whole.axes.edges)
+            np.testing.assert_array_equal(part.axes.centers, whole.axes.centers)
     tips = TaxelGrid(name, placement="tips").occupied
     assert bool(tips[:, 0].all())
     assert not tips[:, 4:].any()
@@ -153,7 +153,7 @@ def test_every_type_with_touch_has_a_grid_that_pushes_into_the_skin(kind) -> Non
         force = grid(values)[0, :3].sum((1, 2)).numpy()
         expected = np.zeros(3)
         for link, probes in grid.layout.items():
-            expected += int(probes.active.sum()) * grid.rays.place[link][0][:, 0]
+            expected += int(probes.active.sum()) * grid.axes.place[link][0][:, 0]
         np.testing.assert_allclose(force, expected, atol=1e-3)
     else:
         if kind == "agg_force":  # what a real tip reports when its link is pushed: summed normals, axes z y x

@@ -8,7 +8,7 @@ import os
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.deploy.realtime import PRIORITY, realtime
+from robotics_bridge.deploy.timing import PRIORITY, realtime
 
 linux = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="SCHED_FIFO is Linux's")
 

@@ -1,0 +1,118 @@
+"""Time of the control loop: ahead of other work of the computer, how long ticks take, how regularly they come."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import math
+import os
+from collections import deque
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PRIORITY = 20
+"""Of SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)."""
+
+
+@contextlib.contextmanager
+def realtime(priority: int = PRIORITY) -> Iterator[None]:
+    """Run the calling thread ahead of all ordinary ones (SCHED_FIFO) and without garbage collection, until it leaves.
+
+    Processes that it starts meanwhile are ordinary. A loop that never sleeps would keep a processor to itself.
+
+    Raises:
+        UsageError: the system has no such scheduling (it is Linux's), or this user may not ask for it.
+    """
+    if not hasattr(os, "SCHED_FIFO"):
+        raise UsageError("Real-time scheduling is Linux's; leave realtime out on this system.")
+    before, parameters, collecting = os.sched_getscheduler(0), os.sched_getparam(0), gc.isenabled()
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except PermissionError as error:
+        raise UsageError(
+            f"This user may not run threads at real-time priority {priority}; allow it with the line "
+            f"'{os.environ.get('USER', 'USER')} - rtprio {priority}' in /etc/security/limits.conf, or leave realtime "
+            "out."
+        ) from error
+    gc.disable()
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, before, parameters)
+        if collecting:
+            gc.enable()
+
+
+class LatencyHistogram:
+    """Durations of ticks, counted in logarithmic buckets: 10 per decade from 10 µs to 10 s; percentiles are exact."""
+
+    EDGES = np.logspace(-5, 1, 61)
+    """[61] (s)."""
+
+    def __init__(self) -> None:
+        self._values: list[float] = []
+
+    def add(self, seconds: float) -> None:
+        """Count a duration."""
+        self._values.append(seconds)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Durations [62] below each edge, and beyond the last."""
+        return np.bincount(np.searchsorted(self.EDGES, self._values, side="right"), minlength=len(self.EDGES) + 1)
+
+    def percentile(self, share: float) -> float:
+        """Return the duration (s) that a share (0 to 100) of ticks stays below; NaN without any."""
+        return float(np.percentile(self._values, share)) if self._values else math.nan
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts and percentiles in milliseconds."""
+        parts = {f"p{share:g}": 1e3 * self.percentile(share) for share in (50, 90, 99, 99.9)}
+        return {"ticks": len(self), **parts, "max": 1e3 * max(self._values, default=math.nan)}
+
+    def text(self, width: int = 40) -> str:
+        """Return the histogram as lines of text, without empty ends."""
+        counts = self.counts
+        used = np.flatnonzero(counts)
+        if not len(used):
+            return "no ticks"
+        lines = []
+        for bucket in range(used[0], used[-1] + 1):
+            top = f"{1e3 * self.EDGES[bucket]:8.3g} ms" if bucket < len(self.EDGES) else "    more    "
+            bar = "█" * round(width * counts[bucket] / counts.max())
+            lines.append(f"< {top} {counts[bucket]:6d} {bar}")
+        return "\n".join(lines)
+
+
+class RateMonitor:
+    """The rate of ticks over a sliding window.
+
+    Args:
+        rate: Nominal [Hz].
+        window: Seconds.
+    """
+
+    def __init__(self, rate: float, window: float = 1.0) -> None:
+        self.rate, self.window = rate, window
+        self._times: deque[float] = deque()
+        self._begun: float | None = None
+
+    def tick(self, now: float) -> float:
+        """Count a tick; return the rate over the window [Hz], the nominal one until a window has passed."""
+        self._begun = now if self._begun is None else self._begun
+        self._times.append(now)
+        while self._times and self._times[0] <= now - self.window:
+            self._times.popleft()
+        if now - self._begun < self.window:
+            return self.rate
+        return len(self._times) / self.window
