@@ -16,13 +16,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.devices import to_struct, warp
+from brainbench.core.devices import pick_device, warp
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.engines.rod.limits import DOUBTFUL
-from brainbench.stimuli.engines.rod.packing import Shapes, Tracks, still_knots
+from brainbench.stimuli.engines.rod.launch import WhiskerSolver
+from brainbench.stimuli.engines.rod.limits import NOTHING
+from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
+from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.rod.sweeps import BLOCK, SweepLauncher
+from brainbench.stimuli.engines.trust import LARGEST_RESIDUAL
 from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.sweeps.grid import default_array
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
     from brainbench.stimuli.objects.collections import NamedObject
@@ -48,70 +53,28 @@ def free(
     links: int,
     steps: int,
     block: int,
-    most: int = 0,
     bounds: tuple[int, int] | None = None,
     precision: str = "single",
 ) -> None:
     """Whiskers that swing under gravity, nothing near: pure integration."""
-    wp = warp()
-    objects = resolve_objects(["torus-1"], surfaces=True)
-    scenes = SweepScenes(GRIDS["thesis-low"], {name: item.load for name, item in objects.items()})
     step = 1e-4
-    launcher = SweepLauncher(scenes, Fidelity(links=links, time_step=step, precision=precision), device_name, 0, bounds)
-    kernels, device, real = launcher.kernels, launcher.device, launcher.real
-    tracks, shapes = Tracks(), Shapes()
-    tracks.add(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])), 0.0, 1.0)
+    fidelity = Fidelity(links=links, time_step=step, precision=precision)
+    chains = [build_chain(mount.whisker, links) for mount in default_array("mouse")]
+    solver = WhiskerSolver(chains, fidelity, pick_device(device_name), NOTHING, block=block, bounds=bounds)
+    motions, shapes = PackedMotions(), PackedShapes()
+    motions.add(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])), 0.0, 1.0)
     shapes.first.append(0)
-    which = np.sort(np.arange(lanes, dtype=np.int32) % len(launcher.steps))
-    zeros = np.zeros(lanes, dtype=np.int32)
-    lane = {
-        "whisker": which,
-        "scene": zeros,
-        "base": zeros,
-        "step": np.full(lanes, step * 1e3),
-        "row": zeros,
-        "column": zeros,
-        "load_first": np.zeros(lanes + 1, dtype=np.int32),
-        "load_link": np.zeros(0, dtype=np.int32),
-        "load_share": np.zeros(0),
-        "load_force": np.zeros((0, 3)),
-        "load_stop": np.zeros(0),
-    }
-    out = kernels.structs.ResultArrays()
-    out.wrench = wp.zeros((1, 1, 1, 6), dtype=real, device=device)
-    out.contact = wp.zeros((1, 1, 1), dtype=real, device=device)
-    out.points, out.contact_wrench = (wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2))
-    out.depth, out.failed, out.miss, out.load = (wp.zeros(lanes, dtype=real, device=device) for _ in range(4))
-    for name in ("status", "steps", "touching", "crowded", "unsolved"):
-        setattr(out, name, wp.zeros(lanes, dtype=wp.int32, device=device))
-    options = kernels.structs.StepOptions()
-    options.gravity = kernels.structs.vec3(0.0, 0.0, -9.81e-3)
-    options.axes = kernels.structs.mat33(*np.eye(3).ravel().tolist())
-    readings = wp.array([steps * step * 1e3], dtype=real, device=device)
-    inputs = [
-        launcher._chains,
-        to_struct(kernels.structs.MotionArrays, tracks.arrays(), device),
-        to_struct(kernels.structs.ShapeArrays, shapes.arrays(), device),
-        to_struct(kernels.structs.JobArrays, lane, device),
-        options,
-        readings,
-        out,
-        kernels.structs.ContactProblems(),
-        kernels.structs.PausedWhiskers(),
-    ]
-
-    def once() -> None:
-        # The kernel goes on counting where it finds a count.
-        out.steps.zero_()
-        wp.launch(kernels.run, lanes, inputs, device=device, block_dim=block, max_blocks=most)
-
-    seconds = timed(wp, device, once)
-    done = int(out.steps.numpy().astype(np.int64).sum())
-    bad = int((out.status.numpy() != 0).sum())
+    which, zeros = np.sort(np.arange(lanes, dtype=np.int32) % len(chains)), np.zeros(lanes, dtype=np.int32)
+    jobs = PackedJobs(which, zeros, zeros, np.arange(lanes, dtype=np.int32), zeros)
+    kernels = []
+    for _ in range(4):
+        result = solver.launch(jobs, motions, shapes, np.array([steps * step]), (lanes, 1), gravity=(0.0, 0.0, -9.81))
+        kernels.append(result.seconds["kernel"])
+    seconds = statistics.median(kernels[1:])
     print(
-        f"free  N={links} {precision} lanes={lanes} block={block} blocks={most or 'all'} bounds={bounds}: "
-        f"{done / seconds:.3e} whisker-steps/s "
-        f"({seconds:.3f} s, {bad} failed)",
+        f"free  N={links} {precision} lanes={lanes} block={block} bounds={bounds}: "
+        f"{int(result.steps.astype(np.int64).sum()) / seconds:.3e} whisker-steps/s "
+        f"({seconds:.3f} s, {int((result.counts['status'] != 0).sum())} failed)",
         flush=True,
     )
 
@@ -124,8 +87,6 @@ def peer(device_name: str, worlds: int, links: int, steps: int) -> None:
     from brainbench.stimuli.engines.mujoco.model import build_model
     from brainbench.stimuli.engines.protocol import Job, StillFollicle
     from brainbench.stimuli.engines.reach import reachable
-    from brainbench.stimuli.sweeps.grid import default_array
-    from brainbench.stimuli.whiskers.chain import build_chain
 
     wp = warp()
     whisker = next(mount.whisker for mount in default_array("mouse") if mount.name == "C2")
@@ -180,7 +141,7 @@ def sweep(
     loaded = time.perf_counter() - started
     scenes = SweepScenes(GRIDS[recipe], objects)
     launcher = SweepLauncher(scenes, fidelity, device_name, sliced=sliced)
-    launcher.tuning = tuning or {}
+    launcher.solver.tuning = tuning or {}
     groups = [(name, scenes.grid.sweeps(name)[: max(1, sweeps // len(objects))]) for name in scenes.objects]
     launcher.launch(groups[:1])
     started = time.perf_counter()
@@ -200,7 +161,7 @@ def sweep(
     wp.synchronize_device(launcher.device)
     seconds = time.perf_counter() - started
     count = sum(len(some) for _, some in groups)
-    steps, full = int(result.steps.astype(np.int64).sum()), result.steps_in_full
+    steps, full = int(result.steps.astype(np.int64).sum()), launcher.steps_in_full(count)
     # Delivered: every whisker at every time step of the recording, as a solver without skipping would compute them.
     print(
         f"sweep {recipe} {count} sweeps of {len(objects)} objects, {fidelity.links} links, "
@@ -208,15 +169,18 @@ def sweep(
         f"(kernels {launcher.seconds.get('kernel', float('nan')):.2f} s); whisker-steps/s computed "
         f"{steps / seconds:.3e}, delivered {full / seconds:.3e} (in kernels alone "
         f"{steps / launcher.seconds['kernel']:.3e}, {full / launcher.seconds['kernel']:.3e}); "
-        f"{1 - steps / full:.1%} of the steps saved, {result.touching.sum() / max(steps, 1):.1%} of the others in "
+        f"{1 - steps / full:.1%} of the steps saved, {result.counts['touching'].sum() / max(steps, 1):.1%} of the
+        others in "
         f"contact; {count / seconds:.0f} sweeps/s: 159,696 in {159696 / count * seconds:.0f} s, 2,076,048 in "
         f"{2076048 / count * seconds / 60:.1f} min (objects made before, in {loaded:.1f} s, not counted)",
         flush=True,
     )
     print(
-        f"      tuning {tuning}; {launcher.slices} slices, most steps {result.steps.max()}; failed "
-        f"{int((result.status != 0).sum())}, unsolved steps {int(result.unsolved.sum())}, doubtful "
-        f"{int((result.doubt > DOUBTFUL).sum())}; phases { ({k: round(v, 3) for k, v in launcher.seconds.items()}) }",
+        f"      tuning {tuning}; {launcher.solver.slices} slices, most steps {result.steps.max()}; failed "
+        f"{int((result.counts['status'] != 0).sum())}, unsolved steps {int(result.counts['unsolved'].sum())}, large
+        residual "
+        f"{int((result.residual > LARGEST_RESIDUAL).sum())}; phases { ({k: round(v, 3) for k, v in
+        launcher.seconds.items()}) }",
         flush=True,
     )
 
@@ -240,7 +204,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--only", default="free,peer,sweep")
     parser.add_argument("--lanes", type=int, default=262_144)
-    parser.add_argument("--blocks", default=f"{BLOCK}:0", help="block size : most blocks (0 = all), several by commas")
+    parser.add_argument("--blocks", default=str(BLOCK), help="threads of a block, several by commas")
     parser.add_argument("--bounds", default="0", help="CUDA launch bounds such as 64x6, several by commas; 0 = none")
     parser.add_argument("--objects", default="procedural-24:2")
     parser.add_argument("--sweeps", type=int, default=768)
@@ -258,10 +222,10 @@ def main() -> None:
     if "free" in chosen:
         for links in (10, 20):
             for pair in args.blocks.split(","):
-                block, most = map(int, pair.split(":"))
+                block = int(pair)
                 for words in args.bounds.split(","):
                     bounds = None if words == "0" else tuple(map(int, words.split("x")))
-                    free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, most, bounds)
+                    free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, bounds)
     if "peer" in chosen:
         for links in (10, 20):
             peer(args.device, 16 if small else 32_768, links, 20)
