@@ -169,18 +169,16 @@ def sweep(
         f"(kernels {launcher.seconds.get('kernel', float('nan')):.2f} s); whisker-steps/s computed "
         f"{steps / seconds:.3e}, delivered {full / seconds:.3e} (in kernels alone "
         f"{steps / launcher.seconds['kernel']:.3e}, {full / launcher.seconds['kernel']:.3e}); "
-        f"{1 - steps / full:.1%} of the steps saved, {result.counts['touching'].sum() / max(steps, 1):.1%} of the
-        others in "
-        f"contact; {count / seconds:.0f} sweeps/s: 159,696 in {159696 / count * seconds:.0f} s, 2,076,048 in "
+        f"{1 - steps / full:.1%} of the steps saved, {result.counts['touching'].sum() / max(steps, 1):.1%} of the "
+        f"others in contact; {count / seconds:.0f} sweeps/s: 159,696 in {159696 / count * seconds:.0f} s, 2,076,048 in "
         f"{2076048 / count * seconds / 60:.1f} min (objects made before, in {loaded:.1f} s, not counted)",
         flush=True,
     )
     print(
         f"      tuning {tuning}; {launcher.solver.slices} slices, most steps {result.steps.max()}; failed "
-        f"{int((result.counts['status'] != 0).sum())}, unsolved steps {int(result.counts['unsolved'].sum())}, large
-        residual "
-        f"{int((result.residual > LARGEST_RESIDUAL).sum())}; phases { ({k: round(v, 3) for k, v in
-        launcher.seconds.items()}) }",
+        f"{int((result.counts['status'] != 0).sum())}, unsolved steps {int(result.counts['unsolved'].sum())}, "
+        f"large residual {int((result.residual > LARGEST_RESIDUAL).sum())}; "
+        f"phases { ({k: round(v, 3) for k, v in launcher.seconds.items()}) }",
         flush=True,
     )
 
