@@ -31,10 +31,10 @@ def run(scenes: SweepScenes, picked: dict[str, list[Any]], fidelity: Fidelity) -
     results = [launcher.launch([(name, sweeps)]) for name, sweeps in picked.items()]
     spent = time.process_time() - started
     return {
-        "wrench": np.concatenate([result.wrench.numpy() for result in results]),
-        "flagged": np.concatenate([result.unstable for result in results]),
+        "wrench": np.concatenate([result.wrench for result in results]),
+        "flagged": np.concatenate([result.verdict.unstable for result in results]),
         "steps": int(sum(result.steps.sum() for result in results)),
-        "touching": int(sum(result.touching.sum() for result in results)),
+        "touching": int(sum(result.counts["touching"].sum() for result in results)),
         "seconds": spent,
     }
 

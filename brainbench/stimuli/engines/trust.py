@@ -163,7 +163,7 @@ def run_with_retries(simulate: Callable[[NDArray[np.bool_] | None, int], Result]
     """
     result = simulate(None, 1)
     for finer in (retry, 2 * retry) if retry > 1 else ():
-        left = result.verdict.retryable
+        left = result.verdict.retryable.copy()
         if not left.any():
             break
         result = result.replaced(left, simulate(left, finer))
