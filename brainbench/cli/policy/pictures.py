@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from brainbench.cli.tactile import figures
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,7 +27,6 @@ HOT, BALL, WOOD = (0.86, 0.30, 0.22), (0.62, 0.72, 0.86), (0.93, 0.90, 0.85)
 VIEWS = {"hot_ball": (-0.8, -0.9, 1.3), "screwdriver": (-0.9, 0.9, 0.45)}
 """Direction from the scene to the camera, by task."""
 _VIEW = (0.85, -0.75, 0.95)
-_SAMPLES = 2
 
 
 class Stage:
@@ -37,12 +39,10 @@ class Stage:
     """
 
     def __init__(self, env: Env, size: tuple[int, int] = (480, 400), number: int = 0) -> None:
-        from brainbench.cli.tactile.figures import SKIN, _solid
         from brainbench.stimuli.figures.camera import Camera
 
         self._env, self._number = env, number
         self._scene = env.simulation.engine.scene
-        still = np.array([0.0, 0, 0, 0, 0, 0, 1])
         self._parts: list[tuple[int, Any]] = []
         focus = []
         for index in range(len(self._scene.geometries)):
@@ -51,39 +51,25 @@ class Stage:
             held = geometry.link in env.model.objects
             if (held and max(geometry.size) < 1e-3) or geometry.kind == "plane":
                 continue
-            solid = _solid(geometry, still, WOOD if link == 0 else SKIN)
+            solid = figures.surface(geometry, WOOD if link == 0 else figures.SKIN)
             if held:
-                solid = _coloured(solid, self._object_colors(geometry.link, solid))
+                solid = replace(solid, colors=self._object_colors(geometry.link, solid))
             self._parts.append((link, solid))
-            focus.append(self._placed(link, solid, self._pose()).corners.reshape(-1, 3))
+            focus.append(figures.placed(solid, self._pose()[link]).corners.reshape(-1, 3))
         points = np.concatenate(focus)
-        self._lens = Camera(view=VIEWS.get(env.task.name, _VIEW)).lens(points, size).supersampled(_SAMPLES)
-        self._size = size
+        self._lens = Camera(view=VIEWS.get(env.task.name, _VIEW)).lens(points, size).supersampled(figures.SAMPLES)
 
     def frame(self) -> NDArray[np.uint8]:
         """Return the picture [H, W, 3] of this moment."""
-        from brainbench.stimuli.figures.raster import Triangles, draw
-        from brainbench.stimuli.figures.shading import lamp, paint, shade
+        from brainbench.stimuli.figures.raster import Triangles
 
         pose = self._pose()
-        everything = Triangles.joined([self._placed(link, solid, pose) for link, solid in self._parts])
-        light = lamp(self._lens, _SAMPLES, everything.corners.reshape(-1, 3), everything)
-        image = np.ones((self._lens.size[1], self._lens.size[0], 3))
-        layer = draw(everything, self._lens)
-        paint(layer, shade(layer, self._lens, light, gloss=0.05, bias=8.0), image)
-        width, height = self._size
-        image = image.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
-        return (255 * np.clip(image, 0, 1)).astype(np.uint8)
+        solids = Triangles.joined([figures.placed(solid, pose[link]) for link, solid in self._parts])
+        image, _, _ = figures.shaded(solids, self._lens, 0.05)
+        return (255 * figures.averaged(image)).astype(np.uint8)
 
     def _pose(self) -> NDArray[np.float64]:
         return self._env.simulation.state.pose_torch[self._number].cpu().numpy().astype(float)
-
-    def _placed(self, link: int, solid: Any, pose: NDArray[np.float64]) -> Any:
-        from brainbench.cli.tactile.figures import _turn
-        from brainbench.stimuli.figures.raster import Triangles
-
-        turn = _turn(pose[link, 3:])
-        return Triangles(solid.corners @ turn.T + pose[link, :3], solid.normals @ turn.T, solid.colors)
 
     def _object_colors(self, link: str, solid: Any) -> NDArray[np.float64]:
         if len(self._env.model.objects) > 1:
@@ -93,12 +79,6 @@ class Stage:
         axis = np.abs(normal).argmax(axis=1)
         sign = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0
         return FACES[2 * axis + sign]
-
-
-def _coloured(solid: Any, colors: NDArray[np.float64]) -> Any:
-    from brainbench.stimuli.figures.raster import Triangles
-
-    return Triangles(solid.corners, solid.normals, colors)
 
 
 def write_video(
@@ -116,24 +96,13 @@ def write_video(
 
 def write_strip(path: Path, frames: Sequence[NDArray[np.uint8]], times: Sequence[float]) -> None:
     """Write a PNG of frames side by side, each with its time (s)."""
-    from brainbench.cli.tactile.figures import _pyplot, _save
-
-    pyplot = _pyplot()
     height, width = frames[0].shape[:2]
     scale = 2.2
-    figure, axes = pyplot.subplots(
+    figure, axes = figures.pyplot().subplots(
         1, len(frames), figsize=(scale * len(frames) * width / height, scale), squeeze=False, layout="constrained"
     )
     for ax, frame, time in zip(axes[0], frames, times, strict=True):
         ax.imshow(frame)
         ax.set_title(f"{time:.1f} s", fontsize=8)
         ax.set_axis_off()
-    _save(figure, path)
-
-
-def film(env: Env, act: Any, stage: Stage, steps: int, every: int) -> Iterator[NDArray[np.uint8]]:
-    """Run an agent and yield a frame at every so many control steps."""
-    for step in range(steps):
-        if step % every == 0:
-            yield stage.frame()
-        env.step(act(env.observations))
+    figures.save(figure, path)

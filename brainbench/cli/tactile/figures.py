@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.core.errors import missing_dependency
 from brainbench.core.files import atomic_path
+from brainbench.core.rotations import to_matrices
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -15,70 +17,78 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from brainbench.stimuli.figures.camera import Lens
+    from brainbench.stimuli.figures.raster import Triangles
+
 SIZE = (1100, 900)
 SKIN, OBJECT = (0.80, 0.82, 0.86), (0.95, 0.75, 0.45)
-_SAMPLES = 2
+SAMPLES = 2
+"""Samples of a pixel along each axis."""
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Return matplotlib's pyplot, which draws into files alone.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
     try:
         import matplotlib as mpl
     except ImportError as error:
         raise missing_dependency("matplotlib", extra="report", purpose="Pictures") from error
     mpl.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot as plots
 
-    return pyplot
+    return plots
 
 
-def _save(figure: Any, path: Path) -> None:
+def save(figure: Any, path: Path) -> None:
+    """Write a figure and forget it."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=110)
-    _pyplot().close(figure)
+    pyplot().close(figure)
 
 
-def _turn(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix of a quaternion (x, y, z, w)."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def link_rotation(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrix of a link's pose [7], a transform (x, y, z, qx, qy, qz, qw)."""
+    return to_matrices(np.roll(pose[3:], 1))
 
 
-def _solid(geometry: Any, pose: NDArray[np.float64], color: tuple[float, float, float]) -> Any:
-    """Return the triangles of one geometry in the world."""
-    from trimesh import creation
-
-    from brainbench.geometry import Mesh
+def surface(geometry: Any, color: tuple[float, float, float]) -> Triangles:
+    """Return the triangles of a geometry in the frame of its link; a plane has none."""
     from brainbench.stimuli.figures.raster import Triangles
     from brainbench.stimuli.figures.surfaces import corner_normals
+    from robotics_bridge.sensors.queries.solids import tessellate
 
-    size = geometry.size
-    if geometry.kind == "sphere":
-        solid = creation.icosphere(subdivisions=4, radius=size[0])
-    elif geometry.kind == "capsule":
-        solid = creation.capsule(height=2 * size[1], radius=size[0], count=[32, 32])
-        solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
-    elif geometry.kind == "cylinder":
-        solid = creation.cylinder(radius=size[0], height=2 * size[1], sections=48)
-    elif geometry.kind == "box":
-        solid = creation.box(extents=[2 * value for value in size[:3]])
-    elif geometry.kind == "mesh" and geometry.mesh is not None:
-        solid = geometry.mesh
-    else:
+    if geometry.kind == "plane":
         return Triangles.joined([])
-    mesh = Mesh(np.asarray(solid.vertices, dtype=float), np.asarray(solid.faces, dtype=np.int64))
-    w, x, y, z = geometry.quaternion
-    inner, outer = _turn(np.array([x, y, z, w])), _turn(pose[3:])
-    rotation = outer @ inner
-    place = pose[:3] + outer @ np.array(geometry.position)
-    corners = mesh.vertices[mesh.faces] @ rotation.T + place
-    colors = np.broadcast_to(np.array(color), (len(corners), 3))
-    return Triangles(corners, corner_normals(mesh) @ rotation.T, colors)
+    mesh, rotation = tessellate(geometry), to_matrices(geometry.quaternion)
+    corners = mesh.vertices[mesh.faces] @ rotation.T + np.array(geometry.position)
+    return Triangles(corners, corner_normals(mesh) @ rotation.T, np.broadcast_to(np.array(color), (len(corners), 3)))
+
+
+def placed(solid: Triangles, pose: NDArray[np.float64]) -> Triangles:
+    """Return triangles of a link in the world."""
+    turn = link_rotation(pose)
+    return replace(solid, corners=solid.corners @ turn.T + pose[:3], normals=solid.normals @ turn.T)
+
+
+def shaded(solids: Triangles, lens: Lens, gloss: float) -> tuple[NDArray[np.float64], Any, Any]:
+    """Draw triangles on white through a supersampled lens; return picture [H, W, 3], layer and light."""
+    from brainbench.stimuli.figures.raster import draw
+    from brainbench.stimuli.figures.shading import lamp, paint, shade
+
+    light = lamp(lens, SAMPLES, solids.corners.reshape(-1, 3), solids)
+    image = np.ones((lens.size[1], lens.size[0], 3))
+    layer = draw(solids, lens)
+    paint(layer, shade(layer, lens, light, gloss=gloss, bias=8.0), image)
+    return image, layer, light
+
+
+def averaged(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a supersampled picture [H, W, 3] at its own size, from 0 to 1."""
+    height, width = (size // SAMPLES for size in image.shape[:2])
+    return np.clip(image.reshape(height, SAMPLES, width, SAMPLES, 3).mean(axis=(1, 3)), 0, 1)
 
 
 def draw_forces(
@@ -91,21 +101,19 @@ def draw_forces(
     """Draw a hand with its taxels coloured by force, and arrows along the force (link frame)."""
     from brainbench.stimuli.figures.camera import Camera
     from brainbench.stimuli.figures.raster import Triangles, draw
-    from brainbench.stimuli.figures.shading import lamp, paint, shade
+    from brainbench.stimuli.figures.shading import shade
     from brainbench.stimuli.figures.surfaces import ball, tube
 
-    pyplot = _pyplot()
+    plots = pyplot()
     peak = max(float(np.linalg.norm(force, axis=1).max()) for force in readings.values()) or 1e-9
     hand, held, marks = [], [], []
     for geometry in scene.geometries:
-        where = pose[scene.link_index(geometry.link)]
-        (held if geometry.link == "object" else hand).append(
-            _solid(geometry, where, OBJECT if geometry.link == "object" else SKIN)
-        )
-    palette = pyplot.get_cmap("inferno")
+        kept, color = (held, OBJECT) if geometry.link == "object" else (hand, SKIN)
+        kept.append(placed(surface(geometry, color), pose[scene.link_index(geometry.link)]))
+    palette = plots.get_cmap("inferno")
     for link, item in probes.items():
         where = pose[scene.link_index(link)]
-        turn = _turn(where[3:])
+        turn = link_rotation(where)
         world, normal = item.position @ turn.T + where[:3], item.normal @ turn.T
         force = readings[link] @ turn.T
         for index in np.flatnonzero(item.active):
@@ -122,30 +130,26 @@ def draw_forces(
     solid, shown, seen = Triangles.joined(hand), Triangles.joined(marks), Triangles.joined(held)
     camera = Camera(view=(0.95, -0.55, 0.75))
     lens = camera.lens(np.concatenate([solid.corners.reshape(-1, 3), seen.corners.reshape(-1, 3)]), SIZE)
-    fine = lens.supersampled(_SAMPLES)
-    everything = Triangles.joined([solid, shown])
-    light = lamp(fine, _SAMPLES, everything.corners.reshape(-1, 3), everything)
-    image = np.ones((fine.size[1], fine.size[0], 3))
-    layer = draw(everything, fine)
-    paint(layer, shade(layer, fine, light, gloss=0.08, bias=8.0), image)
+    fine = lens.supersampled(SAMPLES)
+    image, layer, light = shaded(Triangles.joined([solid, shown]), fine, 0.08)
     veil = draw(seen, fine)
     front = veil.nearness.reshape(-1)[veil.pixels] > layer.nearness.reshape(-1)[veil.pixels]
     colors = shade(veil, fine, light)
     flat = image.reshape(-1, 3)
     flat[veil.pixels[front]] = 0.24 * colors[front] + 0.76 * flat[veil.pixels[front]]
-    image = image.reshape(lens.size[1], _SAMPLES, lens.size[0], _SAMPLES, 3).mean(axis=(1, 3))
-    image = _trimmed(np.clip(image, 0, 1))
+    image = _trimmed(averaged(image))
     inches = image.shape[1] / 110, image.shape[0] / 110 + 0.75
-    figure = pyplot.figure(figsize=inches)
+    figure = plots.figure(figsize=inches)
     axes = figure.add_axes((0, 0.75 / inches[1], 1, 1 - 0.75 / inches[1]))
     axes.imshow(image)
     axes.set_axis_off()
-    scale = pyplot.cm.ScalarMappable(pyplot.Normalize(0, peak), _part(palette))
+    part = plots.matplotlib.colors.ListedColormap(palette(np.linspace(0.15, 0.9, 256)))
+    scale = plots.cm.ScalarMappable(plots.Normalize(0, peak), part)
     bar = figure.colorbar(
         scale, cax=figure.add_axes((0.3, 0.55 / inches[1], 0.4, 0.14 / inches[1])), orientation="horizontal"
     )
     bar.set_label("force on a taxel (N); arrows push on the skin; blue taxels feel nothing", labelpad=2)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64]:
@@ -159,16 +163,10 @@ def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64
     return image[spans[0], spans[1]]
 
 
-def _part(palette: Any) -> Any:
-    from matplotlib.colors import ListedColormap
-
-    return ListedColormap(palette(np.linspace(0.15, 0.9, 256)))
-
-
 def draw_markers(path: Path, rest: NDArray[np.float64], fields: Mapping[str, NDArray[np.float64]]) -> None:
     """Draw marker displacements [N, 3] (m) from their places at rest [N, 3], one panel per motion."""
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(1, len(fields), figsize=(11, 4.1), layout="constrained")
+    plots = pyplot()
+    figure, axes = plots.subplots(1, len(fields), figsize=(11, 4.1), layout="constrained")
     bulge = max(float(np.abs(field[:, 2]).max()) for field in fields.values()) or 1.0
     places = None
     for panel, (name, field) in zip(axes, fields.items(), strict=True):
@@ -183,7 +181,7 @@ def draw_markers(path: Path, rest: NDArray[np.float64], fields: Mapping[str, NDA
         panel.set(title=f"{name}: up to {1e3 * largest:.2g} mm", xlabel="x (mm)", aspect="equal")
     axes[0].set_ylabel("y (mm)")
     figure.colorbar(places, ax=axes, label="bulge (of the largest)", shrink=0.8)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_temperature(
@@ -194,8 +192,8 @@ def draw_temperature(
     maps: Mapping[str, NDArray[np.float64]],
 ) -> None:
     """Draw the warmest cell over time, and for each material the warmest value along one axis (°C)."""
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(
+    plots = pyplot()
+    figure, axes = plots.subplots(
         1, 1 + len(maps), figsize=(12, 3.4), layout="constrained", width_ratios=[1.5] + [1] * len(maps)
     )
     colors = dict(zip(lines, ("#c1440e", "#2b6cb0", "#4a7c3a"), strict=False))
@@ -209,7 +207,7 @@ def draw_temperature(
     top = max(float(field.max()) for field in maps.values())
     bottom = min(float(field.min()) for field in maps.values())
     # The eye has to tell a tenth of a degree under wood from ten degrees under metal.
-    scale = pyplot.matplotlib.colors.PowerNorm(0.35, bottom, top)
+    scale = plots.matplotlib.colors.PowerNorm(0.35, bottom, top)
     shown = None
     for panel, (name, field) in zip(axes[1:], maps.items(), strict=True):
         seen = field.max(axis=0).T
@@ -220,15 +218,15 @@ def draw_temperature(
     bar = figure.colorbar(shown, ax=axes[1:], label="°C", shrink=0.85)
     bar.set_ticks([bottom, *(bottom + share * (top - bottom) for share in (0.02, 0.1, 0.3, 0.6)), top])
     bar.ax.yaxis.set_major_formatter("{x:.1f}")
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: float) -> None:
     """Draw spectrograms of signals [T] at a sample rate (Hz)."""
     from scipy.signal import spectrogram
 
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(1, len(signals), figsize=(12, 3.8), layout="constrained", sharey=True)
+    plots = pyplot()
+    figure, axes = plots.subplots(1, len(signals), figsize=(12, 3.8), layout="constrained", sharey=True)
     shown = None
     for panel, (name, signal) in zip(axes, signals.items(), strict=True):
         frequency, time, power = spectrogram(signal, rate, nperseg=1024, noverlap=896)
@@ -237,4 +235,4 @@ def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: flo
         panel.set(title=f"ball on {name}", xlabel="time (s)")
     axes[0].set_ylabel("frequency (kHz)")
     figure.colorbar(shown, ax=axes, label="dB", shrink=0.9)
-    _save(figure, path)
+    save(figure, path)

@@ -35,11 +35,11 @@ def keep_still() -> tasks.Task:
 
 
 def test_a_task_of_ones_own_is_one_file(tmp_path: Path) -> None:
-    from brainbench.cli.policy.options import read_task_file
+    from brainbench.core.plugins import load_module
 
     file = tmp_path / "keep_still.py"
     file.write_text(MY_TASK)
-    read_task_file(file)
+    load_module(str(file))
     try:
         assert "keep_still" in tasks.list_tasks()
         env = tasks.make("keep_still", num_envs=2, threads=1)
@@ -47,7 +47,7 @@ def test_a_task_of_ones_own_is_one_file(tmp_path: Path) -> None:
         assert set(observations) == {"proprio", "priv_proprio", "priv_obj_state"}
         assert (reward <= 0).all()
         with pytest.raises(UsageError, match="already"):
-            read_task_file(file)
+            load_module(str(file))
     finally:
         tasks.forget("keep_still")
     assert "keep_still" not in tasks.list_tasks()

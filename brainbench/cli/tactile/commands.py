@@ -1,0 +1,193 @@
+"""``brainbench tactile demo | layouts | bench | check | calibrate``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
+from brainbench.cli.policy.options import HandOption
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path("tactile-demo"),
+    hand: HandOption = "xhand1",
+    resolution: Annotated[str, typer.Option(help="low, med or high.")] = "high",
+    noisy: Annotated[bool, typer.Option("--noisy", help="Draw measured readings with the published noise.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Let a hand close around a warm ball and draw what it feels.
+
+    Four pictures: forces on the taxels, marker motion of an elastomer, temperature of the finger tips, and the sound
+    of a ball on wood, metal and glass.
+    """
+    from brainbench.cli.tactile import scenes
+
+    jobs = {
+        "forces": lambda path: scenes.forces(path, hand, resolution, noisy=noisy),
+        "markers": lambda path: scenes.markers(path, noisy=noisy),
+        "temperature": lambda path: scenes.temperature(path, hand),
+        "sound": scenes.sound,
+    }
+    made: dict[str, Any] = {}
+    with progress_bar() as progress:
+        for index, (name, job) in enumerate(jobs.items()):
+            progress(index, len(jobs), f"drawing {name}")
+            path = out / f"tactile-{name}.png"
+            made[name] = {"picture": path, **job(path)}
+        progress(len(jobs), len(jobs), "drawing")
+
+    def shown(item: dict[str, Any]) -> str:
+        return ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture")
+
+    emit(made, table_of("", made.values(), {"picture": "{0[picture]}", "shows": shown}), as_json=as_json)
+
+
+def layouts(
+    hand: Annotated[str, typer.Argument(help="xhand1, sharpa, or a URDF or MJCF file.")] = "xhand1",
+    probes: Annotated[Path | None, typer.Option(help="Probe file (published JSON form) to show instead.")] = None,
+    links: Annotated[bool, typer.Option("--links", help="Also list every link.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the layouts as probe files here.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Count the probes of a hand by resolution and placement, as table 4.11 of the thesis does."""
+    from robotics_bridge import hands
+
+    chosen = hands.load(hand)
+    resolutions: tuple[str, ...] = hands.RESOLUTIONS
+    if probes is not None:
+        chosen, resolutions = chosen.with_probes(probes), ("custom",)
+    counts, rows, detail = {}, [], []
+    for resolution in resolutions:
+        layout = {place: chosen.layout(resolution, place) for place in hands.PLACEMENTS}
+        counts[resolution] = {place: hands.active_count(layout[place]) for place in hands.PLACEMENTS}
+        rows.append([resolution, *(str(counts[resolution][place]) for place in hands.PLACEMENTS)])
+        for link, item in layout["hand"].items():
+            shape = " × ".join(map(str, item.shape))
+            radius = sorted({f"{1e3 * value:g}" for value in item.radius[item.active]})
+            detail.append([resolution, link, shape, str(int(item.active.sum())), ", ".join(radius)])
+        if out is not None:
+            hands.write_probes(out / f"{chosen.name}_{resolution}.json", layout["hand"])
+    text = table(f"{chosen.name}: {len(chosen.joints)} joints, {len(chosen.fingers)} fingers, palm {chosen.palm}",
+                 ["resolution", *hands.PLACEMENTS], rows, right=(1, 2, 3, 4))  # fmt: skip
+    if links:
+        text += "\n\n" + table("", ["resolution", "link", "grid", "active", "radius (mm)"], detail, right=(3,))
+    data = {
+        "hand": chosen.name,
+        "palm": chosen.palm,
+        "joints": chosen.joints,
+        "fingers": chosen.fingers,
+        "counts": counts,
+    }
+    emit(data, text, as_json=as_json)
+
+
+def bench(
+    hand: HandOption = "xhand1",
+    resolution: Annotated[str, typer.Option(help="low, med or high.")] = "med",
+    placement: Annotated[str, typer.Option(help="hand, fingers, tips or palm.")] = "hand",
+    envs: Annotated[int, typer.Option(help="Environments.")] = 256,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    noisy: Annotated[bool, typer.Option("--noisy", help="With the published noise of each sensor.")] = False,
+    repeats: Annotated[int, typer.Option(help="Timed updates; the median counts.")] = 20,
+    as_json: JsonOption = False,
+) -> None:
+    """Time one update of each sensor class on a hand that holds a ball, with the memory per environment.
+
+    The benchmark against peers and rooflines is benchmarks/tactile/throughput.py in the repository.
+    """
+    from brainbench.cli.tactile import scenes
+    from brainbench.core.errors import UsageError
+
+    if envs < 1 or repeats < 1:
+        raise UsageError(f"--envs and --repeats are at least 1; received {envs} and {repeats}.")
+    results = []
+    with progress_bar() as progress:
+        grip = scenes.Grip(hand, envs=envs, device=device)
+        grip.run(60)
+        for index, name in enumerate(scenes.CLASSES):
+            progress(index, len(scenes.CLASSES), "timing sensors")
+            results.append(scenes.time_class(grip, name, resolution, placement, noisy=noisy, repeats=repeats))
+        progress(len(scenes.CLASSES), len(scenes.CLASSES), "timing sensors")
+    noise = ", published noise" if noisy else ""
+    columns = {
+        "sensor": "{0[sensor]}",
+        ">probes": "{0[probes]}",
+        ">ms per update": lambda item: f"{1e3 * item['seconds']:.3f}",
+        ">ns per probe": "{0[per_probe_ns]:.1f}",
+        ">readings/s": lambda item: f"{envs / item['seconds']:,.0f}",
+        ">bytes/environment": "{0[state_bytes]:,}",
+    }
+    text = table_of(f"{hand}, {resolution} {placement}, {envs} environments on {device}{noise}", results, columns)
+    emit({"results": results, "envs": envs, "device": device}, text, as_json=as_json)
+
+
+def check(
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    as_json: JsonOption = False,
+) -> None:
+    """Compare sensors with closed forms on this machine; exit status 1 if one is off."""
+    from brainbench.cli.tactile.checks import CHECKS
+
+    results = []
+    with progress_bar() as progress:
+        for index, (name, run) in enumerate(CHECKS.items()):
+            progress(index, len(CHECKS), "checking")
+            found, truth, tolerance = run(device)
+            error = abs(found - truth) / max(abs(truth), 1e-30)
+            results.append(
+                {"check": name, "found": found, "truth": truth, "error": error, "passed": error <= tolerance}
+            )
+        progress(len(CHECKS), len(CHECKS), "checking")
+    columns = {
+        "check": "{0[check]}",
+        ">found": "{0[found]:.6g}",
+        ">truth": "{0[truth]:.6g}",
+        ">relative error": "{0[error]:.1e}",
+        "": lambda item: "ok" if item["passed"] else "OFF",
+    }
+    emit({"device": device, "checks": results}, table_of(f"Checks on {device}", results, columns), as_json=as_json)
+    if not all(result["passed"] for result in results):
+        raise typer.Exit(1)
+
+
+def calibrate(
+    log: Annotated[Path, typer.Argument(help="CSV with 'time' (s), probes, and optionally 'reference' and 'episode'.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the preset here (.json).")] = None,
+    max_delay: Annotated[float, typer.Option(help="Longest read delay that is tried (s).")] = 0.5,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit the noise model to a recording of a real device, with 95 % intervals, and write a preset.
+
+    'reference' holds the true signal in the sensor's unit (a load cell, a stage); without it the device was at rest.
+    Load the preset with robotics_bridge.sensors.Noise.load(path).
+    """
+    from brainbench.core.errors import UsageError
+    from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
+    from robotics_bridge.sensors.calibration.calibrate import describe, read_log
+
+    if not max_delay >= 0:
+        raise UsageError(f"--max-delay is zero or positive (s); received {max_delay:g}.")
+    found = fit(read_log(log), max_delay=max_delay)
+    if out is not None:
+        found.save(out, log=log.name)
+
+    def span(estimate: Any) -> str:
+        known = math.isfinite(estimate.low) and math.isfinite(estimate.high)
+        return f"{estimate.low:.4g} … {estimate.high:.4g}" if known else ""
+
+    columns = {
+        "knob": "{0[0]}",
+        ">value": "{0[1].value:.4g}",
+        "95 % interval": lambda item: span(item[1]),
+        "from": "{0[1].how}",
+    }
+    about = found.about
+    title = f"{log.name}: {len(about['probes'])} probes, {about['episodes']} episodes, {about['readings']} readings"
+    text = table_of(title, describe(found), columns)
+    text += "\n\n" + "\n".join(found.notes) + (f"\nWrote {out}." if out is not None else "")
+    data = {"noise": found.noise, "estimates": found.estimates, "notes": found.notes, "about": about}
+    emit({**data, "preset": out}, text, as_json=as_json)
