@@ -1,15 +1,14 @@
-"""The doctor for recordings: what is wrong with a file, worst first, before a score hides it.
+"""Checks of whole recordings: what is wrong with files, worst first, before a score hides it.
 
-:func:`check` reads spike times and tables of every session (no raw data) and applies each check of
-:mod:`brainbench.datasets.checks.spikes`, ``_check_tables``, ``_check_labels`` and ``_check_clock``.
-A finding is an *error* when results would be wrong, a *warning* when they may be, a *note* when it
-only has to be known.
+:func:`check` reads spike times and tables of every session (no raw data) and applies the checks of ``tables``,
+``labels``, ``spikes`` and ``clock``. A finding is an *error* when results would be wrong, a *warning* when they may be,
+a *note* when it only has to be known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from brainbench.core.errors import DataError
@@ -43,7 +42,7 @@ class Checkup:
         return next((level for level in SEVERITIES if self.count(level)), "ok")
 
     def count(self, severity: str) -> int:
-        """Number of findings of one severity."""
+        """Return the number of findings of one severity."""
         return sum(item.severity == severity for item in self.findings)
 
     def to_json(self) -> str:
@@ -83,11 +82,13 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
         try:
             findings += _check_file(path, layout, wanted, names)
         except DataError as error:
-            findings.append(Finding("error", "file", path.name, str(error)))
-    findings += _check_together(names)
-    order = sorted(range(len(findings)), key=lambda index: (SEVERITIES.index(findings[index].severity), index))
+            findings.append(Finding("error", "file", str(error), where=path.name))
+    for name in repeats(names):
+        message = f"{names.count(name)} files hold this session; its trials would count more than once"
+        findings.append(Finding("error", "file", message, "Leave all but one of them out.", where=name))
     shown = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
-    return Checkup(shown, len(paths), tuple(names), tuple(findings[index] for index in order))
+    worst_first = sorted(findings, key=lambda item: SEVERITIES.index(item.severity))
+    return Checkup(shown, len(paths), tuple(names), tuple(worst_first))
 
 
 def _check_file(
@@ -97,39 +98,32 @@ def _check_file(
         if hdf5.holds_counts(file, path):
             hdf5.read_counts(file, path)
             message = "holds responses that are already counted; spikes, clock and tables cannot be checked"
-            yield Finding("note", "file", path.name, message)
+            yield Finding("note", "file", message, where=path.name)
             return
         for session, found in each_session(file, path, layout):
-            name = f"{session.subject} / {session.session}"
-            names.append(name)
-            yield from check_session(session, found, conditions, name)
+            names.append(f"{session.subject} / {session.session}")
+            for finding in check_session(session, found, conditions):
+                yield replace(finding, where=names[-1])
 
 
 def check_session(
-    session: Session, layout: RecordingLayout | None = None, conditions: Conditions | None = None, where: str = ""
+    session: Session, layout: RecordingLayout | None = None, conditions: Conditions | None = None
 ) -> Iterator[Finding]:
     """Yield the findings about one session, which must still be open."""
-    where = where or f"{session.subject} / {session.session}"
     conditions = conditions or (layout.conditions if layout else None)
-    yield from check_tables(session, where)
-    yield from check_labels(session, layout, conditions, where)
+    yield from check_tables(session)
+    yield from check_labels(session, layout, conditions)
     if not has_units(session) or session.units is None:
-        yield Finding("error", "units", where, no_units(session))
+        yield Finding("error", "units", no_units(session))
         return
     notes: list[str] = []
     try:
         spikes = read_spikes(session.units, notes)
     except DataError as error:
-        yield Finding("error", "spikes", where, str(error))
+        yield Finding("error", "spikes", str(error))
         return
     for note in notes:
-        yield Finding("warning", "spikes", where, note, "Whoever wrote the file may have joined trials or probes.")
-    yield from check_spikes(session, spikes, where)
-    yield from check_coverage(session, spikes, layout, conditions, where)
-    yield from check_clock(session, spikes, layout, where)
-
-
-def _check_together(names: list[str]) -> Iterator[Finding]:
-    for name in repeats(names):
-        message = f"{names.count(name)} files hold this session; its trials would count more than once"
-        yield Finding("error", "file", name, message, "Leave all but one of them out.")
+        yield Finding("warning", "spikes", note, "Whoever wrote the file may have joined trials or probes.")
+    yield from check_spikes(session, spikes)
+    yield from check_coverage(session, spikes, layout, conditions)
+    yield from check_clock(session, spikes, layout)

@@ -42,13 +42,13 @@ _LONGEST = 12 * 3600.0
 
 
 def check_clock(
-    session: Session, spikes: list[NDArray[np.float64]], layout: RecordingLayout | None, where: str
+    session: Session, spikes: list[NDArray[np.float64]], layout: RecordingLayout | None
 ) -> Iterator[Finding]:
     """Yield what can be said about the clock of one session."""
     found = touches(session, layout)
     if found is None:
         message = "no touch times (tables contacts_by_whisker_*, or a layout's event), so the clock cannot be checked"
-        yield Finding("note", "clock", where, message, "Look at spike rates around a known event before scoring.")
+        yield Finding("note", "clock", message, "Look at spike rates around a known event before scoring.")
         return
     times, event = found
     every = np.concatenate(spikes) if spikes else np.zeros(0)
@@ -58,7 +58,7 @@ def check_clock(
     if len(times) < _FEWEST or len(every) < _FEWEST or span > _LONGEST:
         why = f"over {span / 3600:.0f} hours" if span > _LONGEST else "are too few"
         message = f"{len(times)} touches near the recording and {len(every)} spikes {why}: the clock was not checked"
-        yield Finding("warning", "clock", where, message)
+        yield Finding("warning", "clock", message)
         return
     lags, response, size = response_by_lag(every, times)
     at_touch = float(size[np.abs(lags) <= TOLERANCE].max())
@@ -76,16 +76,16 @@ def check_clock(
             f"spikes follow touch ({event}) by about {_seconds(lag)} s instead of 5 to 30 ms (response "
             f"{elsewhere:.0f} SD there, {at_touch:.1f} SD at the touch)"
         )
-        yield Finding("error", "clock", where, message, _advice(session, lag), values)
+        yield Finding("error", "clock", message, _advice(session, lag), values)
     elif at_touch >= PRESENT:
         message = f"spikes answer touch ({event}) within 5 to 30 ms ({at_touch:.1f} SD, {len(times)} touches)"
-        yield Finding("note", "clock", where, message, "", values)
+        yield Finding("note", "clock", message, "", values)
     else:
         message = (
             f"no response to touch ({event}) stands out at any lag within ±{-lags[0]:.0f} s ({at_touch:.1f} SD at "
             f"the touch); the clock cannot be confirmed"
         )
-        yield Finding("warning", "clock", where, message, "Few or untuned units, or a clock that drifts.", values)
+        yield Finding("warning", "clock", message, "Few or untuned units, or a clock that drifts.", values)
 
 
 def _other_lag(lags: NDArray[np.float64], size: NDArray[np.float64], at_touch: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""What a check of recordings says."""
+"""The form in which every check of recordings reports."""
 
 from __future__ import annotations
 
@@ -9,35 +9,37 @@ from typing import Any, Literal
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Worst first."""
+LONGEST_SESSION = 48 * 3600.0
+"""Times that span more than this (s) are no seconds."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found."""
+    """One fault that a check found."""
 
     severity: Severity
     check: str
-    """Which check: file, units, spikes, duplicates, refractory, silent, tables, times, labels, coverage, clock."""
-    where: str
-    """The session, or the file."""
+    """Name: file, units, spikes, duplicates, refractory, silent, tables, times, labels, coverage or clock."""
     message: str
-    """What was found, in numbers."""
+    """The fault, in numbers."""
     advice: str = ""
-    """What to do."""
+    """The remedy."""
     values: dict[str, Any] = field(default_factory=dict)
     """The measurements behind it, for programs."""
+    where: str = ""
+    """The session, or the file; filled in by the checkup."""
 
 
 def share(part: int, whole: int) -> str:
-    """Write a part of a whole for a message: ``"3 of 40 (8 %)"``."""
+    """Return a part of a whole for a message: ``"3 of 40 (8 %)"``."""
     return f"{part} of {whole} ({100 * part / max(whole, 1):.0f} %)"
 
 
 def repeats(names: list[str]) -> list[str]:
-    """Names that occur more than once, sorted."""
+    """Return the names that occur more than once, sorted."""
     return sorted(name for name, number in Counter(names).items() if number > 1)
 
 
 def some(names: list[str], limit: int = 5) -> str:
-    """Name the first few and say how many more there are."""
+    """Return the first few names and how many more there are."""
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets.checks.findings import Finding, Severity, repeats, share, some
+from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, repeats, share, some
 from brainbench.datasets.sessions import Session, as_labels
+from brainbench.datasets.trials.counting import recorded_span
 
 Spikes = list[NDArray[np.float64]]
 
@@ -22,57 +23,53 @@ VIOLATIONS, MANY_VIOLATIONS = 0.01, 0.1
 """Share of intervals below the refractory time in a unit that is not one neuron, or no neuron at all."""
 _FEWEST = 50
 """Spikes that a unit needs to be judged."""
-_LONGEST = 48 * 3600.0
 
 
-def check_spikes(session: Session, spikes: Spikes, where: str) -> Iterator[Finding]:
+def check_spikes(session: Session, spikes: Spikes) -> Iterator[Finding]:
     """Yield the findings about spike times [U] of one session."""
     ids = as_labels(session.units.ids()).tolist() if session.units is not None else []
     names = [f"unit {name}" for name in ids]
-    yield from _silent(spikes, names, where)
-    yield from _impossible(spikes, names, where)
-    yield from _refractory(spikes, names, where)
-    yield from _duplicates(spikes, names, where)
+    yield from _silent(spikes, names)
+    yield from _impossible(spikes, names)
+    yield from _refractory(spikes, names)
+    yield from _duplicates(spikes, names)
     if repeated := repeats(ids):
         message = f"{len(repeated)} unit ids occur more than once ({some(repeated)})"
-        yield Finding("warning", "units", where, message, "Fine for several probes; else units were merged wrongly.")
+        yield Finding("warning", "units", message, "Fine for several probes; else units were merged wrongly.")
 
 
-def _silent(spikes: Spikes, names: list[str], where: str) -> Iterator[Finding]:
+def _silent(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
     silent = [name for name, times in zip(names, spikes, strict=True) if not len(times)]
     if silent:
         message = f"{share(len(silent), len(names))} units have no spike ({some(silent)})"
         yield Finding(
             "error" if len(silent) == len(names) else "note",
             "silent",
-            where,
             message,
             "They are left out unless the selection says otherwise.",
             {"silent": len(silent), "units": len(names)},
         )
 
 
-def _impossible(spikes: Spikes, names: list[str], where: str) -> Iterator[Finding]:
-    heard = [times for times in spikes if len(times)]
-    if not heard:
+def _impossible(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
+    span = recorded_span(spikes)
+    if span is None:
         return
-    low, high = min(float(times[0]) for times in heard), max(float(times[-1]) for times in heard)
+    low, high = span
     if low < 0:
         early = [name for name, times in zip(names, spikes, strict=True) if len(times) and times[0] < 0]
         message = f"{share(len(early), len(names))} units have spikes before the session began (first at {low:.3f} s)"
-        yield Finding("warning", "times", where, message, "Was a starting time subtracted twice?", {"first": low})
-    whole = all(np.all(times == np.round(times)) for times in heard)
-    if whole and sum(map(len, heard)) >= _FEWEST:
+        yield Finding("warning", "times", message, "Was a starting time subtracted twice?", {"first": low})
+    whole = all(np.all(times == np.round(times)) for times in spikes)
+    if whole and sum(map(len, spikes)) >= _FEWEST:
         message = f"all spike times are whole numbers, up to {high:g}"
-        yield Finding(
-            "error", "times", where, message, "They look like samples, not seconds: divide by the sampling rate."
-        )
-    elif high - low > _LONGEST:
+        yield Finding("error", "times", message, "They look like samples, not seconds: divide by the sampling rate.")
+    elif high - low > LONGEST_SESSION:
         message = f"spikes span {(high - low) / 3600:.0f} hours ({low:g} to {high:g} s)"
-        yield Finding("error", "times", where, message, "They look like milliseconds or samples, not seconds.")
+        yield Finding("error", "times", message, "They look like milliseconds or samples, not seconds.")
 
 
-def _refractory(spikes: Spikes, names: list[str], where: str) -> Iterator[Finding]:
+def _refractory(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
     rates = {
         name: float(np.mean(np.diff(times) < REFRACTORY))
         for name, times in zip(names, spikes, strict=True)
@@ -87,10 +84,10 @@ def _refractory(spikes: Spikes, names: list[str], where: str) -> Iterator[Findin
         if bad:
             shown = some([f"{name}: {100 * bad[name]:.1f} %" for name in sorted(bad, key=lambda name: -bad[name])], 3)
             message = f"{share(len(bad), len(names))} units fire again within {1e3 * REFRACTORY:g} ms ({shown})"
-            yield Finding(severity, "refractory", where, message, advice, {"share": bad})
+            yield Finding(severity, "refractory", message, advice, {"share": bad})
 
 
-def _duplicates(spikes: Spikes, names: list[str], where: str) -> Iterator[Finding]:
+def _duplicates(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
     found = coincidences(spikes)
     bands: tuple[tuple[Severity, float, float, str], ...] = (
         ("error", SAME, np.inf, "Remove one of each pair: twins count twice in every RDM."),
@@ -103,7 +100,7 @@ def _duplicates(spikes: Spikes, names: list[str], where: str) -> Iterator[Findin
             what = f"{len(pairs)} pair{'s' * (len(pairs) > 1)} of units"
             message = f"{what} have the same spikes within {1e3 * COINCIDENT:g} ms ({shown})"
             values = {"pairs": [[names[one], names[two], part] for one, two, part in pairs]}
-            yield Finding(severity, "duplicates", where, message, advice, values)
+            yield Finding(severity, "duplicates", message, advice, values)
 
 
 def coincidences(spikes: Spikes) -> list[tuple[int, int, float]]:

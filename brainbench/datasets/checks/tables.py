@@ -8,42 +8,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.datasets.checks.findings import Finding, Severity, repeats, share, some
+from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, repeats, share, some
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.sessions import OBSERVED, Session, SessionTable, as_labels
+from brainbench.datasets.sessions import Session, SessionTable, as_labels
 from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import merged_spans, recorded_span
+from brainbench.datasets.trials.counting import inside_observed_spans, recorded_span
 from brainbench.datasets.trials.windows import CONTACTS, WHOLE, Window
 
 _LONGEST_TRIAL = 600.0
 _MANY_ROWS = 10
 """A table of few long rows may be one of epochs."""
-_LONGEST_SESSION = 48 * 3600.0
 _SHIFTS = range(-5, 6)
 """Rows by which a column is tried against the trials."""
 _GAP = 30.0
 """A silence of all units this long (s) is a break in the recording."""
 
 
-def check_tables(session: Session, where: str) -> Iterator[Finding]:
+def check_tables(session: Session) -> Iterator[Finding]:
     """Yield the findings about the interval tables of one session."""
     if not session.tables:
         message = "there are no interval tables: nothing says when which stimulus was presented"
-        yield Finding("error", "tables", where, message)
+        yield Finding("error", "tables", message)
     for table in session.tables.values():
-        yield from _damaged(table, where)
+        yield from _damaged(table)
         if "start_time" in table and len(table):
-            yield from _times(table, where)
+            yield from _times(table)
     trials = session.tables.get("trials")
     if trials is not None and "start_time" in trials and "stop_time" in trials and len(trials):
         try:
-            yield from _events(trials, where)
-            yield from _contacts(session, trials, where)
+            yield from _events(trials)
+            yield from _contacts(session, trials)
         except DataError:
             return  # The damaged column has been told already.
 
 
-def _damaged(table: SessionTable, where: str) -> Iterator[Finding]:
+def _damaged(table: SessionTable) -> Iterator[Finding]:
     for name in table.columns:
         try:
             if f"{name}_index" in table.data:
@@ -52,17 +51,17 @@ def _damaged(table: SessionTable, where: str) -> Iterator[Finding]:
                 table.column(name)
         except BrainbenchError as error:
             advice = "Rows no longer belong together: write the table again."
-            yield Finding("error", "tables", where, str(error), advice)
+            yield Finding("error", "tables", str(error), advice)
     if repeated := repeats(as_labels(table.ids()).tolist()):
-        yield Finding("warning", "tables", where, f"table {table.name!r} has ids more than once ({some(repeated)})")
+        yield Finding("warning", "tables", f"table {table.name!r} has ids more than once ({some(repeated)})")
 
 
-def _times(table: SessionTable, where: str) -> Iterator[Finding]:
+def _times(table: SessionTable) -> Iterator[Finding]:
     try:
         start = table.times("start_time")
         stop = table.times("stop_time") if "stop_time" in table else start
     except DataError as error:
-        yield Finding("error", "tables", where, str(error))
+        yield Finding("error", "tables", str(error))
         return
     name, rows = f"table {table.name!r}", len(table)
     impossible: tuple[tuple[Severity, NDArray[np.bool_], str], ...] = (
@@ -73,21 +72,21 @@ def _times(table: SessionTable, where: str) -> Iterator[Finding]:
     for severity, bad, what in impossible:
         if bad.any():
             message = f"{share(int(bad.sum()), rows)} rows of {name} have {what}"
-            yield Finding(severity, "times", where, message, "Such rows cannot be counted.")
+            yield Finding(severity, "times", message, "Such rows cannot be counted.")
     duration = stop - start
     known = np.isfinite(duration)
     if not known.any():
         return
     middle, last = float(np.median(duration[known])), float(stop[known].max())
-    if (rows >= _MANY_ROWS and middle > _LONGEST_TRIAL) or last > _LONGEST_SESSION:
+    if (rows >= _MANY_ROWS and middle > _LONGEST_TRIAL) or last > LONGEST_SESSION:
         message = f"{name} runs to {last:g} s with rows of {middle:g} s (median)"
-        yield Finding("error", "times", where, message, "Its times look like milliseconds or samples, not seconds.")
+        yield Finding("error", "times", message, "Its times look like milliseconds or samples, not seconds.")
     if table.name == "trials" and np.any(np.diff(start) < 0):
         message = f"{name} is not in the order of time"
-        yield Finding("note", "tables", where, message, "Trials are sorted when they are read; nothing is lost.")
+        yield Finding("note", "tables", message, "Trials are sorted when they are read; nothing is lost.")
 
 
-def _events(trials: SessionTable, where: str) -> Iterator[Finding]:
+def _events(trials: SessionTable) -> Iterator[Finding]:
     """Event times must lie in their own trial; if they fit another row, the column has slipped."""
     start, stop = trials.times("start_time"), trials.times("stop_time")
     for name in trials.columns:
@@ -108,9 +107,7 @@ def _events(trials: SessionTable, where: str) -> Iterator[Finding]:
                 f"{name} lies in its own trial in {100 * inside[0]:.0f} % of rows, but in the trial {best:+d} "
                 f"rows away in {100 * inside[best]:.0f} %"
             )
-            yield Finding(
-                "error", "tables", where, message, f"The column {name!r} has slipped against the others.", values
-            )
+            yield Finding("error", "tables", message, f"The column {name!r} has slipped against the others.", values)
         elif inside[0] < 0.5:
             relative = np.mean((events[known] >= 0) & (events[known] <= (stop - start)[known]))
             advice = (
@@ -121,7 +118,7 @@ def _events(trials: SessionTable, where: str) -> Iterator[Finding]:
             message = (
                 f"{name} lies outside its own trial in {share(int(np.sum(known) * (1 - inside[0])), int(known.sum()))}"
             )
-            yield Finding("warning", "tables", where, f"{message} rows", advice, values)
+            yield Finding("warning", "tables", f"{message} rows", advice, values)
 
 
 def _inside(events: NDArray[np.float64], start: NDArray[np.float64], stop: NDArray[np.float64], shift: int) -> float:
@@ -134,7 +131,7 @@ def _inside(events: NDArray[np.float64], start: NDArray[np.float64], stop: NDArr
     return float(np.mean((events[fits] >= low) & (events[fits] <= high)))
 
 
-def _contacts(session: Session, trials: SessionTable, where: str) -> Iterator[Finding]:
+def _contacts(session: Session, trials: SessionTable) -> Iterator[Finding]:
     start, stop = np.sort(trials.times("start_time")), np.sort(trials.times("stop_time"))
     brief, every = 0, 0
     for name, table in session.tables.items():
@@ -145,11 +142,11 @@ def _contacts(session: Session, trials: SessionTable, where: str) -> Iterator[Fi
         outside = (row < 0) | (begin > stop[np.maximum(row, 0)])
         if np.mean(outside) > 0.5:
             message = f"{share(int(outside.sum()), len(begin))} contacts of {name} lie in no trial"
-            yield Finding("error", "tables", where, message, "Contacts and trials are on different clocks.")
+            yield Finding("error", "tables", message, "Contacts and trials are on different clocks.")
         brief, every = brief + int(np.sum(end == begin)), every + len(begin)
     if brief:
         message = f"{share(brief, every)} contacts have zero duration"
-        yield Finding("note", "tables", where, message, "They are not taken for a first contact.")
+        yield Finding("note", "tables", message, "They are not taken for a first contact.")
 
 
 def check_coverage(
@@ -157,7 +154,6 @@ def check_coverage(
     spikes: list[NDArray[np.float64]],
     layout: RecordingLayout | None,
     conditions: Conditions | None,
-    where: str,
 ) -> Iterator[Finding]:
     """Yield the findings about trials without recording, and breaks inside it.
 
@@ -172,19 +168,20 @@ def check_coverage(
         edges = window.edges(session, table, [])
     except BrainbenchError:
         return  # What is wrong with the columns has been told already.
-    start, stop = edges[np.isfinite(edges).all(axis=1)].T
+    edges = edges[np.isfinite(edges).all(axis=1)]
+    start, stop = edges.T
     if not len(start):
         message = f"none of {len(table)} trials has the events of the window {window}"
-        yield Finding("error", "coverage", where, message)
+        yield Finding("error", "coverage", message)
         return
     low, high = span
-    units = session.units
-    if units is not None and OBSERVED in units:
-        outside = ~_observed(units, start, stop)
+    observed = inside_observed_spans(session.units, edges) if session.units is not None else None
+    if observed is not None:
+        outside = ~observed.any(axis=1)
     else:
         outside = ~((start >= low) & (stop <= high))
         message = "no obs_intervals: the recorded span is taken from the first to the last spike of all units"
-        yield Finding("note", "coverage", where, message, "A unit lost early cannot be told from a silent one.")
+        yield Finding("note", "coverage", message, "A unit lost early cannot be told from a silent one.")
     values = {"first_spike": low, "last_spike": high, "trials": len(start), "outside": int(outside.sum())}
     if outside.any():
         message = (
@@ -193,33 +190,19 @@ def check_coverage(
         )
         severity: Severity = "error" if outside.all() else "warning" if outside.mean() > 0.1 else "note"
         question = " Do spikes and trials share a clock?" if severity != "note" else ""
-        yield Finding(
-            severity, "coverage", where, message, f"They are excluded, not read as silence.{question}", values
-        )
+        yield Finding(severity, "coverage", message, f"They are excluded, not read as silence.{question}", values)
     gaps = _gaps(spikes, low, high)
     if gaps:
         hit = sum(bool(np.any((start < end) & (stop > begin))) for begin, end in gaps)
         shown = some([f"{begin:.0f}–{end:.0f} s" for begin, end in gaps], 3)
         message = f"no unit fires for more than {_GAP:g} s in {len(gaps)} places ({shown}), {hit} of them during trials"
         advice = "If recording stopped, put these spans into an invalid_times table or leave them out of obs_intervals."
-        yield Finding("warning" if hit else "note", "coverage", where, message, advice, {"gaps": gaps})
-
-
-def _observed(units: SessionTable, start: NDArray[np.float64], stop: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which trials [rows] at least one unit was observed in from begin to end."""
-    ends = units.ends(OBSERVED)
-    spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)
-    covered = np.zeros(len(start), dtype=bool)
-    # Units of one probe share their spans, so each distinct list is looked at once.
-    for own in {part.tobytes(): part for part in np.split(spans, ends[:-1])}.values():
-        for low, high in merged_spans(own):
-            covered |= (start >= low) & (stop <= high)
-    return covered
+        yield Finding("warning" if hit else "note", "coverage", message, advice, {"gaps": gaps})
 
 
 def _gaps(spikes: list[NDArray[np.float64]], low: float, high: float) -> list[tuple[float, float]]:
     """Spans without any spike longer than ``_GAP``, found on a grid of one second."""
-    if high - low > _LONGEST_SESSION:
+    if high - low > LONGEST_SESSION:
         return []  # Times that cannot be seconds are told by another check.
     edges = np.arange(np.floor(low), np.ceil(high) + 2)
     fired = np.zeros(len(edges), dtype=bool)

@@ -239,12 +239,8 @@ def _coverage(
         few = "no spikes" if selection.min_spikes == 1 else f"fewer than {selection.min_spikes} spikes"
         kept = tally.apply(kept, numbers >= selection.min_spikes, f"units: {few}")
     covered = np.zeros((len(edges), len(spikes)), dtype=bool)
-    if OBSERVED in units and f"{OBSERVED}_index" in units:
-        ends = units.ends(OBSERVED)
-        spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)
-        for index, own in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
-            for low, high in merged_spans(own):
-                covered[:, index] |= (edges[:, 0] >= low) & (edges[:, 1] <= high)
+    if (observed := inside_observed_spans(units, edges)) is not None:
+        covered = observed
     elif (span := recorded_span(spikes)) is not None:
         low, high = span
         covered[:] = ((edges[:, 0] >= low) & (edges[:, 1] <= high))[:, None]
@@ -255,8 +251,26 @@ def _coverage(
     return covered & kept if kept.any() else covered, kept
 
 
-def merged_spans(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """Join the recorded spans [n, 2] (s) that touch or overlap."""
+def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+    """Return which windows [R, 2] (s) lie in the spans in which each unit was observed [R, U]; None without spans."""
+    if OBSERVED not in units or f"{OBSERVED}_index" not in units:
+        return None
+    ends = units.ends(OBSERVED)
+    spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)
+    inside = np.zeros((len(edges), len(units)), dtype=bool)
+    # Units of one probe share their spans, so each distinct list is looked at once.
+    known: dict[bytes, NDArray[np.bool_]] = {}
+    for unit, own in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
+        key = own.tobytes()
+        if key not in known:
+            fits = [(edges[:, 0] >= low) & (edges[:, 1] <= high) for low, high in _merged(own)]
+            known[key] = np.any(fits, axis=0) if fits else inside[:, unit]
+        inside[:, unit] = known[key]
+    return inside
+
+
+def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """Join the spans [n, 2] (s) that touch or overlap."""
     merged: list[tuple[float, float]] = []
     for low, high in sorted(map(tuple, spans.tolist())):
         if merged and low <= merged[-1][1]:

@@ -131,11 +131,11 @@ def test_in_sixty_sessions_no_clock_is_misjudged(units):
         (session,) = make_sessions(GEOMETRY, design, seed=seed)
         spikes = read_spikes(session.units, [])
         for shift in (0.0, 10.0, -3.0, 0.3):
-            (finding,) = check_clock(session, [times + shift for times in spikes], None, "")
+            (finding,) = check_clock(session, [times + shift for times in spikes], None)
             assert finding.severity == ("error" if shift else "note"), finding
             assert finding.values["lag"] == pytest.approx(shift, abs=0.05)
         noise = [np.sort(random.uniform(0, times[-1], len(times))) for times in spikes]
-        (finding,) = check_clock(session, noise, None, "")
+        (finding,) = check_clock(session, noise, None)
         assert finding.severity != "error", finding
         confirmed += finding.severity == "note"
     # Noise passes for a response in few sessions (measured: one of 450), and never for a shift.
