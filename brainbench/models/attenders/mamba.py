@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from functools import cache
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -17,6 +16,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
+from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import Linear
 from brainbench.models.ops.linear_scan import linear_scan
 from brainbench.models.parts import run_layers
@@ -35,24 +35,6 @@ class MambaMemory(NamedTuple):
 
 MambaState = tuple[MambaMemory, ...]
 """One memory per block."""
-
-
-def _fused_scan(x: torch.Tensor) -> Any:
-    """Return the kernel of the package ``mamba_ssm`` for tensors on CUDA, None where it cannot be used."""
-    if not x.is_cuda or torch.compiler.is_compiling() or torch.compiler.is_exporting():
-        return None
-    return _selective_scan()
-
-
-@cache
-def _selective_scan() -> Any:
-    try:
-        from mamba_ssm.ops.selective_scan_interface import (  # pyright: ignore[reportMissingImports]
-            selective_scan_fn,
-        )
-    except ImportError:
-        return None
-    return selective_scan_fn
 
 
 class MambaBlock(nn.Module):
@@ -98,8 +80,8 @@ class MambaBlock(nn.Module):
         u, gate = self.expand(self.norm(x)).chunk(2, -1)
         padded = functional.pad(u.transpose(1, 2), (self.convolution.kernel_size[0] - 1, 0))
         u = functional.silu(self.convolution(padded).transpose(1, 2))
-        if (fused := _fused_scan(u)) is not None:
-            return self._scanned(fused, x, u, gate)
+        if (scan := dispatch.selective_scan(u)) is not None:
+            return self._scanned(scan, x, u, gate)
         decay, drive, readout = self._selected(u)
         h = linear_scan(decay, drive)
         return self._out(x, (h * readout[..., None, :]).sum(-1), u, gate)

@@ -48,8 +48,13 @@ class _Section:
                 f"The graph configuration has {key!r}: {value!r} in {self.where}; only {allowed[0]!r} is supported."
             )
 
-    def size(self, key: str, default: Any = _REQUIRED) -> Any:
+    def size(self, key: str, default: Any = _REQUIRED, *, or_else: tuple[Any, ...] = ()) -> Any:
+        """Take a pair of whole numbers (or one for both), or one of other values."""
         value = self.take(key, default)
+        if value in or_else:
+            return value
+        if or_else and isinstance(value, str):
+            raise unknown_name(f"{key} in {self.where}", value, or_else)
         numbers = [value, value] if isinstance(value, int) and not isinstance(value, bool) else value
         if not isinstance(numbers, (list, tuple)) or len(numbers) != 2 or not all(isinstance(n, int) for n in numbers):
             raise DataError(f"{key!r} in {self.where} must be a whole number or a pair of them; found {value!r}.")
@@ -150,12 +155,7 @@ def _operation(part: _Section) -> Convolution | Dense | None:
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:
-        padding = part.take("padding", 0)
-        if not isinstance(padding, str):
-            part.data["padding"] = padding
-            padding = part.size("padding")
-        elif padding not in ("same", "valid"):
-            raise unknown_name(f"padding in {part.where}", padding, ("same", "valid"))
+        padding = part.size("padding", 0, or_else=("same", "valid"))
         for key, allowed in (("dilation", 1), ("groups", 1), ("padding_mode", "zeros")):
             part.only(key, allowed)
         operation = Convolution(channels, part.size("ksize"), part.size("stride", 1), padding, **common)
@@ -208,10 +208,7 @@ def _after(part: _Section) -> tuple[str | None, Pool | None]:
         activation = part.take("activation", "ReLU")
         part.only("activation_func_kwargs", {}, None)
     elif kind == "MaxPool":
-        size, stride = part.size("ksize"), part.take("stride", None)
-        if stride is not None:
-            part.data["stride"] = stride
-            stride = part.size("stride")
+        size, stride = part.size("ksize"), part.size("stride", None, or_else=(None,))
         part.only("dilation", 1)
         part.only("return_indices", False)
         pool = Pool("max", size, stride, part.size("padding", 0), bool(part.take("ceil_mode", False)))

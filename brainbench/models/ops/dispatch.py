@@ -1,4 +1,4 @@
-"""The choice of how convolutions and gates are computed.
+"""The choice of how convolutions, gates and scans are computed.
 
 ========================  ==================================================  ==========================================
 computed by               where                                               in
@@ -6,6 +6,7 @@ computed by               where                                               in
 deferred gradients        a pass with gradients that :func:`deferring` wraps  :mod:`.convolution`, :mod:`.gates`
 fused kernels             bfloat16 on CUDA with Triton, no gradients          :mod:`.convolution`, :mod:`.gates`
 packed weights            one stimulus on the CPU, after :mod:`.packing`      :class:`.layers.PackedMatrix`
+scan of ``mamba_ssm``     CUDA, where the package is installed                :mod:`brainbench.models.attenders.mamba`
 PyTorch                   everything else                                     :class:`.layers.Conv2d`
 ========================  ==================================================  ==========================================
 
@@ -35,10 +36,15 @@ _wanted: ContextVar[bool] = ContextVar("brainbench_kernels", default=True)
 
 def usable(x: torch.Tensor) -> bool:
     """Return whether the kernels apply to what is computed from ``x`` here: in bfloat16, on CUDA, not being traced."""
-    if not x.is_cuda or not _wanted.get() or torch.compiler.is_compiling() or torch.compiler.is_exporting():
+    if not _eager_on_cuda(x) or not _wanted.get():
         return False
     half = torch.get_autocast_dtype("cuda") if torch.is_autocast_enabled("cuda") else x.dtype
     return half == torch.bfloat16 and _installed()
+
+
+def selective_scan(x: torch.Tensor) -> Any:
+    """Return Mamba's kernel of the package ``mamba_ssm`` for tensors on CUDA, None where it cannot be used."""
+    return _mamba_kernel() if _eager_on_cuda(x) else None
 
 
 def knows(conv: Conv2d, x: torch.Tensor) -> bool:
@@ -96,6 +102,19 @@ def plain() -> Iterator[None]:
         yield
     finally:
         _wanted.reset(token)
+
+
+def _eager_on_cuda(x: torch.Tensor) -> bool:
+    return x.is_cuda and not torch.compiler.is_compiling() and not torch.compiler.is_exporting()
+
+
+@functools.cache
+def _mamba_kernel() -> Any:
+    try:
+        from mamba_ssm.ops.selective_scan_interface import selective_scan_fn  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    return selective_scan_fn
 
 
 @functools.cache

@@ -3,8 +3,8 @@ import torch
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
-from brainbench.models.attenders import mamba
 from brainbench.models.attenders.mamba import MambaAttender
+from brainbench.models.ops import dispatch
 
 
 def _attender(**options):
@@ -84,10 +84,10 @@ def test_a_kernel_that_does_what_mamba_ssm_documents_changes_neither_answers_nor
         return [y.detach(), *(parameter.grad.clone() for parameter in attender.parameters())]
 
     plain = results()
-    monkeypatch.setattr(mamba, "_fused_scan", lambda x: _selective_scan)
+    monkeypatch.setattr(dispatch, "selective_scan", lambda x: _selective_scan)
     torch.testing.assert_close(results(), plain, atol=1e-4, rtol=1e-4)
 
 
 def test_without_cuda_no_kernel_is_looked_for(monkeypatch):
-    monkeypatch.setattr(mamba, "_selective_scan", lambda: pytest.fail("asked for a CUDA kernel"))
+    monkeypatch.setattr(dispatch, "_mamba_kernel", lambda: pytest.fail("asked for a CUDA kernel"))
     _attender()(torch.randn(1, 3, 12))

@@ -5,12 +5,15 @@ s' = σ(p + 1) s + (1 − σ(p + 1)) tanh(m) and y = σ(q + 1) x + (1 − σ(q +
 place), C channels.
 """
 
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
 
-GATES = 4
 EPS = 1e-5
+TILE = 2048
+"""Numbers of one gate that a program holds at a time."""
 WARPS = 8
 BACK_WARPS = 4
 """Warps of a backward pass: fewer threads that keep more each take 72, not 84 µs (384 channels, NVIDIA H200)."""
@@ -69,7 +72,7 @@ def gates_kernel(
     BLOCK_R: tl.constexpr,
     BLOCK_C: tl.constexpr,
 ):
-    """Write y and s'."""
+    """Write y and s' [R, C]. A program takes ``BLOCK_R`` rows with all their channels."""
     rows = tl.program_id(0) * BLOCK_R + tl.arange(0, BLOCK_R)
     c = tl.arange(0, BLOCK_C)
     inside = (rows < count)[:, None] & (c < C)[None, :]
@@ -136,7 +139,10 @@ def gates_backward_kernel(
     BLOCK_R: tl.constexpr,
     BLOCK_C: tl.constexpr,
 ):
-    """Write the gradients of pre-activations, x and s; add those of the norms to this program's sums."""
+    """Write the gradients of pre-activations [R, 4 C], x and s [R, C]; add those of the norms to this program's sums.
+
+    A program takes every num_programs-th block of ``BLOCK_R`` rows, with all their channels.
+    """
     c = tl.arange(0, BLOCK_C)
     # Kept apart by row until the end: threads that share a sum would race for its place in memory.
     scale0 = tl.zeros((BLOCK_R, BLOCK_C), tl.float32)
@@ -212,30 +218,9 @@ def apply_gates(
         state_type: Precision of the new state.
     """
     x, state = channels_innermost(x), channels_innermost(state)
-    batch, channels, height, width = x.shape
-    y = torch.empty(batch, height, width, channels, dtype=x.dtype, device=x.device).permute(0, 3, 1, 2)
-    after = torch.empty(batch, height, width, channels, dtype=state_type, device=x.device).permute(0, 3, 1, 2)
-    tall, wide = _tile(channels, 2048)
-    gates_kernel[(triton.cdiv(len(fused), tall),)](
-        fused,
-        x,
-        state,
-        fused if norms is None else norms,
-        y,
-        after,
-        len(fused),
-        x.stride(0),
-        state.stride(0),
-        height * width,
-        x.stride(3),
-        state.stride(3),
-        channels,
-        norms is not None,
-        EPS,
-        tall,
-        wide,
-        num_warps=WARPS,
-    )
+    y, after = _empty_maps(x, x.dtype), _empty_maps(x, state_type)
+    arrays = (fused, x, state, fused if norms is None else norms, y, after)
+    _launch(gates_kernel, arrays, (x, state), norms is not None, warps=WARPS)
     return y, after
 
 
@@ -253,41 +238,37 @@ def apply_gates_backward(
 
     The other arguments are those of :func:`apply_gates`, and the gradients of its two results.
     """
-    x, state = channels_innermost(x), channels_innermost(state)
-    batch, channels, height, width = x.shape
-    d_x = torch.empty(batch, height, width, channels, dtype=x.dtype, device=x.device).permute(0, 3, 1, 2)
-    d_state = torch.empty(batch, height, width, channels, dtype=state.dtype, device=x.device).permute(0, 3, 1, 2)
-    d_y, d_after = channels_innermost(d_y), channels_innermost(d_after)
-    tall, wide = _tile(channels, 2048)
-    gates_backward_kernel[(min(PROGRAMS, triton.cdiv(len(fused), tall)),)](
-        fused,
-        x,
-        state,
-        fused if norms is None else norms,
-        d_y,
-        d_after,
-        d_fused,
-        d_x,
-        d_state,
-        fused if sums is None else sums,
-        len(fused),
-        x.stride(0),
-        state.stride(0),
-        d_y.stride(0),
-        d_after.stride(0),
-        height * width,
-        x.stride(3),
-        state.stride(3),
-        d_y.stride(3),
-        d_after.stride(3),
-        channels,
-        norms is not None,
-        EPS,
-        tall,
-        wide,
-        num_warps=BACK_WARPS,
-    )
+    x, state, d_y, d_after = (channels_innermost(maps) for maps in (x, state, d_y, d_after))
+    d_x, d_state = _empty_maps(x, x.dtype), _empty_maps(x, state.dtype)
+    # Kernels ask for a pointer even where there are no norms, and do not use it.
+    weights, totals = fused if norms is None else norms, fused if sums is None else sums
+    arrays = (fused, x, state, weights, d_y, d_after, d_fused, d_x, d_state, totals)
+    _launch(gates_backward_kernel, arrays, (x, state, d_y, d_after), norms is not None, warps=BACK_WARPS, most=PROGRAMS)
     return d_x, d_state
+
+
+def _launch(
+    kernel: Any,
+    arrays: tuple[torch.Tensor, ...],
+    read: tuple[torch.Tensor, ...],
+    norm: bool,
+    *,
+    warps: int,
+    most: int | None = None,
+) -> None:
+    """Launch a kernel over blocks of rows; ``read`` are the maps [B, C, H, W] whose strides it is told."""
+    rows, (_, channels, height, width) = len(arrays[0]), read[0].shape
+    wide = triton.next_power_of_2(channels)
+    tall = max(1, TILE // wide)
+    programs = triton.cdiv(rows, tall)
+    batches, places = (tuple(maps.stride(axis) for maps in read) for axis in (0, 3))
+    sizes = (rows, *batches, height * width, *places, channels, norm, EPS, tall, wide)
+    kernel[(programs if most is None else min(most, programs),)](*arrays, *sizes, num_warps=warps)
+
+
+def _empty_maps(like: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    batch, channels, height, width = like.shape
+    return torch.empty(batch, height, width, channels, dtype=dtype, device=like.device).permute(0, 3, 1, 2)
 
 
 def channels_innermost(x: torch.Tensor) -> torch.Tensor:
@@ -296,8 +277,3 @@ def channels_innermost(x: torch.Tensor) -> torch.Tensor:
     if x.stride(1) == 1 and (rows == 1 or x.stride(2) == columns * x.stride(3)):
         return x
     return x.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
-
-
-def _tile(channels: int, size: int) -> tuple[int, int]:
-    wide = triton.next_power_of_2(channels)
-    return max(1, size // wide), wide
