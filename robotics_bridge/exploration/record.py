@@ -7,7 +7,6 @@ way. Letters: K condition (object and procedure), T frame of 9 ms, S sub-step of
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,9 +15,9 @@ import numpy as np
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_json
+from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
 from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
@@ -253,23 +252,7 @@ class _World:
 
     def _bottom(self, item: Explored) -> float:
         """Return how far the lowest point of a held object lies below its body's origin (m)."""
-        mujoco = mujoco_module()
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, np.array(item.quaternion))
-        turn = turn.reshape(3, 3)
-        if item.mesh is not None:
-            return float(-(item.mesh.vertices @ turn.T)[:, 2].min())
-        shape, down = item.shape(), turn.T @ np.array([0.0, 0.0, -1.0])
-        size = [*shape.size, 0.0, 0.0][:3]
-        if shape.kind == "sphere":
-            return size[0]
-        if shape.kind == "capsule":
-            return size[0] + size[1] * abs(float(down[2]))
-        if shape.kind == "ellipsoid":
-            return float(np.linalg.norm(np.array(size) * down))
-        if shape.kind == "cylinder":
-            return size[1] * abs(float(down[2])) + size[0] * math.hypot(*down[:2])
-        return float(np.abs(np.array(size) * down).sum())
+        return float(item.shape().reach(-to_matrices(item.quaternion)[2]))
 
     def move(self, conditions: Sequence[tuple[Explored, Procedure]], time: float) -> None:
         """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""
@@ -282,17 +265,13 @@ class _World:
             ]
             data.qvel[self._speed : self._speed + 3] = rates[:3]
             # MuJoCo wants the angular velocity in the body's own axes.
-            turn = np.zeros(9)
-            mujoco_module().mju_quat2Mat(turn, data.qpos[self._at + 3 : self._at + 7])
-            data.qvel[self._speed + 3 : self._speed + 6] = turn.reshape(3, 3).T @ np.array([0.0, 0.0, rates[3]])
+            data.qvel[self._speed + 3 : self._speed + 6] = (
+                rates[3] * to_matrices(data.qpos[self._at + 3 : self._at + 7])[2]
+            )
             data.ctrl[self._drives] = pose.closing * self._closed
         self.engine.step()
 
     def _held(self, pose: Pose, item: Explored) -> NDArray[np.float64]:
         height = pose.z + item.retreat + self._bottoms[id(item)]
-        half = pose.yaw / 2
-        quaternion = np.zeros(4)
-        mujoco_module().mju_mulQuat(
-            quaternion, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array(item.quaternion)
-        )
-        return np.concatenate([[self._place[0] + pose.x, self._place[1] + pose.y, height], quaternion])
+        turned = from_matrices(to_matrices(from_rpy((0.0, 0.0, pose.yaw))) @ to_matrices(item.quaternion))
+        return np.concatenate([[self._place[0] + pose.x, self._place[1] + pose.y, height], turned])

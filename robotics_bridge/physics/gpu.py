@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
 from robotics_bridge.physics.model_fields import check_fields, differing_fields
@@ -86,7 +87,7 @@ class MujocoWarpEngine:
                 "time": self._d.time,
             }
         )
-        self._graph: Any = None
+        self._replay: Callable[[], None] | None = None
         self.forward()
 
     @property
@@ -149,19 +150,15 @@ class MujocoWarpEngine:
 
     def step(self, steps: int = 1) -> None:
         """Advance every environment and refresh the state."""
-        wp = warp()
-        with wp.ScopedDevice(self._device):
+        with warp().ScopedDevice(self._device):
             for _ in range(steps):
-                if not self._device.is_cuda:
-                    self._step()
-                elif self._graph is None:
-                    # The first step compiles; recording must not.
-                    self._step()
-                    with wp.ScopedCapture() as capture:
-                        self._step()
-                    self._graph = capture.graph
-                else:
-                    wp.capture_launch(self._graph)
+                if self._replay:
+                    self._replay()
+                    continue
+                # The first step compiles; recording must not.
+                self._step()
+                if self._device.is_cuda:
+                    self._replay = record_launches(self._step, self._device)
 
     def forward(self) -> None:
         """Refresh the state at the current positions and velocities, without advancing."""

@@ -16,7 +16,7 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from brainbench.geometry import Mesh
 
@@ -69,6 +69,22 @@ class Geometry:
             )
         object.__setattr__(self, "quaternion", tuple(float(q) / norm for q in self.quaternion))
         object.__setattr__(self, "size", tuple(float(s) for s in self.size[:needed]))
+
+    def reach(self, directions: ArrayLike) -> NDArray[np.float64]:
+        """Return the support function: how far the solid reaches along unit directions [..., 3] of its frame (m)."""
+        d, size = np.asarray(directions, dtype=float), self.size
+        upright = np.abs(d[..., 2])
+        if self.mesh is not None:
+            return (d @ self.mesh.vertices.T).max(axis=-1)
+        if self.kind == "sphere":
+            return np.full(d.shape[:-1], size[0])
+        if self.kind == "capsule":
+            return upright * size[1] + size[0]
+        if self.kind == "cylinder":
+            return upright * size[1] + np.hypot(d[..., 0], d[..., 1]) * size[0]
+        if self.kind == "ellipsoid":
+            return np.linalg.norm(d * np.array(size), axis=-1)
+        return np.abs(d) @ np.array(size) if self.kind == "box" else np.full(d.shape[:-1], np.inf)
 
     @property
     def collides(self) -> bool:

@@ -133,12 +133,8 @@ class AfferentFilter:
                     kept[where] = value[where]
 
     def _rest(self, name: str, x: torch.Tensor) -> list[list[torch.Tensor]]:
-        """Return the memories at which a constant signal stays as it is."""
-        states, level = [], x.double()
-        for row in self._sections[name]:
-            b0, b1, b2, _a0, a1, a2 = (float(value) for value in row)
-            out = level * (b0 + b1 + b2) / (1 + a1 + a2)
-            second = b2 * level - a2 * out
-            states.append([(b1 * level - a1 * out + second).to(x.dtype), second.to(x.dtype)])
-            level = out
-        return states
+        """Return the memories at which a constant signal stays as it is: those of a unit step, times the signal."""
+        from scipy.signal import sosfilt_zi
+
+        level = x.double()
+        return [[(level * float(z)).to(x.dtype) for z in pair] for pair in sosfilt_zi(self._sections[name])]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
+from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.state import DIVERGED, HandState
@@ -22,6 +23,14 @@ if TYPE_CHECKING:
     from robotics_bridge.sensors.fidelity import SensorFidelity
     from robotics_bridge.sensors.probes.runtime import DistanceRuntime
     from robotics_bridge.sensors.runtime import Runtime
+
+
+class _RecordedUpdate(NamedTuple):
+    """An update as a CUDA graph, for one state and time step (s)."""
+
+    replay: Callable[[], None]
+    state: HandState
+    dt: float
 
 
 class SensorSuite:
@@ -107,7 +116,7 @@ class SensorSuite:
                 for name, sensor in self.sensors.items()
                 if sensor.history
             }
-        self._graph: tuple[Any, HandState, float] | None = None
+        self._recorded: _RecordedUpdate | None = None
         self._status: Any = None
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
@@ -124,28 +133,23 @@ class SensorSuite:
             self._check(state)
         if not (math.isfinite(dt) and dt > 0):
             raise UsageError(f"dt is the positive time since the last update (s); received {dt!r}.")
-        wp = warp()
         if not self.device.is_cuda:
             self._launch(state, dt)
         elif self.device.is_capturing:
             if self._histories or not all(runtime.recordable for runtime in self.runtimes):
                 raise UsageError("Sensors with a history or with meshes that move cannot be part of another recording.")
             self._launch(state, dt)
-        elif self._graph and self._graph[1] is state and self._graph[2] == dt:
-            wp.capture_launch(self._graph[0])
+        elif self._recorded and self._recorded.state is state and self._recorded.dt == dt:
+            self._recorded.replay()
+        elif self._recorded is None and self._status is state.status and all(r.recordable for r in self.runtimes):
+            replay = record_launches(lambda: self._launch(state, dt), self.device)
+            self._recorded = _RecordedUpdate(replay, state, dt)
+            replay()
         else:
             # The first update of a state compiles and allocates; the next ones replay what it does.
-            known = self._status is state.status and self._graph is None
-            known = known and all(runtime.recordable for runtime in self.runtimes)
-            if known:
-                with wp.ScopedDevice(self.device), wp.ScopedCapture() as capture:
-                    self._launch(state, dt)
-                self._graph = (capture.graph, state, dt)
-                wp.capture_launch(capture.graph)
-            else:
-                with wp.ScopedDevice(self.device):
-                    self._launch(state, dt)
-                self._graph = None
+            with warp().ScopedDevice(self.device):
+                self._launch(state, dt)
+            self._recorded = None
         self._status = state.status
         self._updates += 1
 

@@ -84,38 +84,19 @@ def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[
 
     The inside is where the winding number exceeds one half.
     """
+    from trimesh.triangles import closest_point
+
     from brainbench.geometry import winding_number
 
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    inside = winding_number(mesh, points) > 0.5
-    distance, direction = np.zeros(len(points)), np.zeros((len(points), 3))
-    for index, x in enumerate(points):
-        near = _closest(x, a, b, c)
-        away = x - near
-        length = np.linalg.norm(away, axis=1)
-        best = int(length.argmin())
-        sign = -1.0 if inside[index] else 1.0
-        distance[index] = sign * length[best]
-        direction[index] = sign * away[best] / max(length[best], 1e-15)
-    return distance, direction
+    corners = mesh.vertices[mesh.faces]
+    sign = np.where(winding_number(mesh, points) > 0.5, -1.0, 1.0)
+    away = np.array([_shortest(x - closest_point(corners, np.tile(x, (len(corners), 1)))) for x in points])
+    length = np.linalg.norm(away, axis=1)
+    return sign * length, (sign / np.maximum(length, 1e-15))[:, None] * away
 
 
-def _closest(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray:
-    """Closest points [F, 3] of triangles to one point: the projection if it falls inside, else on the nearest edge."""
-    normal = np.cross(b - a, c - a)
-    square = np.maximum((normal**2).sum(1), 1e-300)
-    flat = x - normal * (((x - a) * normal).sum(1) / square)[:, None]
-    inside = np.ones(len(a), dtype=bool)
-    best, least = flat, np.full(len(a), np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        inside &= (np.cross(end - start, flat - start) * normal).sum(1) >= 0
-        edge = end - start
-        share = np.clip(((x - start) * edge).sum(1) / np.maximum((edge**2).sum(1), 1e-300), 0, 1)
-        point = start + share[:, None] * edge
-        far = ((x - point) ** 2).sum(1)
-        best = np.where((far < least)[:, None], point, best)
-        least = np.minimum(least, far)
-    return np.where(inside[:, None], flat, best)
+def _shortest(vectors: NDArray) -> NDArray:
+    return vectors[np.linalg.norm(vectors, axis=1).argmin()]
 
 
 def _run(solid: Geometry, sensor: Sensor, places: NDArray, resolution: int = 64) -> tuple[NDArray, float]:

@@ -37,24 +37,21 @@ def box(half: tuple[float, float, float], cells: int) -> Any:
 def ball(half: tuple[float, float, float], cells: int) -> Any:
     """Return an ellipsoid of half axes (m), from a cube whose shells are pushed out to spheres."""
     mesh = box((1.0, 1.0, 1.0), cells)
-    p = mesh.p
-    longest, radius = np.abs(p).max(axis=0), np.linalg.norm(p, axis=0)
-    # Near the middle the cube stays a cube, at the skin it is a sphere.
-    round_ = np.where(radius > 0, longest / np.maximum(radius, 1e-12), 1.0)
-    share = longest**2
-    return _moved(mesh, p * (share * round_ + (1 - share) * 0.8) * np.array(half)[:, None])
+    return _moved(mesh, _rounded(mesh.p, 0.8) * np.array(half)[:, None])
 
 
 def cylinder(radius: float, half_length: float, cells: int) -> Any:
     """Return a cylinder along z."""
     mesh = box((radius, radius, half_length), cells)
-    p = mesh.p.copy()
-    flat = p[:2] / radius
-    longest, far = np.abs(flat).max(axis=0), np.linalg.norm(flat, axis=0)
-    round_ = np.where(far > 0, longest / np.maximum(far, 1e-12), 1.0)
+    return _moved(mesh, np.concatenate([_rounded(mesh.p[:2] / radius, 0.85) * radius, mesh.p[2:]]))
+
+
+def _rounded(p: NDArray[np.float64], core: float) -> NDArray[np.float64]:
+    """Push the shells of a cube [-1, 1] out to spheres; near the middle it stays a cube, shrunk by ``core``."""
+    longest, far = np.abs(p).max(axis=0), np.linalg.norm(p, axis=0)
+    sphere = np.where(far > 0, longest / np.maximum(far, 1e-12), 1.0)
     share = longest**2
-    p[0:2] = flat * (share * round_ + (1 - share) * 0.85) * radius
-    return _moved(mesh, p)
+    return p * (share * sphere + (1 - share) * core)
 
 
 def voxels(surface: Mesh, cells: int) -> Any:
@@ -66,6 +63,7 @@ def voxels(surface: Mesh, cells: int) -> Any:
     from scipy.spatial import KDTree
 
     from brainbench.geometry import winding_number
+    from robotics_bridge.sensors.probes.placement import face_areas, spread_over
 
     vertices = np.asarray(surface.vertices, dtype=float)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -83,23 +81,14 @@ def voxels(surface: Mesh, cells: int) -> Any:
     if not keep.any():
         raise UsageError(f"No voxel lies inside the body with {cells} cells along it; use more, or a primitive shape.")
     mesh = grid.restrict(np.flatnonzero(keep))
-    samples = _scattered(surface, 40_000)
+    corners = vertices[surface.faces]
+    samples = spread_over(corners, face_areas(corners)[0], 40_000, seed=0)[0]
     skin = np.unique(mesh.facets[:, mesh.boundary_facets()])
     distance, nearest = (np.asarray(item) for item in KDTree(samples).query(mesh.p[:, skin].T))
     p = mesh.p.copy()
     near = distance < 1.2 * edge
     p[:, skin[near]] = samples[nearest[near]].T
     return _moved(mesh, _untangled(mesh, p))
-
-
-def _scattered(surface: Mesh, count: int) -> NDArray[np.float64]:
-    """Return points [count, 3] spread over a surface by area."""
-    a, b, c = np.asarray(surface.vertices, dtype=float)[surface.faces].transpose(1, 0, 2)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    rng = np.random.default_rng(0)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    u, v = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
-    return a[face] * (1 - u) + b[face] * (u * (1 - v)) + c[face] * (u * v)
 
 
 def _untangled(mesh: Any, target: NDArray[np.float64]) -> NDArray[np.float64]:

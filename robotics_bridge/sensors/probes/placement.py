@@ -136,10 +136,8 @@ class Probes:
             UsageError: no triangle is left.
         """
         corners = mesh.vertices[mesh.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1) / 2
+        area, normal = face_areas(corners)
         keep = area > 0
-        normal = cross / np.maximum(2 * area, 1e-30)[:, None]
         if facing is not None:
             direction = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
             keep &= normal @ direction >= np.cos(np.radians(within))
@@ -155,6 +153,13 @@ class Probes:
     def with_radius(self, radius: ArrayLike) -> Probes:
         """Return the same places with other radii (m); fillers stay fillers."""
         return Probes(self.position, self.normal, np.where(self.active, radius, 0.0), self.shape, self.pitch)
+
+
+def face_areas(corners: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return areas [F] (m²) and unit normals [F, 3] of triangles [F, 3, 3]."""
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1) / 2
+    return area, cross / np.maximum(2 * area, 1e-30)[:, None]
 
 
 def cover_evenly(corners: NDArray, area: NDArray, count: int) -> NDArray[np.float64]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.devices import warp
-from robotics_bridge.sensors.probes.placement import cover_evenly
+from brainbench.core.devices import to_struct
+from robotics_bridge.sensors.probes.placement import cover_evenly, face_areas
 from robotics_bridge.sensors.queries.solids import tessellate
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
 
@@ -35,8 +35,7 @@ def surface_points(geometry: Geometry, count: int) -> NDArray[np.float64]:
     """Return evenly spread points [count, 3] on the surface of a geometry (m, its own frame)."""
     mesh = tessellate(geometry)
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    return cover_evenly(corners, area, count)
+    return cover_evenly(corners, face_areas(corners)[0], count)
 
 
 def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows: int, device: Any) -> Cloud:
@@ -44,55 +43,39 @@ def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows
 
     Planes are left out: they have no end.
     """
-    wp = warp()
-    sampled: dict[tuple[int, int], NDArray] = {}
-    first, blocks, coordinates, spheres = [], [], [], []
-    counts = np.zeros(rows, np.int64)
-    start = block = total = 0
-    layout: dict[tuple, tuple[int, int]] = {}
+    sampled: dict[tuple[int, int], tuple[int, NDArray]] = {}
+    counts, totals = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
+    first, blocks = (np.zeros((rows, max(len(scene.geometries), 1)), np.int32) for _ in range(2))
+    start = 0
     for row in range(rows):
         shapes = {g: scene.geometry_in(row, g) for g in geometries}
         shapes = {g: shape for g, shape in shapes.items() if shape.kind not in ("plane", "other")}
         areas = {g: surface_area(shape) for g, shape in shapes.items()}
         whole = sum(areas.values()) or 1.0
-        row_first = np.zeros(len(scene.geometries) or 1, np.int32)
-        row_blocks = np.zeros(len(scene.geometries) or 1, np.int32)
-        place = 0
         for g, shape in shapes.items():
             share = max(1, round(points * areas[g] / whole))
             key = (id(shape), share)
-            if key not in layout:
-                if key not in sampled:
-                    sampled[key] = _in_blocks(surface_points(shape, share))
-                cloud = sampled[key]
-                layout[key] = (block, len(cloud) // BLOCK)
-                coordinates.append(cloud)
-                spheres.append(_spheres(cloud))
-                block += len(cloud) // BLOCK
-            row_first[g], row_blocks[g] = layout[key]
+            if key not in sampled:
+                sampled[key] = (start, _in_blocks(surface_points(shape, share)))
+                start += len(sampled[key][1]) // BLOCK
+            first[row, g], placed = sampled[key]
+            blocks[row, g] = len(placed) // BLOCK
             counts[row] += share
-            place += len(sampled[key])
-        total = max(total, place)
-        first.append(row_first)
-        blocks.append(row_blocks)
-        start += place
-    s = CloudArrays()
-    empty = np.zeros((0, 3), np.float32)
-    s.point = wp.array(np.concatenate([empty, *coordinates]).astype(np.float32), dtype=wp.vec3f, device=device)
-    bounds = np.concatenate([np.zeros((0, 4), np.float32), *spheres]).astype(np.float32)
-    s.sphere = wp.array(bounds, dtype=wp.vec4f, device=device)
-    s.first = wp.array(np.stack(first), dtype=wp.int32, device=device)
-    s.blocks = wp.array(np.stack(blocks), dtype=wp.int32, device=device)
-    return Cloud(s, total, counts)
+            totals[row] += len(placed)
+    clouds = [placed for _start, placed in sampled.values()] or [np.zeros((0, 3), np.float32)]
+    arrays = {
+        "point": np.concatenate(clouds),
+        "sphere": np.concatenate([_spheres(placed) for placed in clouds]),
+        "first": first,
+        "blocks": blocks,
+    }
+    return Cloud(to_struct(CloudArrays, arrays, device), int(totals.max()), counts)
 
 
 def surface_area(geometry: Geometry) -> float:
     """Return the surface area of a geometry [m²]."""
     mesh = tessellate(geometry)
-    corners = mesh.vertices[mesh.faces]
-    return float(
-        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    )
+    return float(face_areas(mesh.vertices[mesh.faces])[0].sum())
 
 
 def halve(points: NDArray, order: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:

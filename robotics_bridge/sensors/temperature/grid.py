@@ -17,6 +17,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial, material
 
@@ -153,28 +154,6 @@ def _runtime_of(suite: SensorSuite, name: str) -> TemperatureRuntime:
 
 def _bounds(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the box around a geometry in the link's frame (m)."""
-    w, x, y, z = geometry.quaternion
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    place, size = np.array(geometry.position), geometry.size
-    if geometry.kind == "mesh" and geometry.mesh is not None:
-        points = geometry.mesh.vertices @ turn.T + place
-        return points.min(axis=0), points.max(axis=0)
-    if geometry.kind in ("plane", "other"):
-        return np.full(3, -np.inf), np.full(3, np.inf)
-    if geometry.kind == "sphere":
-        half = np.full(3, size[0])
-    elif geometry.kind == "capsule":
-        half = np.abs(turn[:, 2]) * size[1] + size[0]
-    elif geometry.kind == "cylinder":
-        half = np.abs(turn[:, 2]) * size[1] + np.sqrt(np.maximum(1 - turn[:, 2] ** 2, 0)) * size[0]
-    elif geometry.kind == "ellipsoid":
-        half = np.linalg.norm(turn * np.array(size[:3]), axis=1)
-    else:
-        half = np.abs(turn) @ np.array(size[:3])
-    return place - half, place + half
+    # Row i of the rotation is the link's axis i in the frame of the geometry.
+    axes, place = to_matrices(geometry.quaternion), np.array(geometry.position)
+    return place - geometry.reach(-axes), place + geometry.reach(axes)
