@@ -19,7 +19,7 @@ Array = Any
 
 
 def is_tensor(values: Any) -> bool:
-    """Whether ``values`` is a torch tensor; torch is not imported for that."""
+    """Return whether ``values`` is a torch tensor; torch is not imported for that."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(values, torch.Tensor)
 

@@ -38,7 +38,7 @@ from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
 @dataclass(frozen=True)
 class Switches:
-    """Which published faults are on; the text of this module says what each does."""
+    """Published faults that are on; the text of this module says what each does."""
 
     best_target: bool = True
     best_layer: bool = True
@@ -55,7 +55,6 @@ PUBLISHED_INPUT = Switches(drop_splits=False, median=True)
 """The bar of the raw input."""
 CORRECTED = Switches(*(False for _ in fields(Switches)))
 _AVERAGED = "split halves averaged before the correction instead of after"
-_GATED = "gate on reliability: the default"
 
 
 @dataclass(frozen=True)
@@ -63,11 +62,11 @@ class Step:
     """One line of the walk."""
 
     change: str
-    """What was switched, in words."""
+    """The switch, in words."""
     value: float
     status: Status
     detail: str
-    """How many splits and animals entered, or why there is no value."""
+    """Number of splits and animals that entered, or why there is no value."""
     switches: Switches
 
 
@@ -147,7 +146,7 @@ def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None =
             "all splits again, two negative reliabilities no longer pass",
             Switches(drop_splits=False, negative_pairs=False),
         ),
-        ("split halves averaged before the correction instead of after", replace(CORRECTED, no_gate=True)),
+        (_AVERAGED, replace(CORRECTED, no_gate=True)),
     )
     steps = []
     for change, switches in walk:
@@ -156,17 +155,15 @@ def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None =
         if switches.ratio_per_split and not switches.drop_splits:
             detail += f"; {negative} with negative reliability have no real ratio and vanish"
         steps.append(Step(change, value, "ok" if math.isfinite(value) else "undefined", detail, switches))
-    value = steps[-1].value
+    value, status = steps[-1].value, "ok" if reliability >= RELIABILITY_GATE else "unreliable"
+    detail = f"reliability {reliability:.2f}"
     if not reliability > 0:
-        last = Step(
-            "gate on reliability: the default", math.nan, "undefined", f"reliability {reliability:.2f}", CORRECTED
-        )
+        value, status = math.nan, "undefined"
+    elif status == "ok":
+        detail += f" is at least {RELIABILITY_GATE}"
     else:
-        good = reliability >= RELIABILITY_GATE
-        detail = f"reliability {reliability:.2f} is {'at least' if good else 'below'} {RELIABILITY_GATE}"
-        detail += "" if good else ": no correction of these data is trustworthy"
-        last = Step(_GATED, value, "ok" if good else "unreliable", detail, CORRECTED)
-    return (*steps, last)
+        detail += f" is below {RELIABILITY_GATE}: no correction of these data is trustworthy"
+    return (*steps, Step("gate on reliability: the default", value, status, detail, CORRECTED))
 
 
 def explain_score(
@@ -186,18 +183,14 @@ def explain_score(
     usable = [subject for subject in animals.subjects if subject.problem is None and not is_flat(subject.rdm)]
     if not len(rdms) or not usable:
         raise UsageError("There is nothing to explain: no layer or no animal has a usable RDM.")
+    averaged = replace(PUBLISHED, best_target=False)
+    unfiltered = replace(averaged, drop_splits=False)
     walk = (
         ("as published: maximum over layers and over targets", PUBLISHED),
-        ("mean over animals instead of the best target", replace(PUBLISHED, best_target=False)),
-        ("no split is left out", replace(PUBLISHED, best_target=False, drop_splits=False)),
-        (
-            "two negative reliabilities no longer pass",
-            replace(PUBLISHED, best_target=False, drop_splits=False, negative_pairs=False),
-        ),
-        (
-            "split halves averaged before the correction instead of after",
-            replace(CORRECTED, best_layer=True, no_gate=True),
-        ),
+        ("mean over animals instead of the best target", averaged),
+        ("no split is left out", unfiltered),
+        ("two negative reliabilities no longer pass", replace(unfiltered, negative_pairs=False)),
+        (_AVERAGED, replace(CORRECTED, best_layer=True, no_gate=True)),
         (f"animals with a reliability below {RELIABILITY_GATE} left out", replace(CORRECTED, best_layer=True)),
         ("layer chosen on the other animals: the default", CORRECTED),
     )

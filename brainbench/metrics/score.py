@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ _HALVES_IN_PERMUTATIONS = 100
 
 @dataclass(frozen=True)
 class _Choice:
-    """Which layer each scored animal was compared with, and what came out."""
+    """The layer that each scored animal was compared with, and the result."""
 
     r: Floats
     """[A] raw comparisons."""
@@ -114,23 +114,30 @@ def score_with_test(
     layers = _layer_scores(names, rdms, defined, animals, compare)
     finite = [index for index in defined if math.isfinite(layers[index].value)]
     best = finite[first_best(np.array([layers[index].value for index in finite]))] if finite else None
-    chosen = None if choice is None else defined[choice.overall]
-    repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
+    measured: dict[str, Any] = {"value": math.nan}
+    statistics: dict[str, Any] = {}
+    if choice is not None:
+        chosen, usable = defined[choice.overall], [names[index] for index in defined]
+        repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
+        measured = {
+            "value": float(choice.values.mean()),
+            "r": float(choice.r.mean()),
+            "interval": t_interval(choice.values),
+            "p": choice.test.p,
+            "p_method": choice.test.summary(len(defined), repeated),
+            "layer": names[chosen],
+            "layer_rule": choice.rule,
+            "model_rdm": tuple(rdms[chosen].tolist()),
+        }
+        statistics = _statistics(usable, rdms[defined], animals, choice, estimator, compare, seed)
     score = Score(
         name=name,
-        value=math.nan if choice is None else float(choice.values.mean()),
         status=status,
         reasons=reasons,
-        r=math.nan if choice is None else float(choice.r.mean()),
         reliability=reliability,
         reliability_interval=reliability_interval,
-        interval=None if choice is None else t_interval(choice.values),
-        p=math.nan if choice is None else choice.test.p,
-        p_method="" if choice is None else choice.test.summary(len(defined), repeated),
         p_smallest=smallest_p(len(stimuli)),
         ceiling=ceiling_of(animals, compare),
-        layer=None if chosen is None else names[chosen],
-        layer_rule="" if choice is None else choice.rule,
         best_layer=None if best is None else names[best],
         best_layer_value=math.nan if best is None else layers[best].value,
         layers=layers,
@@ -138,20 +145,16 @@ def score_with_test(
         estimator=estimator,
         metric=metric_name(animals, compare),
         stimuli=tuple(map(str, stimuli)),
-        model_rdm=() if chosen is None else tuple(rdms[chosen].tolist()),
         brain_rdm=mean_rdm(animals),
         provenance=Provenance.of(
             {
-                "statistics": {}
-                if choice is None
-                else _statistics(
-                    [names[index] for index in defined], rdms[defined], animals, choice, estimator, compare, seed
-                ),
+                "statistics": statistics,
                 "seed": seed,
                 "splits": max(len(subject.split_half_r) for subject in animals.subjects),
                 "reliability_gate": RELIABILITY_GATE,
             }
         ),
+        **measured,
     )
     return score, None if choice is None else choice.test
 
@@ -331,17 +334,13 @@ def _verdict(
 def _layer_scores(
     names: tuple[str, ...], rdms: Floats, defined: list[int], animals: Animals, comparison: str
 ) -> tuple[LayerScore, ...]:
-    nothing = LayerScore("", math.nan, math.nan, "undefined")
-    scores = dict.fromkeys(range(len(names)), nothing)
+    found: dict[int, LayerScore] = {}
     if animals.scored and defined and rdms.shape[1] > 1:
         r = compare_all(rdms[defined], animals.rdms(animals.scored), method=comparison)
-        values = r * animals.factors(animals.scored)
         status: Status = "ok" if animals.reliable else "unreliable"
-        for row, index in enumerate(defined):
-            scores[index] = LayerScore(
-                "", float(values[row].mean()), float(r[row].mean()), status, t_interval(values[row])
-            )
-    return tuple(replace(scores[i], layer=names[i]) for i in range(len(names)))
+        for index, raw, value in zip(defined, r, r * animals.factors(animals.scored), strict=True):
+            found[index] = LayerScore(names[index], float(value.mean()), float(raw.mean()), status, t_interval(value))
+    return tuple(found.get(i) or LayerScore(name, math.nan, math.nan, "undefined") for i, name in enumerate(names))
 
 
 def _subject_scores(

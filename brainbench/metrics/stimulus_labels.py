@@ -68,6 +68,11 @@ def response_matrix(responses: ArrayLike, rows: str) -> Any:
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
+def membership(codes: Ints, count: int) -> Floats:
+    """Return 1 where a trial is one of a stimulus, else 0 [K, R]."""
+    return (codes == np.arange(count)[:, None]).astype(np.float64)
+
+
 def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     """Return the mean response [K, U] over the trials of each stimulus; NaN entries are missing.
 
@@ -83,8 +88,7 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     if (means := _complete_means(responses, codes, numbers)) is not None:
         return means
     check_finite(responses)
-    member = np.zeros((count, len(codes)))
-    member[codes, np.arange(len(codes))] = 1.0
+    member = membership(codes, count)
     present = ~np.isnan(responses)
     shift = float(responses[present][0]) if present.any() else 0.0
     totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
@@ -120,9 +124,7 @@ def tensor_means(responses: Any, codes: Ints, count: int, device: Any) -> Array:
     Raises:
         DataError: a response is infinite.
     """
-    member = np.zeros((count, len(codes)))
-    member[codes, np.arange(len(codes))] = 1.0
-    member = place(member, device)
+    member = place(membership(codes, count), device)
     xp, found = library(member), []
     for _, part in slices(responses, _SLICE_ELEMENTS, device):
         present = xp.isfinite(part)

@@ -34,8 +34,8 @@ _STIMULI = 12
 
 
 @dataclass(frozen=True)
-class Point:
-    """One setting."""
+class MonteCarloPoint:
+    """Error and time of one setting."""
 
     quantity: str
     """``splits``, ``draws``, ``draw_splits`` or ``permutations``."""
@@ -60,7 +60,7 @@ def measure_tradeoff(
     permutations: Sequence[int] = PERMUTATIONS,
     repeats: int = REPEATS,
     progress: Progress | None = None,
-) -> tuple[Point, ...]:
+) -> tuple[MonteCarloPoint, ...]:
     """Measure Monte-Carlo error and time of each number, the others at their defaults.
 
     Args:
@@ -119,7 +119,9 @@ def measure_tradeoff(
             start = time.perf_counter()
             found.append(job(seed))
             seconds.append(time.perf_counter() - start)
-        points.append(Point(quantity, count, float(np.std(found, ddof=1)), of, float(np.median(seconds)), default))
+        points.append(
+            MonteCarloPoint(quantity, count, float(np.std(found, ddof=1)), of, float(np.median(seconds)), default)
+        )
     if progress is not None:
         progress(len(jobs), len(jobs), "measuring Monte-Carlo error")
     return tuple(points)

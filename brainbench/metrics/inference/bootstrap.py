@@ -31,6 +31,7 @@ from brainbench.metrics.inference.intervals import (
     percentile_interval,
     t_interval,
 )
+from brainbench.metrics.layers import held_out
 from brainbench.metrics.rdms.comparison import check_comparison, compare_all, pooling
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
@@ -60,7 +61,7 @@ class Bootstrap:
     jackknife: Floats = field(repr=False)
     """[A] the score without each animal."""
     levels: str = "animals"
-    """What was drawn."""
+    """The levels that were drawn, in words."""
 
     @property
     def standard_error(self) -> float:
@@ -282,8 +283,6 @@ def _scores(r: Floats, factors: Floats, counts: Floats) -> Floats:
 
 
 def _animal_values(r: Floats, factors: Floats) -> Floats:
-    from brainbench.metrics.layers import held_out
-
     raw = r[:, 0]
     if len(raw) > 1 and raw.shape[1] > 1:
         return held_out(raw) * factors[0]

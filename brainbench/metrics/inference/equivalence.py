@@ -1,4 +1,4 @@
-"""Is a model as much like a brain as brains are like one another? (the NeuroAI Turing test)
+"""Equivalence of a model with the animals: the NeuroAI Turing test.
 
 A large p of a difference is no evidence of equality. Two one-sided tests (Schuirmann 1987) ask instead
 whether the difference between the model's score and the animals' consistency with one another, paired
@@ -31,13 +31,13 @@ class EquivalenceTest:
     """Mean over animals of the model's value minus the animal's consistency with the others."""
     margin: float
     interval: Interval | None
-    """Of level 1 − 2α: inside ±margin exactly when the model passes."""
+    """Interval of the difference at level 1 − 2α: inside ±margin exactly when the model passes."""
     p: float
-    """Of equivalence: the larger of the two one-sided p."""
+    """p of equivalence: the larger of the two one-sided p."""
     p_lower: float
-    """That the model is worse than the animals by the margin or more (small: it is not)."""
+    """p of the hypothesis that the model is worse than the animals by the margin or more."""
     p_upper: float
-    """That the model is better than the animals by the margin or more."""
+    """p of the hypothesis that the model is better than the animals by the margin or more."""
     verdict: str
     """``equivalent``, ``worse``, ``better`` (the interval lies wholly outside the margin) or ``undecided``."""
     status: Status
@@ -45,7 +45,7 @@ class EquivalenceTest:
     animals: int = 0
 
     def summary(self) -> str:
-        """One line a person reads."""
+        """Return the result in one line."""
         if self.status == "undefined" or self.interval is None:
             return f"undefined: {self.reason}"
         text = (
@@ -73,8 +73,6 @@ def equivalence_test(
     >>> test.verdict, round(test.difference, 3)
     ('equivalent', 0.002)
     """
-    from scipy.special import stdtr
-
     if not margin > 0:
         raise UsageError(f"An equivalence margin is positive; received {margin}.")
     if not 0 < alpha < 0.5:
@@ -90,7 +88,7 @@ def equivalence_test(
         return EquivalenceTest(math.nan, margin, None, math.nan, math.nan, math.nan, "undecided", "undefined", reason)
     mean, interval = float(difference.mean()), t_interval(difference, 1 - 2 * alpha)
     error = float(difference.std(ddof=1)) / math.sqrt(count)
-    lower, upper = (_tail(distance, error, count, stdtr) for distance in (mean + margin, margin - mean))
+    lower, upper = (_tail(distance, error, count) for distance in (mean + margin, margin - mean))
     low, high = (interval.low, interval.high) if interval else (math.nan, math.nan)
     if low > -margin and high < margin:
         verdict = "equivalent"
@@ -119,8 +117,10 @@ def turing_test(
     return equivalence_test(*paired_values(score, animal_to_animal), margin=margin, alpha=alpha)
 
 
-def _tail(distance: float, error: float, count: int, cdf: object) -> float:
+def _tail(distance: float, error: float, count: int) -> float:
     """Return P(t ≥ distance/error) with count − 1 degrees of freedom."""
+    from scipy.special import stdtr
+
     if error == 0:
         return 0.0 if distance > 0 else 1.0
-    return float(cdf(count - 1, -distance / error))  # pyright: ignore[reportCallIssue]
+    return float(stdtr(count - 1, -distance / error))

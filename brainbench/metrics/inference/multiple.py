@@ -52,13 +52,13 @@ class PairTest:
     """Two models on the same animals."""
 
     first: str
-    """Name of a model."""
+    """Name of one model."""
     second: str
-    """Name of another."""
+    """Name of the other model."""
     difference: float
     """Mean over animals of the first's value minus the second's."""
     interval: Interval | None
-    """Of the difference, over animals."""
+    """Interval of the difference, over animals."""
     p: float
     """Two-sided, by flipping the signs of the animals' differences."""
     p_corrected: float

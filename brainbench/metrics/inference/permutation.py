@@ -44,7 +44,7 @@ class PermutationTest:
     smallest: float
     """Smallest p that this test could give."""
     exact: bool
-    """Whether all orders were taken."""
+    """True when all orders were taken."""
     count: int
     """Orders that were taken, the given one included."""
     observed: float

@@ -1,4 +1,4 @@
-"""Power analysis: how often would an experiment find a model that is truly alike?
+"""Power analysis: the share of experiments that find a model which is truly alike.
 
 Experiments are simulated at the level of RDMs. Every RDM is a standardised vector of correlation
 distances between random patterns, so distances that share a stimulus are dependent as they are in
@@ -83,7 +83,7 @@ class ExperimentDesign:
 
 @dataclass(frozen=True)
 class Power:
-    """How often a design finds its effect."""
+    """Share of experiments in which a design finds its effect."""
 
     design: ExperimentDesign
     power: float

@@ -14,7 +14,7 @@ from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 from brainbench.metrics.reliability.sessions import usable_sessions
-from brainbench.metrics.stimulus_labels import stimulus_means
+from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,7 @@ def animal_patterns(
     for session in sessions:
         mean = stimulus_means(session.responses, session.labels, n_stimuli)
         square = stimulus_means((session.responses - mean[session.labels]) ** 2, session.labels, n_stimuli)
-        member = np.zeros((n_stimuli, len(session.labels)))
-        member[session.labels, np.arange(len(session.labels))] = 1.0
-        number = member @ np.isfinite(session.responses)
+        number = membership(session.labels, n_stimuli) @ np.isfinite(session.responses)
         means.append(mean)
         noise.append(square / (number - 1))
     joined = np.concatenate(means, axis=1)

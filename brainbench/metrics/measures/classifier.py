@@ -25,7 +25,7 @@ ORDERS = 200
 
 @dataclass(frozen=True)
 class Decoding:
-    """How well a property is decoded for stimuli left out."""
+    """Accuracy of decoding a property of stimuli left out."""
 
     accuracy: float
     """Mean over left-out stimuli of the share of rows decoded rightly."""

@@ -49,7 +49,7 @@ class PatternMetric:
     name = ""
     title = ""
     corrected = False
-    """Whether values are corrected for noise, so that animals below the reliability gate do not count."""
+    """True when values are corrected for noise, so that animals below the reliability gate do not count."""
 
     def similarity(self, model: Floats, brain: Floats) -> float:
         """Return how alike features [K, F] and mean responses [K, U] are; larger is more alike.

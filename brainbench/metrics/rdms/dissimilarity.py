@@ -36,7 +36,7 @@ POISSON_PRIOR_WEIGHT = 0.1
 
 @dataclass(frozen=True)
 class _Responses:
-    """What a method may use: responses of K stimuli as given, and for labelled trials their codes."""
+    """Responses of K stimuli as given, and for labelled trials the codes of their stimuli."""
 
     responses: Array
     count: int
@@ -48,7 +48,7 @@ class _Responses:
 
     @property
     def missing(self) -> bool:
-        """Whether NaN means not recorded; a NaN activation makes its pattern useless instead."""
+        """True when NaN means not recorded; a NaN activation makes its pattern useless instead."""
         return self.codes is not None
 
     def patterns(self) -> Array:

@@ -39,7 +39,7 @@ class NoiseModel:
 
     @property
     def dual(self) -> bool:
-        """Whether inner products of trials are fewer numbers than those of units, and good enough."""
+        """True when inner products of trials are fewer numbers than those of units, and good enough."""
         trials, units = self.trials.shape
         return trials < units and self.ridge >= _DUAL_RIDGE * (self.ridge + self.weight * self._power)
 

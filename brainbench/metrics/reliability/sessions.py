@@ -19,7 +19,14 @@ from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.trial_hashes import Hashes, content_hashes, key_hashes
-from brainbench.metrics.stimulus_labels import check_finite, listed, response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics.stimulus_labels import (
+    check_finite,
+    listed,
+    membership,
+    response_matrix,
+    stimulus_codes,
+    stimulus_means,
+)
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,7 @@ class SortedTrials(Trials):
 
     @cached_property
     def complete(self) -> bool:
-        """Whether no response is missing."""
+        """True when no response is missing."""
         return bool(np.isfinite(self.responses).all())
 
     @cached_property
@@ -93,9 +100,7 @@ def usable_sessions(
                 f"fewer than {least} trials of {', '.join(few[:4])}" + (" and others" if len(few) > 4 else "")
             )
             continue
-        member = np.zeros((count, len(codes)))
-        member[codes, np.arange(len(codes))] = 1.0
-        splittable = (member @ np.isfinite(responses) >= least).all(axis=0)
+        splittable = (membership(codes, count) @ np.isfinite(responses) >= least).all(axis=0)
         dropped += int((~splittable).sum())
         if splittable.any():
             sessions.append(SortedTrials.sort(responses[:, splittable], codes, hashes))

@@ -68,7 +68,7 @@ class SubjectRDM:
     """Percentiles of single splits' Spearman-Brown values: how much one split would have misled, not a
     confidence interval of the reliability."""
     seed: int = 0
-    """Of splits and draws."""
+    """Seed of splits and draws."""
     problem: str | None = None
     """Why the animal has no usable RDM, in words."""
     notes: tuple[str, ...] = ()
