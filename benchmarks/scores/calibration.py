@@ -20,12 +20,12 @@ from scipy import stats
 
 from benchmarks.report import table, write_section
 from brainbench.metrics import Trials, compare, rdm, score_animals, subject_rdm
-from brainbench.metrics.inference.bootstrap import _factors, _scores, animal_counts, ceilings
+from brainbench.metrics.inference.bootstrap import animal_counts, ceilings, drawn_scores, noise_factors
 from brainbench.metrics.inference.equivalence import equivalence_test
 from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
 from brainbench.metrics.inference.multiple import sign_flip_p, step_down
 from brainbench.metrics.inference.permutation import label_orders
-from brainbench.metrics.inference.power import ExperimentDesign, _experiments
+from brainbench.metrics.inference.power import ExperimentDesign, simulate_experiments
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.rdms.comparison import compare_all, features
 from brainbench.metrics.rdms.pairs import permuted_pairs
@@ -56,7 +56,7 @@ def null_statistics(simulations: int, layers: int, animals: int, seed: int) -> t
     rng = np.random.default_rng(seed)
     held, each = [], []
     for _ in range(0, simulations, 20):
-        model, brain = _experiments(rng, ExperimentDesign(animals=animals, effect=0.0, layers=layers), 20)
+        model, brain = simulate_experiments(rng, ExperimentDesign(animals=animals, effect=0.0, layers=layers), 20)
         left, right = features(model, "pearson"), features(brain, "pearson")
         r = np.einsum("slnp,sap->snla", left[:, :, PAIRS], right, optimize=True)
         held.append(held_out(r).mean(axis=-1) if layers > 1 else r[:, :, 0].mean(axis=-1))
@@ -78,7 +78,7 @@ def p_values(simulations: int) -> Result:
     rng = np.random.default_rng(3)
     resampled = []
     for _ in range(simulations):
-        model, brain = _experiments(rng, ExperimentDesign(effect=0.0), 1)
+        model, brain = simulate_experiments(rng, ExperimentDesign(effect=0.0), 1)
         resampled.append(t_interval(compare(model[0, 0], brain[0]), 0.9).low > 0)
     found = {
         "one layer": p_of(one),
@@ -127,8 +127,8 @@ def corrections(simulations: int) -> Result:
         rng = np.random.default_rng(count)
         alarms, naive, found, alone = [], [], [], []
         for _ in range(0, simulations, 20):
-            model, brain = _experiments(rng, ExperimentDesign(animals=5, effect=0.0, layers=count), 20)
-            true, _ = _experiments(rng, ExperimentDesign(animals=5, effect=0.0), 20)
+            model, brain = simulate_experiments(rng, ExperimentDesign(animals=5, effect=0.0, layers=count), 20)
+            true, _ = simulate_experiments(rng, ExperimentDesign(animals=5, effect=0.0), 20)
             mean = features(brain, "pearson").mean(axis=1)
             null = np.einsum("slnp,sp->sln", features(model, "pearson")[:, :, PAIRS], mean, optimize=True)
             strong = features(brain, "pearson").mean(axis=1) + 0.15 * true[:, 0] / np.sqrt(15)
@@ -289,7 +289,7 @@ def coverage(simulations: int) -> Result:
         factors = 1 / np.sqrt(np.array([s.reliability for s in usable]))
         values = compare_all(pool.model[None], rdms)[0] * factors
         drawn = np.stack([compare_all(pool.model[None], s.draws)[0] for s in usable], axis=1)
-        drawn_factors = np.stack([_factors(s.draws_r) for s in usable], axis=1)
+        drawn_factors = np.stack([noise_factors(s.draws_r) for s in usable], axis=1)
         reliability = np.mean([s.reliability for s in usable])
         truth = values.mean()
         rng = np.random.default_rng(9)
@@ -301,7 +301,7 @@ def coverage(simulations: int) -> Result:
                 own = values[pick]
                 jackknife = (own.sum() - own) / (animals - 1)
                 top = counts @ own / animals
-                every = _scores(drawn[:, pick][None], drawn_factors[:, pick], counts)
+                every = drawn_scores(drawn[:, pick][None], drawn_factors[:, pick], counts)
                 intervals = (
                     t_interval(own, 0.9),
                     percentile_interval(top, 0.9),

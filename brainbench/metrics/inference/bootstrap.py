@@ -150,8 +150,8 @@ def bootstrap_animals(
     number = len(scored)
     r = compare_all(rdms, animals.rdms(animals.scored), method=comparison)[:, None]
     factors = animals.factors(animals.scored)[None]
-    estimate = float(_scores(r, factors, np.ones((1, number)))[0])
-    jackknife = _scores(r, factors, 1.0 - np.eye(number)) if number > 1 else np.empty(0)
+    estimate = float(drawn_scores(r, factors, np.ones((1, number)))[0])
+    jackknife = drawn_scores(r, factors, 1.0 - np.eye(number)) if number > 1 else np.empty(0)
     values = _animal_values(r, factors)
     if levels == "all":
         held = min(len(subject.draws) for subject in scored)
@@ -162,13 +162,13 @@ def bootstrap_animals(
             )
         drawn = np.stack([subject.draws[:draws] for subject in scored], axis=1)
         r = compare_all(rdms, drawn.reshape(-1, drawn.shape[-1]), method=comparison).reshape(-1, draws, number)
-        factors = np.stack([_factors(subject.draws_r[:draws]) for subject in scored], axis=1)
+        factors = np.stack([noise_factors(subject.draws_r[:draws]) for subject in scored], axis=1)
     generator = np.random.default_rng(seed)
     counts = animal_counts(generator, number, draws)
     what = (
         "animals" if levels == "animals" else "sessions and trials" if number == 1 else "animals, sessions and trials"
     )
-    return Bootstrap(estimate, _scores(r, factors, counts), values, jackknife, what)
+    return Bootstrap(estimate, drawn_scores(r, factors, counts), values, jackknife, what)
 
 
 def animal_counts(generator: np.random.Generator, animals: int, draws: int) -> Floats:
@@ -252,13 +252,13 @@ _LINEAR = {"pearson": _centred_gram, "cosine": _gram}
 """Comparisons that are the cosine of pooled vectors."""
 
 
-def _factors(split_half_r: Floats) -> Floats:
+def noise_factors(split_half_r: Floats) -> Floats:
     """Return noise corrections [D]; NaN without positive reliability."""
     reliability = spearman_brown(split_half_r)
     return 1 / np.sqrt(np.where(reliability > 0, reliability, np.nan))
 
 
-def _scores(r: Floats, factors: Floats, counts: Floats) -> Floats:
+def drawn_scores(r: Floats, factors: Floats, counts: Floats) -> Floats:
     """Return scores [D] from comparisons [L, D or 1, A], corrections [D or 1, A] and counts [D, A]."""
     known = np.isfinite(factors) & np.isfinite(r).all(axis=0)
     counts = np.where(known, counts, 0.0)

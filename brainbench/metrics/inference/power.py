@@ -120,7 +120,7 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
     pairs = permuted_pairs(np.concatenate(list(orders)))
     found, total = 0, 0.0
     for size in _chunks(simulations, design, len(pairs)):
-        model, brain = _experiments(generator, design, size)
+        model, brain = simulate_experiments(generator, design, size)
         null = _statistics(model, brain, pairs)
         found += int((tail_p(null.T) <= design.alpha).sum())
         total += float(null[:, 0].sum())
@@ -162,7 +162,7 @@ def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator
         yield min(step, simulations - start)
 
 
-def _experiments(generator: np.random.Generator, design: ExperimentDesign, size: int) -> tuple[Floats, Floats]:
+def simulate_experiments(generator: np.random.Generator, design: ExperimentDesign, size: int) -> tuple[Floats, Floats]:
     """Return models [S, L, P] and measured animals [S, A, P]."""
 
     def rdms(*shape: int) -> Floats:

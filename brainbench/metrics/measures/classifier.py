@@ -74,7 +74,7 @@ def decode(
         )
     if not np.isfinite(matrix).all():
         raise UsageError("Responses to be decoded must be finite; leave out units or trials with missing values.")
-    assignments = _assignments(codes, seed)
+    assignments = class_assignments(codes, seed)
     decoder = Decoder(matrix, rows, penalty=penalty)
     accuracy = np.array([decoder(assignment) for assignment in assignments])
     means = accuracy.mean(axis=1)
@@ -134,11 +134,11 @@ def _fold(matrix: Floats, rows: Ints, stimulus: int) -> _Fold:
 
 def _correct(fold: _Fold, codes: Ints, rows: Ints, penalty: float) -> float:
     target = codes[rows[rows != fold.stimulus]]
-    weight, bias = _fit(fold.train, target, int(codes.max()) + 1, penalty)
+    weight, bias = fit_softmax(fold.train, target, int(codes.max()) + 1, penalty)
     return float((np.argmax(fold.test @ weight + bias, axis=1) == codes[fold.stimulus]).mean())
 
 
-def _fit(features: Floats, target: Ints, classes: int, penalty: float) -> tuple[Floats, Floats]:
+def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) -> tuple[Floats, Floats]:
     """Return weights [D, C] and biases [C] of multinomial logistic regression, Σ loss + ‖w‖²/2C, bias free."""
     from scipy.optimize import minimize
     from scipy.special import log_softmax
@@ -165,7 +165,7 @@ def _partition(codes: Ints) -> tuple[int, ...]:
     return tuple(seen.setdefault(code, len(seen)) for code in codes.tolist())
 
 
-def _assignments(codes: Ints, seed: int) -> list[Ints]:
+def class_assignments(codes: Ints, seed: int) -> list[Ints]:
     """Return ways to give the classes to the stimuli, the given one first: all up to 200, else 200 random ones."""
     counts = np.bincount(codes)
     number = math.factorial(len(codes)) // math.prod(math.factorial(int(count)) for count in counts)

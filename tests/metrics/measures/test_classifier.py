@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics.measures.classifier import _assignments, _fit, decode
+from brainbench.metrics.measures.classifier import class_assignments, fit_softmax, decode
 
 SHAPES = ["convex"] * 3 + ["concave"] * 3
 DISTANCES = ["close", "medium", "far"] * 2
@@ -16,7 +16,7 @@ def test_the_fit_is_that_of_scikit_learn():
     linear_model = pytest.importorskip("sklearn.linear_model")
     rng = np.random.default_rng(0)
     features, target = rng.normal(size=(40, 5)), rng.integers(0, 3, 40)
-    weight, bias = _fit(features, target, 3, penalty=0.7)
+    weight, bias = fit_softmax(features, target, 3, penalty=0.7)
     expected = linear_model.LogisticRegression(C=0.7, tol=1e-8, max_iter=1000).fit(features, target)
     np.testing.assert_allclose(
         features @ weight + bias - (features @ weight + bias).mean(axis=1, keepdims=True),
@@ -49,11 +49,11 @@ def test_without_information_leaving_one_out_falls_below_chance():
 
 
 def test_all_assignments_are_tried_once():
-    assert len(_assignments(np.array([0, 0, 0, 1, 1, 1]), 0)) == 20
-    found = _assignments(np.array([0, 1, 2, 0, 1, 2]), 0)
+    assert len(class_assignments(np.array([0, 0, 0, 1, 1, 1]), 0)) == 20
+    found = class_assignments(np.array([0, 1, 2, 0, 1, 2]), 0)
     assert len(found) == len({tuple(item.tolist()) for item in found}) == 90
     assert found[0].tolist() == [0, 1, 2, 0, 1, 2]
-    assert len(_assignments(np.arange(12) % 3, 0)) == 200
+    assert len(class_assignments(np.arange(12) % 3, 0)) == 200
 
 
 def test_many_units_cost_no_more_than_trials():
@@ -69,9 +69,9 @@ def test_many_units_cost_no_more_than_trials():
 
 def test_misuse_is_told_in_a_sentence():
     rng = np.random.default_rng(4)
-    with pytest.raises(UsageError, match="at least 2 stimuli, or leaving one out loses it"):
+    with pytest.raises(UsageError, match="needs at least 2 stimuli"):
         decode(rng.normal(size=(6, 3)), range(6), ["a", "a", "a", "a", "a", "b"])
-    with pytest.raises(UsageError, match="one stimulus 0 … 5 per row"):
+    with pytest.raises(UsageError, match="one stimulus 0 … 5"):
         decode(rng.normal(size=(5, 3)), range(5), SHAPES)
     with pytest.raises(UsageError, match="must be finite"):
         decode(np.full((6, 3), np.nan), range(6), SHAPES)

@@ -188,7 +188,7 @@ def test_a_metric_without_similarity_says_so():
         name = "nothing"
 
     latent, animals = _make(Nothing())
-    with pytest.raises(UsageError, match="'nothing' does not define similarity"):
+    with pytest.raises(UsageError, match="'nothing' does not define"):
         _score(Nothing(), {"a": latent}, animals)
 
 

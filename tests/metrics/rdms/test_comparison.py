@@ -116,7 +116,7 @@ def test_permuting_the_stimuli_of_both_changes_nothing_and_arguments_commute(see
 def test_misuse_is_told_in_a_sentence():
     with pytest.raises(UsageError, match="did you mean 'pearson'"):
         compare(np.ones(3), np.ones(3), method="pearsson")
-    with pytest.raises(UsageError, match="RDMs of 3 and 4 stimuli cannot be compared"):
+    with pytest.raises(UsageError, match="RDMs of 3 and 4 stimuli"):
         compare(np.ones(3), np.ones(6))
     with pytest.raises(UsageError, match=r"K\(K−1\)/2 entries"):
         compare(np.ones(5), np.ones(5))

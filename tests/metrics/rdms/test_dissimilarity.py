@@ -243,7 +243,7 @@ def test_responses_must_be_a_matrix_of_numbers():
 
 
 def test_negative_rates_are_refused_by_poisson():
-    with pytest.raises(DataError, match="never negative; the smallest is -1"):
+    with pytest.raises(DataError, match="the smallest is -1"):
         rdm([[1.0, -1.0], [2.0, 0.0]], method="poisson")
 
 
@@ -260,7 +260,7 @@ def test_a_covariance_of_too_few_trials_names_the_way_out():
     trials[:, 3] = 1.0
     with pytest.raises(DataError, match="1 of 30 units never vary"):
         noise_precision(trials, labels)
-    with pytest.raises(DataError, match="more complete trials than stimuli"):
+    with pytest.raises(DataError, match="more complete trials"):
         noise_precision(trials[:6], labels[:6])
     with pytest.raises(UsageError, match="did you mean 'diag'"):
         noise_precision(trials, labels, method="diagg")

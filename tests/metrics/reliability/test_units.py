@@ -44,5 +44,5 @@ def test_the_order_of_trials_and_units_is_irrelevant():
 
 
 def test_misuse_is_told_in_a_sentence():
-    with pytest.raises(UsageError, match="at least 3 stimuli and 1 split"):
+    with pytest.raises(UsageError, match="at least 3 stimuli"):
         unit_reliability([_make_block()], 2)
