@@ -1,17 +1,22 @@
-"""Recordings of brains: open them, look into them, write them, and make the demo ones.
+"""Recordings of brains, and training data of whisker sweeps.
+
+Files are found and opened (``reading``; formats in ``nwb`` and ``hdf5``), adapted by the layout of their data set
+(``layouts``), counted and joined (``trials``): ``recordings`` does all of this. ``inspection`` and ``checks`` look into
+files, ``exports`` copies them, ``synthetic`` makes them, ``whisking`` reads sweeps.
 
 >>> from brainbench.datasets import open_recordings
 >>> open_recordings("sessions/*.nwb", conditions="trials:stimulus")  # doctest: +SKIP
 """
 
-from brainbench.datasets.checks.checkup import Checkup, check
+from brainbench.datasets.checks.checkup import check
 from brainbench.datasets.exports import export
 from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
-from brainbench.datasets.inspection import Inspection, inspect
-from brainbench.datasets.layouts.registry import RecordingLayout, get_layout, list_layouts, register_layout
+from brainbench.datasets.inspection import inspect
+from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.layouts.registry import get_layout, list_layouts, register_layout
 from brainbench.datasets.recordings import open_recordings
-from brainbench.datasets.sessions import Session, make_session
+from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Rule, Selection
 from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
@@ -19,13 +24,10 @@ from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 
 __all__ = [
-    "Checkup",
     "Conditions",
-    "Inspection",
     "RecordingLayout",
     "Rule",
     "Selection",
-    "Session",
     "WhiskingDataset",
     "Window",
     "check",

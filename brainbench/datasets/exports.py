@@ -1,4 +1,4 @@
-"""Write a small copy of recordings: spike times, unit columns and interval tables, never raw data.
+"""Small copies of recordings: spike times, unit columns and interval tables, never raw data.
 
 Scoring the copy gives what scoring the original gives, to the last bit: rows keep their ids, spike
 times their digits, and what coverage was taken from units that are left out is written down.
@@ -102,7 +102,7 @@ def subset(session: Session, selection: Selection = EVERYTHING, table: str = "tr
 
 
 def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-    """Columns that mean something outside their file, of the rows kept; references do not."""
+    """Return the columns that mean something outside their file, of the rows kept; references do not."""
     made: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
     for name in table.columns:
         if name == SPIKES or name.endswith("_index"):

@@ -1,4 +1,4 @@
-"""Download public recordings through the ``dandi`` client; nothing else here uses a network."""
+"""Download of public recordings through the ``dandi`` client; nothing else here uses a network."""
 
 from __future__ import annotations
 

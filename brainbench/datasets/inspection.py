@@ -108,13 +108,13 @@ class SessionSummary:
     acquired: tuple[AcquiredSummary, ...]
     """Signals in the file; their samples are never read here."""
     missing: tuple[str, ...]
-    """What scoring needs and this session lacks."""
+    """Parts that scoring needs and this session lacks."""
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is in the files of one source."""
+    """Contents of the files of one source."""
 
     path: str
     format: str

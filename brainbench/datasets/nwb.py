@@ -1,4 +1,4 @@
-"""Read Neurodata Without Borders 2.x files through h5py: units, interval tables, subject, nothing else.
+"""Sessions in Neurodata Without Borders 2.x files, read through h5py: units, interval tables, subject, nothing else.
 
 Needs no NWB schema and touches no raw data. Interval tables are every ``TimeIntervals`` under
 ``/intervals`` and in the processing modules.
@@ -24,7 +24,7 @@ _INTRACELLULAR = ("CurrentClampSeries", "VoltageClampSeries", "IZeroClampSeries"
 
 
 def is_nwb(file: h5py.File) -> bool:
-    """Tell whether an open HDF5 file is NWB, of any version."""
+    """Return whether an open HDF5 file is NWB, of any version."""
     return _type(file) == "NWBFile" or "nwb_version" in file.attrs or "nwb_version" in file
 
 
@@ -93,7 +93,7 @@ def _intracellular(file: h5py.File) -> dict[str, int]:
 
 
 def _series(parent: Any) -> Iterator[tuple[str, Series]]:
-    """Acquired signals, also those inside containers such as BehavioralTimeSeries."""
+    """Yield acquired signals by path, also those inside containers such as BehavioralTimeSeries."""
     import h5py
 
     for _, group in _groups(parent):
@@ -109,7 +109,7 @@ def _series(parent: Any) -> Iterator[tuple[str, Series]]:
 
 
 def _licks(file: h5py.File) -> Iterator[tuple[str, Series]]:
-    """Licks, which are processed data with their own times."""
+    """Yield licks, which are processed data with their own times."""
     for _, module in _groups(file.get("processing")):
         yield from (item for item in _series(module) if item[0].rpartition("/")[2] == LICKS)
 

@@ -81,7 +81,7 @@ class SessionTable:
         return values.astype(np.float64)
 
     def ids(self) -> NDArray[Any]:
-        """Row identifiers, or the row numbers when the table has none."""
+        """Return the row identifiers, or the row numbers when the table has none."""
         return decode(self.data["id"][...]) if "id" in self.data else np.arange(len(self))
 
     def ends(self, name: str) -> NDArray[np.int64]:
@@ -145,7 +145,7 @@ class Series:
         return float(np.prod(self.data.shape, dtype=np.float64) * self.data.dtype.itemsize / 1e9)
 
     def active_times(self) -> NDArray[np.float64]:
-        """Times (s, ascending) of the samples of a 0/1 signal that are 1.
+        """Return the times (s, ascending) of the samples of a 0/1 signal that are 1.
 
         Raises:
             DataError: the samples are not 0 or 1, or timestamps are missing or of another number.
@@ -296,7 +296,7 @@ def _label(value: Any) -> str:
 
 
 def natural_key(label: str) -> tuple[Any, ...]:
-    """Sort key that puts numbers in numeric order, alone or inside text.
+    """Return a sort key that puts numbers in numeric order, alone or inside text.
 
     >>> sorted(["10", "9", "b10", "b2"], key=natural_key)
     ['9', '10', 'b2', 'b10']

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.datasets import inspect, open_recordings, write_recordings
-from tests.datasets.test_nwb import write_nwb
+from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session
 
 

@@ -7,42 +7,13 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import inspect, make_session, open_recordings, trials_by_subject
 from brainbench.datasets.nwb import read_nwb
-from brainbench.datasets.nwb_writer import NwbWriter
+from tests.factories.recording_files import HUMAN, write_nwb
 
-HUMAN = "pynapple_sub-4_ses-4_ecephys+image.nwb"
 INTRACELLULAR = {
     "LantyerEtAl2018_170328_AB_277_ST50_C.nwb": "2 VoltageClampSeries",
     "LantyerEtAl2018_180817_ME_9_CC.nwb": "10 CurrentClampSeries",
     "FergusonEtAl2015_PYR5_rebound.nwb": "10 CurrentClampSeries",
 }
-
-
-def write_nwb(path, *, subject="m1", session="s1", keywords=("touch",), units=True, identifier=None, description="d"):
-    """A small NWB file: six trials of two textures, one unit, and a table inside a processing module."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with h5py.File(path, "w") as file:
-        writer = NwbWriter(
-            file,
-            identifier=identifier or path.name,
-            description=description,
-            start="2020-01-01T00:00:00+00:00",
-            general={"session_id": session, "keywords": list(keywords)} if session else {"keywords": list(keywords)},
-            subject={"subject_id": subject} if subject else {"species": "Mus musculus"},
-        )
-        start = np.arange(6.0)
-        columns = {
-            "start_time": ("s", start),
-            "stop_time": ("s", start + 0.5),
-            "texture": ("P", np.resize(np.array(["P100", "P20"]), 6)),
-            "tags": ("list", [np.array([1.0, 2.0])] * 6),
-        }
-        writer.table("intervals/trials", "TimeIntervals", "trials", np.arange(6) * 2, columns)
-        side = {**columns, "side": ("s", np.resize(np.array([1, 2]), 6))}
-        writer.table("processing/behavior/pokes", "TimeIntervals", "pokes", np.arange(6), side)
-        if units:
-            spikes = [np.arange(0.0, 6.0, 0.05)]
-            writer.table("units", "Units", "units", np.array([17]), {"spike_times": ("s", spikes)})
-    return path
 
 
 def test_interval_tables_in_processing_modules_are_found(tmp_path):

@@ -9,7 +9,6 @@ from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.datasets import (
     Selection,
-    Session,
     check,
     export,
     inspect,
@@ -17,7 +16,8 @@ from brainbench.datasets import (
     open_recordings,
     write_recordings,
 )
-from tests.datasets.test_nwb import write_nwb
+from brainbench.datasets.sessions import Session
+from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.datasets import Session, make_session
+from brainbench.datasets import make_session
+from brainbench.datasets.sessions import Session
 
 LABELS = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 

@@ -1,1 +1,4 @@
-"""Checks of recordings, worst finding first: clock, labels, spikes and tables."""
+"""Checks of recordings, worst finding first.
+
+``checkup`` opens the files and runs ``tables``, ``labels``, ``spikes`` and ``clock``, which yield ``findings``.
+"""

@@ -22,7 +22,7 @@ from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, Window
 BIN = 0.005
 """Resolution, s."""
 RESPONSE = (0.005, 0.030)
-"""When neurons answer a touch, s."""
+"""Time after a touch in which neurons answer, s."""
 BEFORE = 0.060
 """Baseline before it, s."""
 LARGEST = 600.0

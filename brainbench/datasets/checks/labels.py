@@ -91,7 +91,7 @@ def _balance(counts: Counter[str], vocabulary: tuple[str, ...] | None) -> Iterat
 
 
 def _answers(table: SessionTable) -> Iterator[Finding]:
-    """A correct trial is one where the choice was the rewarded side, in either task."""
+    """Hold outcome against choice and rewarded side: they are equal in correct trials of either task."""
     try:
         outcome, choice, side = (as_labels(table.column(name)) for name in ("outcome", "choice", "rewarded_side"))
     except BrainbenchError:

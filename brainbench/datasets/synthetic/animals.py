@@ -167,7 +167,7 @@ def _zero_fill(block: Trials, stimuli: int) -> Trials:
 
 
 def _first_appearance(block: Trials, stimuli: int) -> Trials:
-    """Number the stimuli in the order in which the session shows them."""
+    """Renumber the stimuli in the order in which the session shows them."""
     _, first = np.unique(block.labels, return_index=True)
     order = block.labels[np.sort(first)]
     number = np.full(stimuli, -1)

@@ -43,7 +43,7 @@ _ANIMALS = (
 )
 """The animals; the last is hard to read on purpose."""
 _INDIVIDUAL = 0.4
-"""How far animals differ in what they weigh (standard deviation of the logarithm)."""
+"""Standard deviation over animals of the logarithm of an afferent's weight."""
 _MANY = 4000
 """Units that stand for the shared geometry in the truth."""
 _ABANDONED = 24 * 3600.0

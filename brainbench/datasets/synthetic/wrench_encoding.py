@@ -41,7 +41,7 @@ _SPARSE = 0.25
 _SEQUENCE = 0.5
 """Share of units that need an earlier input."""
 _DELAYS = (2, 6)
-"""How much earlier, in frames; the end is excluded."""
+"""Delay of the earlier input, in frames; the end is excluded."""
 _EXPONENT = 2.0
 
 
@@ -68,14 +68,14 @@ class Population:
     earlier: NDArray[np.float64]
     """[W, A, U] mixture that must have been active before; equal to ``weights`` where none must."""
     delay: NDArray[np.int64]
-    """[U] how long before, in frames."""
+    """[U] delay of that mixture, in frames."""
     baseline: NDArray[np.float64]
     """[U] Hz."""
     gain: NDArray[np.float64]
     """[U] Hz at a drive of one root mean square."""
 
     def rates(self, afferents: Afferents) -> NDArray[np.float64]:
-        """Expected firing rate [K, T, U], Hz, before the latency."""
+        """Return the expected firing rate [K, T, U], Hz, before the latency."""
         now = _unit_scale(np.tensordot(afferents.values, self.weights, axes=2))
         before = _unit_scale(np.tensordot(afferents.values, self.earlier, axes=2))
         for delay in np.unique(self.delay[self.delay > 0]):
@@ -125,7 +125,7 @@ def draw_population(
         random: source of the draws.
         afferents: what the units listen to.
         units: number of units.
-        emphasis: [W, A] how strongly this animal weighs each afferent.
+        emphasis: [W, A] weight that this animal gives to each afferent.
         depth: strength of the tuning against the baseline.
     """
     whiskers = len(afferents.whiskers)
@@ -149,7 +149,7 @@ def draw_population(
 def window_rates(
     rates: NDArray[np.float64], frame: float, first: NDArray[np.float64], last: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Mean rate [K, U] from ``first`` [K] to each of ``last`` [N] (s after onset), averaged over N."""
+    """Return the mean rate [K, U] from ``first`` [K] to each of ``last`` [N] (s after onset), averaged over N."""
     frames = rates.shape[1]
     edges = np.arange(frames + 1) * frame + LATENCY
     total = np.concatenate([np.zeros_like(rates[:, :1]), np.cumsum(rates, axis=1) * frame], axis=1)

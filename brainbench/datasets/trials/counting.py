@@ -1,4 +1,4 @@
-"""Turn one session into counted trials: rules, windows, recorded spans, bins."""
+"""Spike counts of one session: rules, windows, recorded spans, bins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What else happened in a trial: contacts, licks and the choice, the nuisances that responses may follow.
+"""Covariates of trials: contacts, licks and the choice, the nuisances that responses may follow.
 
 They are read where a file has them and become coordinates of the trials: ``contacts``, the number of
 contacts of all tracked whiskers that begin inside the window; ``licks``, the number of licks inside it;

@@ -1,4 +1,4 @@
-"""Join the sessions that were read into one recordings data set."""
+"""Join of the sessions that were counted: one recordings data set in canonical order."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _left_out(part: SessionCounts) -> str:
 
 
 def _content(part: SessionCounts) -> tuple[Any, ...]:
-    """What makes the data: all else (window, selection, file names) only says how they came about."""
+    """Return what makes the data: all else (window, selection, file names) only says how they came about."""
     names = (part.subject, part.session, part.labels, part.trial_ids, part.unit_ids)
     return part.counts, part.duration, names
 

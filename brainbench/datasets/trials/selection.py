@@ -1,4 +1,4 @@
-"""Which trials and units enter: rules that are stated, applied in order, and counted."""
+"""Selection of trials and units: rules that are stated, applied in order, and counted."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class Selection:
         return replace(selection, trials=tuple(trials), units=tuple(units))
 
     def lines(self) -> Iterator[str]:
-        """Say every rule in one line each."""
+        """Yield every rule, one line each."""
         yield from (f"trials: {rule}" for rule in self.trials)
         yield from (f"units: {rule}" for rule in self.units)
         if self.min_spikes:
@@ -138,7 +138,7 @@ DEFAULT = Selection(name="default")
 
 @dataclass
 class Tally:
-    """How many rows each rule removed; trials and units stand under separate keys."""
+    """Numbers of rows that each rule removed; trials and units stand under separate keys."""
 
     removed: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)

@@ -110,7 +110,7 @@ def trials_by_subject(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
 
 
 def _unique(keys: list[str]) -> tuple[str, ...]:
-    """Number repeated keys, in the canonical (time) order of the trials."""
+    """Return the keys, repeated ones numbered in the canonical (time) order of the trials."""
     seen: dict[str, int] = {}
     result = []
     for key in keys:

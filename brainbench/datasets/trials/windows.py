@@ -1,4 +1,4 @@
-"""When responses are read: from one event of each trial to another, in bins."""
+"""Windows in which responses are read: from one event of each trial to another."""
 
 from __future__ import annotations
 

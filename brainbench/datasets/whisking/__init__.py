@@ -1,1 +1,5 @@
-"""Training data: sharded whisker sweeps, their memory, and whether their classes can be told apart."""
+"""Training data: whisker sweeps in shards.
+
+``files`` opens the shards, ``dataset`` makes batches of them in reused ``memory``, and ``separability`` measures how
+well their classes are told apart.
+"""

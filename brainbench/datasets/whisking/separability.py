@@ -65,7 +65,7 @@ def separability(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Separability, ...]:
-    """Tell classes apart by the forces and moments of all whiskers.
+    """Measure how well classes are told apart by the forces and moments of all whiskers.
 
     A sweep's features are its forces and moments averaged over steps of five frames, all whiskers side by side,
     divided by the root mean square of each channel; the machine is an SVC with radial kernel (C = 10, its width from
@@ -111,9 +111,9 @@ def separate(
     names: Sequence[str],
     seed: int = 0,
 ) -> Separability:
-    """Tell classes apart by features [n, F], all choices of ``count`` classes; ``names`` are those of the labels [n].
+    """Measure how well classes are told apart by features [n, F], for all choices of ``count`` of them.
 
-    Sweeps of the same object (``objects`` [n]) stay on one side of every test.
+    ``names`` are those of the labels [n]. Sweeps of the same object (``objects`` [n]) stay on one side of every test.
 
     Raises:
         UsageError: there are fewer classes than ``count``.

@@ -15,34 +15,8 @@ from brainbench.datasets import (
     open_recordings,
     write_recordings,
 )
+from tests.factories.recording_files import ROWS, detection, write_rodgers
 from tests.factories.recordings import LABELS
-
-ROWS = 14
-
-
-def write_rodgers(path, *, contacts=True, lost=(), subject="231CR", units=None, **columns):
-    """Fourteen trials of 10 s in the layout of Rodgers 2022; contact after 2 s, choice after 3 s."""
-    start = 10.0 * np.arange(ROWS)
-    trials = {
-        "id": np.arange(ROWS) * 2 + 30,
-        "start_time": start,
-        "stop_time": start + 10,
-        "stimulus": np.resize(np.repeat(["convex", "concave"], 3), ROWS),
-        "servo_position": np.resize(np.array(["far", "medium", "close"]), ROWS),
-        "outcome": np.full(ROWS, "correct"),
-        "choice_time": start + 3,
-        "direct_delivery": np.zeros(ROWS, dtype=bool),
-        "stim_is_random": np.ones(ROWS, dtype=bool),
-        "optogenetic": np.zeros(ROWS, dtype=bool),
-        "ignore_trial": np.zeros(ROWS, dtype=bool),
-    } | {name: np.asarray(values) for name, values in columns.items()}
-    tables = {"trials": {name: values for name, values in trials.items() if values.ndim}}
-    if contacts:
-        tables["contacts_by_whisker_C1"] = {"start_time": start + 2.0, "stop_time": start + 2.1}
-        tables["contacts_by_whisker_C2"] = {"start_time": start + 2.5, "stop_time": start + 2.5}
-    tables = {name: table for name, table in tables.items() if name[-2:] not in lost}
-    spikes = [np.arange(0.0, 10.0 * ROWS, 0.1) - 0.01] * (len(units["layer"]) if units else 1)
-    return write_recordings(path, make_session(subject, "1", spikes, tables, unit_columns=units))
 
 
 def one(index, value, other):
@@ -153,12 +127,6 @@ def test_inspection_proposes_the_conditions_of_the_layout_first(tmp_path):
     assert report.layout == "rodgers"
     assert report.proposals[0].conditions == "trials:stimulus,servo_position"
     assert report.proposals[0].labels == LABELS
-
-
-def detection(**columns):
-    """Every seventh trial without a shape: its position means nothing."""
-    stimulus = np.resize(np.array([*["convex"] * 3, *["concave"] * 3, "nothing"]), ROWS)
-    return {"stimulus": stimulus, "servo_position": np.resize(np.array(["far", "medium", "close"]), ROWS), **columns}
 
 
 def test_the_two_tasks_can_be_read_apart(tmp_path):
