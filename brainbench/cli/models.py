@@ -73,11 +73,10 @@ def show(
     from brainbench.models.recipes import find_recipe, list_recipes
     from brainbench.models.registry import describe_model
 
-    published = name in list_recipes()
-    record = describe_model(name.partition("-warmup")[0] if published else name)
+    recipe = find_recipe(name) if name in list_recipes() else None
+    record = describe_model(recipe.model if recipe else name)
     data = to_plain(record)
-    if published:
-        recipe = find_recipe(name)
+    if recipe:
         data["recipe"] = to_plain(recipe)
         if not as_json:
             data["recipe"] |= {"setting": str(recipe.setting), "search": [f"({item})" for item in recipe.search]}

@@ -17,6 +17,8 @@ from brainbench.core.errors import MissingDependencyError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    import torch
+
 
 _STARTING = threading.Lock()
 
@@ -109,6 +111,24 @@ def pick_device(name: Any) -> Any:
             "'mujoco'."
         )
     return wp.get_device(name)
+
+
+def torch_device(name: Any) -> torch.device:
+    """Return the torch device called ``cpu``, ``cuda`` or ``cuda:1``; a torch device passes through.
+
+    Raises:
+        UsageError: not a device, or none that is here.
+    """
+    import torch
+
+    try:
+        found = torch.device(name)
+    except (RuntimeError, TypeError) as error:
+        raise UsageError(f"{name!r} is not a device; name cpu, cuda or cuda:N.") from error
+    count = torch.cuda.device_count()
+    if found.type == "cuda" and (found.index or 0) >= count:
+        raise UsageError(f"There is no device {str(found)!r} here ({count} CUDA devices); name cpu instead.")
+    return found
 
 
 def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from brainbench.core.devices import torch_device
 from brainbench.core.errors import UsageError
 
 Array = Any
@@ -39,17 +40,7 @@ def find_device(device: Any, *arrays: Any) -> Any:
         device = next((array.device for array in arrays if is_tensor(array)), None)
         if device is None:
             return None
-    import torch
-
-    try:
-        found = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise UsageError(f"{device!r} is no torch device; give 'cuda', 'cuda:1' or 'cpu'.") from error
-    if found.type == "cuda" and (not torch.cuda.is_available() or (found.index or 0) >= torch.cuda.device_count()):
-        raise UsageError(
-            f"There is no device {str(found)!r} here ({torch.cuda.device_count()} CUDA devices); leave device out to "
-            "compute on the processor."
-        )
+    found = torch_device(device)
     if found.type == "mps":
         raise UsageError("The device 'mps' has no float64, which RDMs need; leave device out.")
     return found

@@ -63,7 +63,12 @@ class PublishedTraining:
     @property
     def name(self) -> str:
         """``architecture.objective[-variant]``."""
-        return f"{self.architecture}.{self.objective}" + (f"-{self.variant}" if self.variant else "")
+        return self.model + (f"-{self.variant}" if self.variant else "")
+
+    @property
+    def model(self) -> str:
+        """Name of the model that it trains, ``architecture.objective``."""
+        return f"{self.architecture}.{self.objective}"
 
 
 PROBE = TrainingSetting("sgd", "step", 0.1)

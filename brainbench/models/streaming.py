@@ -103,7 +103,6 @@ class _GraphPart(nn.Module):
         sources = {edge.source for edge in graph.spec.edges}
         self.outputs = tuple(name for name in state.outputs if name in sources)
         self.memories = tuple(state.memories)
-        self.silent = {name: tuple(state.outputs[name].shape[1:]) for name in state.outputs if name not in sources}
         kept = [state.outputs[name] for name in self.outputs] + [state.memories[name] for name in self.memories]
         self.shapes = tuple(tuple(item.shape[1:]) for item in kept)
 

@@ -142,7 +142,7 @@ def test_memory_that_must_not_be_written_is_read():
 
 
 def test_devices_that_cannot_be_used_are_named():
-    with pytest.raises(UsageError, match="'gpu' is no torch device"):
+    with pytest.raises(UsageError, match="'gpu' is not a device"):
         rdm(np.eye(3), device="gpu")
     with pytest.raises(UsageError, match="no device 'cuda:99' here"):
         rdm(np.eye(3), device="cuda:99")
@@ -160,5 +160,5 @@ def test_infinite_trials_are_refused_on_a_device_too():
 def test_a_covariance_by_name_is_spelled_right_and_has_trials():
     with pytest.raises(UsageError, match="did you mean 'shrinkage_diag'"):
         rdm(np.eye(4), method="mahalanobis", precision="shrinkage-diag")
-    with pytest.raises(UsageError, match="give labels"):
+    with pytest.raises(UsageError, match="estimated from trials: give labels"):
         rdm(np.eye(4), method="mahalanobis", precision="diag")

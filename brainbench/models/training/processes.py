@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from brainbench.core.devices import torch_device
 from brainbench.core.errors import UsageError
 
 
@@ -81,15 +82,9 @@ def processes(device: str | None = None) -> Iterator[Processes]:
     Raises:
         UsageError: the device does not exist.
     """
-    chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    where = torch_device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     count, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
-    try:
-        where = torch.device(chosen)
-    except RuntimeError as error:
-        raise UsageError(f"{chosen!r} is not a device; name cpu, cuda or cuda:N.") from error
     if where.type == "cuda":
-        if not torch.cuda.is_available():
-            raise UsageError(f"The device {chosen!r} was asked for and PyTorch sees no CUDA; name cpu instead.")
         if where.index is None:
             where = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(where)
