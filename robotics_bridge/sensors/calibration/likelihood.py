@@ -149,8 +149,10 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
         found = minimize(lambda p: target(dynamics(p)), start, method="Nelder-Mead", options=options)
         return [float(value) for value in found.x], float(found.fun)
 
-    noise, plain_cost = minimum(lambda p: Dynamics(*p, 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)])
-    plain = Dynamics(*noise, 0.0, no_lag)
+    noise, plain_cost = minimum(
+        lambda p: Dynamics(p[0], p[1], 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)]
+    )
+    plain = Dynamics(noise[0], noise[1], 0.0, no_lag)
     best, cost = plain, plain_cost
     if moving:
         taus = np.geomspace(2 * dt, min(duration / 4, 100.0 * dt), 5)
@@ -158,10 +160,10 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
             taus = [known.dynamics.tau]
         for tau in taus:
             found, value = minimum(
-                lambda p: Dynamics(*p[:3], min(max(p[3], -20.0), 10.0)), [*noise, 0.1, math.log(tau)]
+                lambda p: Dynamics(p[0], p[1], p[2], min(max(p[3], -20.0), 10.0)), [*noise, 0.1, math.log(tau)]
             )
             if value < cost - 1e-9:
-                best, cost = Dynamics(*found), value
+                best, cost = Dynamics._make(found), value
     hysteresis = moving and 2 * (plain_cost - cost) > _SIGNIFICANT + 2.6
     if not hysteresis:
         best, cost = plain, plain_cost
