@@ -25,7 +25,8 @@ from robotics_bridge.sensors import (
     find_modes,
 )
 from robotics_bridge.sensors.audio.materials import ElasticMaterial
-from robotics_bridge.sensors.calibration.calibrate import Log, calibrate
+from robotics_bridge.sensors.calibration.calibrate import calibrate
+from robotics_bridge.sensors.calibration.log import Log
 from robotics_bridge.sensors.noise.stages import simulate
 from robotics_bridge.sensors.temperature.materials import material
 

@@ -15,7 +15,7 @@ from brainbench.core.errors import unknown_name
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the object is, and how far the fingers are closed."""
+    """A place of the object, and how far the fingers are closed."""
 
     x: float = 0.0
     y: float = 0.0
@@ -33,7 +33,7 @@ class Procedure:
 
     name: str
     text: str
-    """What it is for, in words."""
+    """Purpose, in words."""
     pose: Callable[[float], Pose]
     """Time from 0 to 1 s → pose."""
 

@@ -1,4 +1,4 @@
-"""What the taxels of a hand feel while objects are explored: [K, T, 35, 6] and, as input of encoders, [K, T, 30, 5, 7].
+"""Touch of a hand that explores objects: [K, T, 35, 6] and, as input of encoders, [K, T, 30, 5, 7].
 
 Objects follow their movement exactly, as if held by a strong robot, with true velocities; the hand's own servos give
 way. Letters: K condition (object and procedure), T frame of 9 ms, S sub-step of a time step.
@@ -61,7 +61,7 @@ class Explored:
     mesh: Mesh | None = None
     """A surface. It collides as its convex hull; what taxels feel is the surface itself."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """How it is held (w, x, y, z)."""
+    """Orientation in which it is held (w, x, y, z)."""
     retreat: float = 0.0
     """Held so much further away than the procedure says (m)."""
 
@@ -80,7 +80,7 @@ class Explored:
 
 @dataclass(frozen=True, eq=False)
 class HandRecording:
-    """What a hand felt."""
+    """Touch of a hand, by condition."""
 
     hand: str
     resolution: str
@@ -88,15 +88,15 @@ class HandRecording:
     labels: tuple[str, ...]
     """One per condition: object, or object/procedure where there are several procedures."""
     objects: tuple[str, ...]
-    """Of each condition."""
+    """Object of each condition."""
     procedures: tuple[str, ...]
-    """Of each condition."""
+    """Procedure of each condition."""
     times: NDArray[np.float64]
     """[T] (s)."""
     wrench: NDArray[np.float32]
     """[K, T, 35, 6] of every site about its centre (N, N·m; palm's axes; action of the object on the skin)."""
     config: Mapping[str, Any]
-    """What was asked for."""
+    """Options of the recording."""
 
     def grid(self) -> torch.Tensor:
         """Return the wrenches as [K, T/S, S·6, 5, 7], in the hand's own units.

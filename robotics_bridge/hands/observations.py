@@ -1,4 +1,4 @@
-"""What a policy gets from the sensors of a hand: the tactile observation types of the thesis (tables 4.3, 4.6).
+"""Observations of a policy from the sensors of a hand: the tactile types of the thesis (tables 4.3, 4.6).
 
 Readings are those of one sensor per link, in the layout's order. Letters: B environment, N probe of a link, L link.
 """

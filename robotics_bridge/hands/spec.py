@@ -79,7 +79,7 @@ class Pad:
 
 @dataclass(frozen=True)
 class Grid:
-    """How many probes a pad carries at one resolution."""
+    """Probes of a pad at one resolution."""
 
     rows: int
     columns: int
@@ -97,9 +97,9 @@ class Link:
     mass: float
     """[kg], of all its solids."""
     solids: tuple[Solid, ...] = ()
-    """What collides and carries the mass; a pad lies on the first."""
+    """Solids that collide and carry the mass; a pad lies on the first."""
     pad: Pad | None = None
-    """Where it feels; None for nowhere."""
+    """Sensing surface; None if it feels nothing."""
     grids: Mapping[str, Grid] = field(default_factory=dict)
     """Resolution → grid."""
 
@@ -114,7 +114,7 @@ class Joint:
     child: str
     """Link that it moves."""
     position: Vector
-    """Of the child's frame in the parent's [m]."""
+    """Origin of the child's frame in the parent's [m]."""
     rpy: Vector
     """Rotation of the child's frame about the parent's fixed x, y, z axes [rad], as in URDF."""
     axis: Vector
@@ -151,7 +151,7 @@ class HandSpec:
     apart: tuple[tuple[str, str], ...] = ()
     """Pairs of links that overlap at rest and must not collide, besides neighbours."""
     source: str = ""
-    """Where the facts come from."""
+    """Source of the numbers."""
 
     def __post_init__(self) -> None:
         names = [link.name for link in self.links]

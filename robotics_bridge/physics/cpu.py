@@ -227,7 +227,7 @@ class _Gatherer:
             )
 
     def _forces(self, found: Sequence[tuple[NDArray[Any], ...]]) -> NDArray[np.float64]:
-        """Normal force of every contact: with a pyramidal cone the sum of its edges."""
+        """Return the normal force of every contact: with a pyramidal cone the sum of its edges."""
         address, dim = (np.concatenate([parts[index] for parts in found]) for index in (4, 5))
         before = np.cumsum([0, *(len(parts[6]) for parts in found)])
         total = np.concatenate([[0.0], *(parts[6] for parts in found)]).cumsum()

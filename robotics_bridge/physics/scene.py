@@ -1,4 +1,4 @@
-"""What sensors may touch: links and the geometries fixed to them, which of them may meet, and who differs where.
+"""Scenes for sensors: links, the geometries fixed to them, pairs that may meet, and variants by environment.
 
 Letters: G geometry, L link. Lengths in metres; quaternions here are (w, x, y, z), as in MuJoCo.
 """
@@ -43,7 +43,7 @@ class Geometry:
     size: tuple[float, ...] = ()
     """Radius (sphere); radius and half length (capsule, cylinder); half axes (ellipsoid); half edges (box) [m]."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of its frame in the link's frame [m]."""
+    """Origin of its frame in the link's frame [m]."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation in the link's frame (w, x, y, z)."""
     mesh: Mesh | None = None
@@ -88,7 +88,7 @@ class Geometry:
 
     @property
     def collides(self) -> bool:
-        """Whether it can touch anything at all."""
+        """True if it can touch anything at all."""
         return bool(self.contype or self.affinity)
 
 

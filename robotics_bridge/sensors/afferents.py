@@ -33,7 +33,7 @@ class Band:
     high: float
     """Upper edge [Hz]."""
     order: int = 2
-    """Of the Butterworth filter at each edge."""
+    """Order of the Butterworth filter at each edge."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.low < self.high and math.isfinite(self.high)):

@@ -36,7 +36,7 @@ class Clock:
 
 @dataclass(eq=False)
 class LaunchContext:
-    """Where kernels run, and what their random numbers depend on."""
+    """Device of kernels, and what their random numbers depend on."""
 
     num_envs: int
     """B."""
@@ -60,7 +60,7 @@ class LaunchContext:
 
 @dataclass(eq=False)
 class SuiteContext(LaunchContext):
-    """What a suite lends to the runtimes of its sensors."""
+    """Parts of a suite that the runtimes of its sensors share."""
 
     scene: TouchScene
     solids: Solids
@@ -79,7 +79,7 @@ class ReadoutSlice:
     layout: tuple[int, ...]
     """(n,) or (ny, nx)."""
     scalar: bool = False
-    """Whether a reading has no channel axis."""
+    """True if a reading has no channel axis."""
     active: NDArray[np.bool_] | None = None
     """[n] False for fillers, which read 0; None if there are none."""
 

@@ -1,4 +1,4 @@
-"""How exactly sensors ask their questions: query, resolution of distance fields, surface points. Measured, not guessed.
+"""Exactness of sensors, with measured error and cost: query, resolution of distance fields, surface points.
 
 The shipped table is made by ``brainbench tradeoff tactile`` (:mod:`robotics_bridge.sensors.tradeoff`).
 """
@@ -28,7 +28,7 @@ class SensorFidelity:
     """
 
     query: Literal["sdf", "raycast"] = "sdf"
-    """How meshes are asked for their distance: sampled fields, or the nearest triangle."""
+    """Way to ask meshes for their distance: sampled fields, or the nearest triangle."""
     resolution: int = 64
     """Cells of a distance field along the longest edge of its mesh."""
     points: int = 2000

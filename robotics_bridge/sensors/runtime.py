@@ -29,9 +29,9 @@ class Runtime(abc.ABC):
     """Serves the sensors of one group. Updates launch kernels and do nothing else, so that they can be recorded."""
 
     slices: Mapping[str, ReadoutSlice]
-    """Where the reading of each sensor lies, by name."""
+    """Place of the reading of each sensor, by name."""
     recordable: bool = True
-    """Whether its updates can become part of a CUDA graph."""
+    """True if its updates can become part of a CUDA graph."""
 
     @abc.abstractmethod
     def update(self, state: HandState, dt: float) -> None:
@@ -101,7 +101,7 @@ class ReadoutRuntime(Runtime):
             fused and any(noise.hysteresis for noise in noises),
             fused and any(noise.walk for noise in noises),
         )
-        """Whether the sensor's kernel keeps hysteresis and drift."""
+        """True for hysteresis, and for drift, that the sensor's kernel keeps."""
         shape = (channels, context.num_envs, self.count)
 
         def planes(wanted: bool) -> Any:

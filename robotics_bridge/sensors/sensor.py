@@ -85,13 +85,13 @@ class ProbeSensor(Sensor):
     """A sensor made of probes that look at geometries of other links."""
 
     probes: Probes
-    """Where its probes sit, in the frame of the link."""
+    """Places of its probes, in the frame of the link."""
     track: tuple[str, ...] = ()
     """Links it looks at; empty means everything that may touch its link."""
 
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
     contact_only: ClassVar[bool] = False
-    """Whether it meets only geometries that the engine reports in contact with its link."""
+    """True if it meets only geometries that the engine reports in contact with its link."""
 
     def layout(self) -> tuple[int, ...]:
         """Return the shape (N,) or (rows, columns) of the reading of one environment, without channels."""
@@ -128,7 +128,7 @@ class QuerySensor(ProbeSensor):
 
     @property
     def contact_only(self) -> bool:  # type: ignore[override]
-        """Whether it meets only geometries that the engine reports in contact with its link."""
+        """True if it meets only geometries that the engine reports in contact with its link."""
         return self.pairs == "contact"
 
     def group(self) -> Hashable:

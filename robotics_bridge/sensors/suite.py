@@ -219,14 +219,14 @@ class SensorSuite:
 
     @property
     def diverged(self) -> torch.Tensor:
-        """Which environments [B] held numbers that are not finite at the last update; their readings are NaN."""
+        """Mask [B] of environments that held numbers that are not finite at the last update; their readings are NaN."""
         if self._status is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
         return (warp().to_torch(self._status) & DIVERGED) != 0
 
     @property
     def crowded(self) -> torch.Tensor:
-        """Which environments [B] ever had more geometries in contact with one sensor link than are looked at."""
+        """Mask [B] of environments that ever had more geometries in contact with one sensor link than are looked at."""
         return warp().to_torch(self.pairs.crowded) != 0
 
     @property

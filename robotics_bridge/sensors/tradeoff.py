@@ -100,7 +100,7 @@ def _shortest(vectors: NDArray) -> NDArray:
 
 
 def _run(solid: Geometry, sensor: Sensor, places: NDArray, resolution: int = 64) -> tuple[NDArray, float]:
-    """Readings over places [n, 3] of an object, and the cost of an update per environment (µs)."""
+    """Return readings over places [n, 3] of an object, and the cost of an update per environment (µs)."""
     scene = TouchScene(("world", "hand", "object"), (_PAD, solid))
     count = len(places)
     suite = SensorSuite(scene, {"s": sensor}, num_envs=count, resolution=resolution)
@@ -144,7 +144,7 @@ def _torus() -> Geometry:
 
 @cache
 def _exact_field(part: str) -> NDArray[np.float64]:
-    """Forces [n, 400, 3] of the taxels in double precision."""
+    """Return the forces [n, 400, 3] of the taxels in double precision."""
     grid, places = _grid(), _mesh_places(part)
     exact = np.zeros((len(places), len(grid), 3))
     for row, place in zip(exact, places, strict=True):
@@ -178,7 +178,7 @@ def _mesh_point(part: str, query: str, resolution: int | None) -> dict[str, Any]
 
 @cache
 def _exact_proximity() -> NDArray[np.float64]:
-    """Normal forces [n, 36] from 200,000 points in double precision."""
+    """Return the normal forces [n, 36] from 200,000 points in double precision."""
     dense, places, grid = surface_points(_CYLINDER, 200_000), _places(0.019), _pads()
     exact = np.zeros((len(places), len(grid)))
     for row, place in zip(exact, places, strict=True):
@@ -208,7 +208,7 @@ def _taxels_point(side: int) -> dict[str, Any]:
 
 
 def _integral(places: NDArray) -> NDArray[np.float64]:
-    """Total force of the continuous pad, by a rule of 600 × 600 points in double precision."""
+    """Return the total force of the continuous pad, by a rule of 600 × 600 points in double precision."""
     side = (np.arange(600) + 0.5) / 600 * 0.03 - 0.015
     x, y = np.meshgrid(side, side)
     exact = []

@@ -167,7 +167,8 @@ def calibrate(
     """
     from brainbench.core.errors import UsageError
     from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
-    from robotics_bridge.sensors.calibration.calibrate import describe, read_log
+    from robotics_bridge.sensors.calibration.calibrate import describe
+    from robotics_bridge.sensors.calibration.log import read_log
 
     if not max_delay >= 0:
         raise UsageError(f"--max-delay is zero or positive (s); received {max_delay:g}.")

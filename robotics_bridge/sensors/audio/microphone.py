@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Microphone:
-    """Where the listener is and how sound reaches it.
+    """A place of a listener, and the way sound takes to it.
 
     Raises:
         UsageError: a number lies outside its range.

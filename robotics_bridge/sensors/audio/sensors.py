@@ -49,7 +49,7 @@ class AudioSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ContactAudio(AudioSensor):
-    """What a link sounds like when it is struck and rubbed: [1, K] samples.
+    """Sound of a link that is struck and rubbed: [1, K] samples.
 
     A rise of the summed normal force by more than ``threshold`` within one update is an impact of the impulse
     ΔF·Δt; sliding is noise of the strength F·v. Engines that give no contact forces are silent.
@@ -61,7 +61,7 @@ class ContactAudio(AudioSensor):
     runtime: ClassVar[str] = "robotics_bridge.sensors.audio.runtime:ContactAudioRuntime"
 
     modes: Modes
-    """Of the link, from ``find_modes`` or by hand."""
+    """Modes of the link, from ``find_modes`` or by hand."""
     threshold: float = 0.1
     """Smallest rise of force that is an impact [N]."""
     impact: float = 1.0
@@ -88,7 +88,7 @@ class ContactAudio(AudioSensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ActuationAudio(AudioSensor):
-    """What the drives of a hand sound like: [J, K] samples, one emitter per joint.
+    """Sound of the drives of a hand: [J, K] samples, one emitter per joint.
 
     Loudness is β_load |τ| + β_pow |τ ω|, the whine a bank of partials on κ |ω|. Write torque and speed of the joints
     to the views of :func:`joint_drive` before each update.

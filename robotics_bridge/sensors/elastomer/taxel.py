@@ -27,7 +27,7 @@ class Layer:
     softening: float = 1e-3
     """Radius over which a surface point spreads its traction (m)."""
     thickness: float = 0.0
-    """Of a layer bonded to a rigid base (m); 0 means a half-space."""
+    """Thickness of a layer bonded to a rigid base (m); 0 means a half-space."""
     recoil: float = 0.0
     """κ: how much of the push past its middle turns round, by 1 − κ λ_d r². The net push is 1 − 2κ of the published
     one: at ½ the gel takes all that is displaced up, above it is drawn in, as under any load on a compressible body."""
@@ -81,7 +81,7 @@ class ElastomerTaxel(QuerySensor):
     """Height (m) above the pad at which it lets go."""
     layer: Layer | None = None
     dilation: Literal["auto", "separable", "fft", "direct"] = "auto"
-    """How sources are summed. Planar grids: ``separable`` passes (``auto``), or ``fft``. Curved ones: ``direct``."""
+    """Way to sum sources. Planar grids: ``separable`` passes (``auto``), or ``fft``. Curved ones: ``direct``."""
 
     channels: ClassVar[int] = 3
     units: ClassVar[str] = "m"
@@ -105,13 +105,13 @@ class ElastomerTaxel(QuerySensor):
 
     @property
     def planar(self) -> bool:
-        """Whether its markers form a regular planar grid without fillers."""
+        """True if its markers form a regular planar grid without fillers."""
         probes = self.probes
         return probes.pitch is not None and len(probes.shape) == 2 and bool(probes.active.all())
 
     @property
     def way(self) -> str:
-        """How its dilation is summed."""
+        """Way in which its dilation is summed."""
         if self.dilation != "auto":
             return self.dilation
         if not self.planar:

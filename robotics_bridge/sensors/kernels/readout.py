@@ -1,4 +1,4 @@
-"""How kernels hand over readings: the truth, and the measured branch with its memories, each written once.
+"""Output of the sensor kernels: the truth, and the measured branch with its memories, each written once.
 
 Planar storage [C, B, N]: neighbouring probes are neighbours in memory. Letters: B environment, N probe, C channel.
 """

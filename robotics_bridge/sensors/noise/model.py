@@ -1,4 +1,4 @@
-"""What a real sensor does to the signal: the noise model of the thesis (equations 4.22–4.28, tables 4.2 and 4.12).
+"""Noise model of a real sensor, as in the thesis (equations 4.22–4.28, tables 4.2 and 4.12).
 
 Order of the measured branch: radius noise and gain → crosstalk → hysteresis → random walk → white noise → bias →
 quantisation → dead probes → threshold → delay. The ground truth is never touched. Values are drawn by counter
@@ -106,7 +106,7 @@ class Noise:
 
     @property
     def active(self) -> bool:
-        """Whether the measured reading can differ from the truth."""
+        """True if the measured reading can differ from the truth."""
         return bool(self.set_knobs)
 
     def check(self, knobs: frozenset[str], sensor: str) -> None:

@@ -1,4 +1,4 @@
-"""Where the probes of a sensor sit: planar grids, explicit lists, patches of a mesh. Metres, link frame."""
+"""Places of the probes of a sensor: planar grids, explicit lists, patches of a mesh. Metres, link frame."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Probes:
 
     @property
     def active(self) -> NDArray[np.bool_]:
-        """Which probes [N] are none of the fillers."""
+        """Mask [N] of the probes that are no fillers."""
         return self.radius > 0
 
     @classmethod

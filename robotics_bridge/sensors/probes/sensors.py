@@ -23,7 +23,7 @@ class SurfaceDistanceProbe(QuerySensor):
     """
 
     nearest: bool = False
-    """Whether the nearest surface points are kept too (``SensorSuite.read_nearest``)."""
+    """True if the nearest surface points are kept too (``SensorSuite.read_nearest``)."""
     max_range: float = math.inf
     """Distance (m) that is read where nothing is nearer."""
 
@@ -43,7 +43,7 @@ class SurfaceDistanceProbe(QuerySensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ContactDepthProbe(QuerySensor):
-    """How deep each probe's sensing sphere overlaps what touches the link [N] (m; thesis 4.2)."""
+    """Depth [N] to which each probe's sensing sphere overlaps what touches the link (m; thesis 4.2)."""
 
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS

@@ -1,1 +1,3 @@
-"""How sensors ask for geometry: contact pairs, solids, distance fields and surface points."""
+"""Geometry that sensors ask for: ``solids`` with ``distance_fields``, ``pairs`` of links and geometries, and
+``surface_points``. An update lists pairs first; kernels of sensors then ask the solids of each pair.
+"""

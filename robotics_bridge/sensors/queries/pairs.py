@@ -63,7 +63,7 @@ class PairTable:
 
     @property
     def contacts_needed(self) -> bool:
-        """Whether any slot looks at the contact list."""
+        """True if any slot looks at the contact list."""
         return any(slot["contact"] for slot in self._slots)
 
     @property

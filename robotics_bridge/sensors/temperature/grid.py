@@ -45,27 +45,27 @@ class TemperatureGrid(Sensor):
     high: tuple[float, float, float] | None = None
     """Upper corner [m, link frame]."""
     material: str | ThermalMaterial = "silicone"
-    """Of the link."""
+    """Material of the link."""
     base_temperature: float = 22.0
-    """Of all cells at a reset [°C]."""
+    """Temperature of all cells at a reset [°C]."""
     ambient_temperature: float = 22.0
-    """Of the surroundings [°C]."""
+    """Temperature of the surroundings [°C]."""
     convection: float = 10.0
     """Coefficient h [W/(m²·K)] over the outer faces; 0 for none. Radiation follows the material's emissivity."""
     radiates: bool = True
-    """Whether outer faces radiate."""
+    """True if outer faces radiate."""
     source: Any = 0.0
     """Heat made inside [W/m³]: one number, or an array [nx, ny, nz]."""
     bodies: Mapping[str, ThermalBody] = field(default_factory=dict)
     """Link → what it is made of, for links that may touch this one; all others are ``other``."""
     other: ThermalBody = field(default_factory=ThermalBody)
-    """What every other link is made of."""
+    """Material and temperature of every other link."""
     conduction: Literal["physical", "thesis"] = "physical"
     """``physical``: the cell (half its depth, and the spreading of a small spot), the interface and the touched body
     (a half-space that gave heat through the spot since the contact began) in series. ``thesis``: 4.38 and 4.39,
     harmonic conductivity over the length V / A."""
     contact_conductance: float = math.inf
-    """Of the bare interface [W/(m²·K)]; infinite is a perfect one."""
+    """Conductance of the bare interface [W/(m²·K)]; infinite is a perfect one."""
     contact_radius: float = 0.005
     """Radius R of the surfaces at a contact point [m]: the area of a contact of depth δ is π (2 R δ − δ²)."""
     depth_weight: float = 1.0
@@ -73,9 +73,9 @@ class TemperatureGrid(Sensor):
     tau: float = 0.0
     """Time constant of the sensing element [s]; 0 reads the cell itself."""
     warm_range: float = math.inf
-    """How far above the base temperature the element reads [K]."""
+    """Range above the base temperature in which the element reads [K]."""
     cold_range: float = math.inf
-    """How far below it [K]; skin reads farther down than up."""
+    """Range below it [K]; skin reads farther down than up."""
 
     units: ClassVar[str] = "degC"
     runtime: ClassVar[str] = "robotics_bridge.sensors.temperature.runtime:TemperatureRuntime"

@@ -1,4 +1,4 @@
-"""What bodies are made of, as far as heat is concerned."""
+"""Thermal materials."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from brainbench.core.errors import UsageError, unknown_name
 
 @dataclass(frozen=True)
 class ThermalMaterial:
-    """How a body conducts, stores and radiates heat.
+    """Conduction, storage and radiation of heat in a body.
 
     Raises:
         UsageError: a number is not positive, or the emissivity lies outside 0 and 1.
@@ -72,7 +72,7 @@ def material(name: str | ThermalMaterial) -> ThermalMaterial:
 
 @dataclass(frozen=True)
 class ThermalBody:
-    """What other links are made of and how warm they are."""
+    """Material and temperature of a link that may be touched."""
 
     material: str | ThermalMaterial = "plastic"
     temperature: float = 22.0

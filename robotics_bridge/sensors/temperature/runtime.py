@@ -160,7 +160,7 @@ def _lags(sensor: TemperatureGrid) -> bool:
 
 
 def _body(sensors: list[TemperatureGrid], link: str) -> ThermalBody:
-    """What a link is made of: as the configuration says, as a grid on it says, or the default."""
+    """Return the body of a link: as the configuration says, as a grid on it says, or the default."""
     if link in sensors[0].bodies:
         return sensors[0].bodies[link]
     own = next((sensor for sensor in sensors if sensor.link == link), None)

@@ -1,4 +1,4 @@
-"""Which geometries a sensor link meets in every environment, and how they lie and move relative to it.
+"""Lists of the geometries that a sensor link meets in every environment, with their relative pose and motion.
 
 A slot is one sensor link with the geometries it may meet. Its list holds, per environment, those in contact (or all
 that are near), each with the transform from link to geometry frame and the relative velocity, so that taxels need no

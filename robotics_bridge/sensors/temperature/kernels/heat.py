@@ -49,7 +49,7 @@ class ThermalParams:
     tau: wp.float32
     """Time constant of the sensing element (s)."""
     cold: wp.float32
-    """How far below the base the element reads (K)."""
+    """Range below the base in which the element reads (K)."""
     warm: wp.float32
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from robotics_bridge.sensors.calibration.calibrate import Log, calibrate, describe, read_log
-from robotics_bridge.sensors.calibration.likelihood import find_quantum
+from robotics_bridge.sensors.calibration.calibrate import calibrate, describe
+from robotics_bridge.sensors.calibration.log import Log, find_quantum, read_log
 from robotics_bridge.sensors.noise import Noise, simulate
 
 DT = 0.005

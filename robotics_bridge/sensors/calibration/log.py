@@ -1,0 +1,126 @@
+"""Recordings of real devices: reading them, their episodes, stuck probes and the step of the converter.
+
+Letters: T reading, N probe. An episode is (x [T], y [T, N]): the true signal and the readings.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+
+if TYPE_CHECKING:
+    import os
+
+    from numpy.typing import NDArray
+
+Episode = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A recording.
+
+    Raises:
+        UsageError: the arrays do not fit each other.
+    """
+
+    time: NDArray[np.float64]
+    """[T] (s), evenly spaced within an episode."""
+    readings: NDArray[np.float64]
+    """[T, N] [unit of the sensor]."""
+    reference: NDArray[np.float64] | None = None
+    """[T] true signal [unit of the sensor]; None for a device at rest, whose true signal is 0."""
+    episode: NDArray[np.int64] | None = None
+    """[T] number of the episode; None for one."""
+    probes: tuple[str, ...] = ()
+    """Names [N]."""
+
+    def __post_init__(self) -> None:
+        for name in ("reference", "episode"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.time):
+                raise UsageError(f"{name} has {len(values)} rows, time {len(self.time)}.")
+        if self.readings.ndim != 2 or len(self.readings) != len(self.time):
+            raise UsageError(f"Readings are [T, N] with T = {len(self.time)}; received {self.readings.shape}.")
+
+    @property
+    def step(self) -> float:
+        """Time between readings [s]."""
+        return float(np.median(np.diff(self.time)))
+
+
+def read_log(path: str | os.PathLike[str]) -> Log:
+    """Read a CSV file with a header: ``time`` (s), optionally ``reference`` and ``episode``, else probes.
+
+    Raises:
+        DataFileNotFoundError: the file is missing.
+        DataError: it has no time or probe, fewer than 20 rows, uneven steps, or holds what is no number.
+    """
+    name = Path(path).name
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no log {str(path)!r}.")
+    with Path(path).open(newline="", encoding="utf-8-sig") as stream:
+        rows = list(csv.reader(stream))
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    probes = [cell for cell in header if cell.lower() not in ("time", "reference", "episode")]
+    if "time" not in [cell.lower() for cell in header] or not probes:
+        raise DataError(f"{name} needs a header with 'time' (s) and at least one column of readings; found {header}.")
+    if len(rows) < 20:
+        raise DataError(f"{name} holds {len(rows) - 1} readings; a calibration needs at least 20 (better thousands).")
+    try:
+        table = np.array([[float(cell) for cell in row] for row in rows[1:] if row], dtype=float)
+    except ValueError as error:
+        raise DataError(f"{name} holds a cell that is no number ({error}).") from error
+    if table.ndim != 2 or table.shape[1] != len(header) or not np.isfinite(table).all():
+        raise DataError(f"{name}: every row needs {len(header)} finite numbers.")
+    columns = {cell.lower(): table[:, index] for index, cell in enumerate(header)}
+    readings = np.stack([table[:, header.index(probe)] for probe in probes], axis=1)
+    episode = columns["episode"].astype(int) if "episode" in columns else None
+    log = Log(columns["time"], readings, columns.get("reference"), episode, tuple(probes))
+    gaps = np.diff(log.time)[np.diff(episode) == 0] if episode is not None else np.diff(log.time)
+    if gaps.min() <= 0 or gaps.max() > 1.5 * gaps.min():
+        raise DataError(
+            f"{name}: times must rise in equal steps within an episode; found {gaps.min():g}…{gaps.max():g} s."
+        )
+    return log
+
+
+def segments(log: Log) -> list[Episode]:
+    """Split a log into its episodes."""
+    x = np.zeros(len(log.time)) if log.reference is None else log.reference
+    numbers = np.zeros(len(x), int) if log.episode is None else log.episode
+    edges = np.flatnonzero(np.diff(numbers)) + 1
+    parts = zip(np.split(x, edges), np.split(log.readings, edges), strict=True)
+    return [(a, b) for a, b in parts if len(a) >= 10]
+
+
+def find_dead(parts: list[Episode]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.float64]]]:
+    """Return per episode which probes [N] never change, and their values."""
+    stuck = [np.ptp(y, axis=0) == 0 for _x, y in parts]
+    return stuck, [y[0] for _x, y in parts]
+
+
+def find_quantum(values: NDArray[np.float64]) -> float:
+    """Return the step of which all readings are multiples, 0 if there is none."""
+    distinct = np.unique(values)
+    if len(distinct) < 2:
+        return 0.0
+    steps = np.diff(distinct)
+    scale = float(np.abs(distinct).max())
+    steps = steps[steps > 1e-6 * scale]
+    if not len(steps):
+        return 0.0
+    step = float(steps.min())
+    # A finer estimate from far apart values, then the test that every value is a multiple.
+    for _ in range(3):
+        whole = np.round(distinct / step)
+        step = float(distinct @ whole / (whole @ whole)) if whole @ whole else step
+    off = np.abs(distinct / step - np.round(distinct / step))
+    coarse = len(distinct) < 0.5 * len(values) or len(values) < 50
+    return step if off.max() < 0.02 and coarse else 0.0
