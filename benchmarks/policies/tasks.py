@@ -32,7 +32,7 @@ from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import agent, evaluate
 from robotics_bridge.policies.training import teacher
-from robotics_bridge.tasks.overrides import changed
+from robotics_bridge.tasks.overrides import apply_overrides
 
 SENSES = ("none", "force_torque", "encoder-small", "encoder")
 ENCODERS = {"encoder-small": "zhuang-intersection-ln-small", "encoder": "zhuang-intersection-ln"}
@@ -239,7 +239,7 @@ def train(options: argparse.Namespace, out: Path) -> None:
     """Train a teacher for some minutes, then hold it against zero and random."""
     (name,) = options.tasks[:1]
     envs = options.envs[-1]
-    task = changed(tasks.load(name, options.config), options.change)
+    task = apply_overrides(tasks.load(name, options.config), options.change)
     run = out / f"teacher-{name}"
     if options.resume and not run.exists():
         shutil.copytree(options.resume, run)
@@ -259,10 +259,11 @@ def train(options: argparse.Namespace, out: Path) -> None:
             )
 
     settings = replace(task.teacher, num_envs=envs)
-    result = teacher.train(
-        env, run, iterations=options.iterations, minutes=options.minutes, settings=settings, seed=options.seed,
-        save_every=50, keep_env=envs <= 256, start=options.start, start_std=options.start_std, progress=tell,
+    extent = teacher.TeacherRun(
+        iterations=options.iterations, minutes=options.minutes, seed=options.seed, keep_env=envs <= 256,
+        start=options.start, start_std=options.start_std,
     )  # fmt: skip
+    result = teacher.train(env, run, extent, settings=settings, progress=tell)
     put(out, {"part": "teacher", "task": name, "iterations": result.iterations, "control_steps": result.steps})
     kept = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
     for path in kept[:-2]:

@@ -1,4 +1,4 @@
-"""What a robot hand must offer to run a policy, and what it tells. Radians, seconds; pressure in the maker's unit."""
+"""The interface of a robot hand: what it must offer to run a policy, and what it tells. Radians, seconds; pressure in the maker's unit."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class HandReading:
 
 @dataclass
 class LinkCounters:
-    """What happened to the reports of a hand on their way."""
+    """Counts of the reports of a hand on their way."""
 
     received: int = 0
     lost: int = 0

@@ -32,7 +32,7 @@ _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 
 @dataclass(frozen=True, eq=False)
 class TactilePoints:
-    """Where the points of ``observation.tactile`` sit. Letters: N point, L link."""
+    """Places of the points of ``observation.tactile``. Letters: N point, L link."""
 
     links: tuple[str, ...]
     """L."""

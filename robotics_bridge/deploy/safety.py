@@ -1,4 +1,4 @@
-"""When a hand must stop, and what it may be asked for. Radians, seconds."""
+"""Limits of safety: when a hand must stop, and what it may be asked for. Radians, seconds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class SafetyLimits:
-    """What is allowed.
+    """Limits of joints, readings and timing.
 
     Raises:
         UsageError: a limit is not a sensible number.
@@ -96,7 +96,7 @@ class SafetyLimits:
 
 
 class ClockOffset:
-    """How late reports come, although the hand's clock and ours have different zeros.
+    """Lateness of reports, although the hand's clock and ours have different zeros.
 
     The smallest difference between arrival and measurement seen so far counts as no delay.
     """

@@ -28,7 +28,7 @@ HOLD_AFTER = 0.25
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong between hand and controller. Probabilities are per report.
+    """Faults between hand and controller. Probabilities are per report.
 
     Raises:
         UsageError: a value is out of range.

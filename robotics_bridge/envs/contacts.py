@@ -1,4 +1,4 @@
-"""What finger tips and objects meet: net contact forces, and distances from tips to objects.
+"""Contacts of finger tips and objects: net contact forces, and distances from tips to objects.
 
 Letters: B environment, F finger tip, K object.
 """

@@ -154,7 +154,7 @@ class Env:
 
     @property
     def tactile(self) -> TactileLayout | None:
-        """Where the columns of the group ``tactile`` sit; None without touch."""
+        """Layout of the columns of the group ``tactile``; None without touch."""
         return None if self.touch is None else self.touch.layout
 
     @property
@@ -179,7 +179,7 @@ class Env:
 
     @property
     def recorded(self) -> bool:
-        """Whether what a control step does around physics is replayed as CUDA graphs by now."""
+        """True once the parts of a control step around physics are replayed as CUDA graphs."""
         return isinstance(self.compute_step, CudaGraphStep) and self.compute_step.recorded
 
     @property

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class GraspSampling:
-    """How grasps are sought (released settings)."""
+    """Settings of the search for grasps (as released)."""
 
     count: int = 64
     """Grasps in total, shared evenly between shapes."""
@@ -36,7 +36,7 @@ class GraspSampling:
     near_fingers: int = 3
     """Finger tips that must be near the surface."""
     near: float = 0.02
-    """What near means [m]."""
+    """Distance of a finger tip that counts as near [m]."""
     max_penetration: float = 0.003
     """[m]."""
     max_displacement: float = 0.01

@@ -15,7 +15,7 @@ ENGINES = ("mujoco", "warp")
 
 @dataclass(frozen=True, kw_only=True)
 class EnvOptions:
-    """How a task is simulated, and what of it is observed.
+    """Options of the simulation of a task, and of what is observed.
 
     Raises:
         UsageError: a name or number is not valid.

@@ -1,4 +1,4 @@
-"""How episodes begin: where hand and object start, and what the object weighs. Letters: B environment, J joint."""
+"""Beginnings of episodes: where hand and object start, and what the object weighs. Letters: B environment, J joint."""
 
 from __future__ import annotations
 

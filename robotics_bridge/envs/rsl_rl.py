@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class RslRlEnv:
-    """What rsl_rl's runners and algorithms call; it keeps no state of its own.
+    """The environment as rsl_rl's runners and algorithms call it, without a state of its own.
 
     RND reads ``env.unwrapped.step_dt``, so ``unwrapped`` is the native environment.
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False)
 class EpisodeState:
-    """What the running episodes remember beside physics, goals and sensors."""
+    """Memory of the running episodes beside physics, goals and sensors."""
 
     action: torch.Tensor
     """[B, A] of this control step, within ``task.action_limit``."""

@@ -1,4 +1,4 @@
-"""What the taxels of a hand feel during a control step, as one tensor, and where each of its columns sits.
+"""Readings of a hand's taxels during a control step, as one tensor, and the place of each of its columns.
 
 Letters: B environment, S physics step of a control step, N column (active taxel, or link for ``agg_*``), C channel,
 L link.
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TactileLayout:
-    """Where the columns of a tactile observation sit. Readings are in the link frame, torques about its origin."""
+    """Layout of the columns of a tactile observation. Readings are in the link frame, torques about its origin."""
 
     observe: str
     """Observation type (table 4.3)."""

@@ -1,4 +1,4 @@
-"""How well an agent does: whole episodes from fresh starts, with intervals. Letters: B environment, A action."""
+"""Evaluation of an agent: whole episodes from fresh starts, with intervals. Letters: B environment, A action."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
-"""What is known of each episode beside its success."""
+"""Quantities of each episode beside its success."""
 AGENTS = ("zero", "random")
 """Agents that every trained one is held against."""
 _Z = 1.959964

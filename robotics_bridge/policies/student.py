@@ -221,7 +221,7 @@ class TactilePolicy(MLPModel):
 
     @property
     def touch(self) -> bool:
-        """Whether the policy reads touch."""
+        """True if the policy reads touch."""
         return self.core.tactile is not None
 
     @property

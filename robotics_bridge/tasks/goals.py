@@ -1,4 +1,4 @@
-"""What orientation an object shall take: goals that step on, and goals with a deadline.
+"""Orientations that an object shall take: goals that step on, and goals with a deadline.
 
 A goal is a frozen configuration that proposes orientations; the environment keeps them. Letters: B environment.
 """

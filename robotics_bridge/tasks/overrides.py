@@ -10,7 +10,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.tasks.task import Ending, Reward, Task
 
 
-def changed(task: Task, words: Iterable[str]) -> Task:
+def apply_overrides(task: Task, words: Iterable[str]) -> Task:
     """Return a task with other numbers.
 
     A word is ``name=value``. The name is that of a reward term (its weight), ``term.parameter``, ``ending.parameter``,

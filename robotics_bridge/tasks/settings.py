@@ -1,4 +1,4 @@
-"""How a task is learned: optimisation of teacher and student (thesis, tables 4.4 and 4.5)."""
+"""Settings of learning: optimisation of teacher and student (thesis, tables 4.4 and 4.5)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What reward terms see of a control step. Letters: B environment, J joint, A action, F finger tip."""
+"""A control step as reward terms see it. Letters: B environment, J joint, A action, F finger tip."""
 
 from __future__ import annotations
 

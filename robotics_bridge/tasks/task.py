@@ -94,7 +94,7 @@ class Push:
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """Where the object starts: its lowest point at a height, with random position and yaw."""
+    """Start of the object: its lowest point at a height, with random position and yaw."""
 
     height: float = 0.5
     """Of the object's lowest point [m]."""
@@ -111,7 +111,7 @@ class Placement:
 
 @dataclass(frozen=True, kw_only=True)
 class Solver:
-    """How exactly physics is solved (as in the released settings)."""
+    """Exactness of the physics (as in the released settings)."""
 
     timestep: float = 0.005
     """Of physics [s]."""
@@ -137,7 +137,7 @@ class ObservationNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class Success:
-    """What counts as success of an episode."""
+    """Success of an episode."""
 
     metric: str
     """``goals`` reached, rotation ``turned`` (rad) or seconds of ``contact`` with the target."""

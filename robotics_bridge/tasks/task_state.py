@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 class EpisodeTarget(Protocol):
-    """What a task's own state may choose for the running episodes."""
+    """The part of the running episodes that a task's own state may choose."""
 
     target: torch.Tensor
     """[B] number of the object that counts; written in place."""
 
 
 class TaskEnvironment(Protocol):
-    """What a task's own state sees of the environments that run the task. Letters: B environment, K object."""
+    """The environments that run a task, as its own state sees them. Letters: B environment, K object."""
 
     num_envs: int
     """B."""

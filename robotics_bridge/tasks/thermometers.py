@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalSettings:
-    """What fingers and balls are made of. The first four numbers are the axes of figure 4.8 and section 4.6.3.
+    """Materials of fingers and balls. The first four numbers are the axes of figure 4.8 and section 4.6.3.
 
     Raises:
         UsageError: the target is not hotter than the room, or the margin lies outside 0 and 1.
@@ -63,7 +63,7 @@ class ThermalSettings:
 
     @property
     def material(self) -> ThermalMaterial:
-        """Of the fingers."""
+        """Material of the fingers."""
         return ThermalMaterial(self.conductivity, self.density, self.specific_heat, self.emissivity)
 
     @property

@@ -57,21 +57,21 @@ def train(
     """
     from robotics_bridge import tasks
     from robotics_bridge.policies.training import teacher
-    from robotics_bridge.tasks.overrides import changed
+    from robotics_bridge.tasks.overrides import apply_overrides
 
     count = envs or (8192 if device != "cpu" else 64)
     read_task_file(task_file)
-    chosen_task = changed(tasks.load(task, config), change or ())
+    chosen_task = apply_overrides(tasks.load(task, config), change or ())
     env = tasks.make(chosen_task, num_envs=count, hand=hand, device=device, seed=seed)
     given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
     chosen = {name: value for name, value in given.items() if value is not None}
     settings = replace(chosen_task.teacher, num_envs=count, **chosen)
     run = out or Path("runs") / f"{task}-{env.hand.name}-{seed}"
     with progress_bar() as progress:
-        result = teacher.train(
-            env, run, iterations=iterations, minutes=minutes, settings=settings, seed=seed, save_every=save_every,
-            start=start, start_std=start_std, progress=progress,
-        )  # fmt: skip
+        options = teacher.TeacherRun(
+            iterations=iterations, minutes=minutes, seed=seed, save_every=save_every, start=start, start_std=start_std
+        )
+        result = teacher.train(env, run, options, settings=settings, progress=progress)
     last = dict(result.history[-1]) if result.history else {}
     told = {
         "run": result.run, "iterations": result.iterations, "control_steps": result.steps, "seconds": result.seconds,

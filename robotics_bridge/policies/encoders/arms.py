@@ -104,7 +104,7 @@ class EncoderConfig:
 
 
 class TactileEncoder(nn.Module):
-    """What all arms share.
+    """Base of all arms.
 
     Args:
         config: Which encoder, and what it reads; fixes :attr:`shape` and the state.
@@ -240,7 +240,7 @@ class _Recurrent(_Learned):
 
 
 class _Images(_Learned):
-    """What the convolutional arms share: the readings as images, one per link, or one of the whole hand."""
+    """Base of the convolutional arms: the readings as images, one per link, or one of the whole hand."""
 
     canvas = False
     index: torch.Tensor

@@ -94,7 +94,7 @@ class TaxelGrid(nn.Module):
 
     @property
     def occupied(self) -> torch.Tensor:
-        """Which cells [5, 7] any item reaches."""
+        """Cells [5, 7] that any item reaches."""
         return self.matrix.abs().sum(1).view(SITES, len(CHANNELS)).sum(1).view(GRID_SHAPE) > 0
 
     def forward(self, taxels: torch.Tensor) -> torch.Tensor:

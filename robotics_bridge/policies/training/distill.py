@@ -40,7 +40,7 @@ _LEAST_VARIANCE = 1e-4
 
 
 class Teacher(Protocol):
-    """Who knows what to do."""
+    """The policy that is imitated."""
 
     def act(self, obs: Any, /) -> torch.Tensor:
         """Return actions [B, A] for observation groups."""
@@ -49,7 +49,7 @@ class Teacher(Protocol):
 
 @dataclass(frozen=True)
 class DistillResult:
-    """How a run ended."""
+    """Outcome of a run."""
 
     status: Literal["finished", "stopped", "diverged"]
     """``stopped``: the time or the iterations allowed were over; start it again to go on."""

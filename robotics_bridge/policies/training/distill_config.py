@@ -1,4 +1,4 @@
-"""What is distilled, from whom and how: one student of the sweep as plain values."""
+"""Options of distillation: one student of the sweep as plain values."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class DistillConfig:
 
     @property
     def name(self) -> str:
-        """What distinguishes the student from its neighbours, for folders and reports."""
+        """Name that distinguishes the student from its neighbours, for folders and reports."""
         parts = [self.task, self.hand, self.observe]
         if self.tactile is not None:
             learning = f"-{self.tactile.learning}" if "learning" in self.encoder_settings else ""

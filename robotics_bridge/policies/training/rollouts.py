@@ -1,4 +1,4 @@
-"""What a student saw, did and should have done: [T, B, …] tensors of one iteration."""
+"""Rollouts: observations, actions and the teacher's actions as [T, B, …] tensors of one iteration."""
 
 from __future__ import annotations
 

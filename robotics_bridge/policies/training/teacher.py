@@ -36,7 +36,7 @@ RESUME = "resume.safetensors"
 
 @dataclass(frozen=True)
 class TeacherResult:
-    """What a training run came to."""
+    """Outcome of a training run."""
 
     run: Path
     iterations: int
@@ -239,18 +239,43 @@ class Trainer:
             torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.env.device)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TeacherRun:
+    """Extent of a training run, and what it begins with.
+
+    Raises:
+        UsageError: ``start_std`` is not positive, or there is no run to start from.
+    """
+
+    iterations: int | None = None
+    """In total; the settings' by default."""
+    minutes: float | None = None
+    """Stop after this time and save."""
+    seed: int = 0
+    """Of weights and actions."""
+    save_every: int = 50
+    """Iterations between checkpoints."""
+    keep_env: bool = True
+    """Keep the environments' state too, which makes resuming exact; large batches may save without and go on with new
+    episodes."""
+    start: Path | None = None
+    """Another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with."""
+    start_std: float | None = None
+    """Standard deviation of actions that it begins with; by default that of the other run."""
+
+    def __post_init__(self) -> None:
+        if self.start_std is not None and (self.start is None or not self.start_std > 0):
+            raise UsageError(
+                f"start_std is a positive number and goes with a run to start from; received {self.start_std!r}."
+            )
+
+
 def train(
     env: Env,
     run: Path,
+    options: TeacherRun | None = None,
     *,
-    iterations: int | None = None,
-    minutes: float | None = None,
     settings: TeacherSettings | None = None,
-    seed: int = 0,
-    save_every: int = 50,
-    keep_env: bool = True,
-    start: Path | None = None,
-    start_std: float | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> TeacherResult:
     """Train a teacher in a folder, or go on with the run that the folder holds.
@@ -258,43 +283,34 @@ def train(
     Args:
         env: the environments; on resuming, of the same task, hand and number.
         run: folder.
-        iterations: total; the settings' by default.
-        minutes: stop after this time and save.
+        options: how long, and from where.
         settings: of the optimisation; those of the task by default.
-        seed: of weights and actions.
-        save_every: iterations between checkpoints.
-        keep_env: keep the environments' state too, which makes resuming exact; large batches may save without and
-            go on with new episodes.
-        start: another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with.
-        start_std: standard deviation of actions that it begins with; by default that of the other run.
         progress: called with iteration, total and a word.
 
     Raises:
         UsageError: the folder holds a run of other settings.
         DataError: the start does not fit.
     """
-    settings = settings or env.task.teacher
-    total = iterations or settings.iterations
-    trainer = Trainer(env, settings, seed=seed)
+    settings, options = settings or env.task.teacher, options or TeacherRun()
+    total = options.iterations or settings.iterations
+    trainer = Trainer(env, settings, seed=options.seed)
     env.goals.start_curriculum()
     origin = None
-    if start_std is not None and (start is None or not start_std > 0):
-        raise UsageError(f"start_std is a positive number and goes with a run to start from; received {start_std!r}.")
-    if start is not None and not (run / RESUME).is_file():
-        trainer.begin_from(start, std=start_std)
-        origin = {"file": str(model_file(start)), "hash": file_hash(model_file(start))}
+    if options.start is not None and not (run / RESUME).is_file():
+        trainer.begin_from(options.start, std=options.start_std)
+        origin = {"file": str(model_file(options.start)), "hash": file_hash(model_file(options.start))}
     run.mkdir(parents=True, exist_ok=True)
     facts = {
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
-        "num_envs": env.num_envs, "seed": seed, "settings": asdict(settings), "rsl_rl": trainer.config,
+        "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
         "action_names": list(env.action_names), "start": origin,
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = _writer(run)
     began, rows = time.monotonic(), []
-    saved = trainer.iteration
-    while trainer.iteration < total:
+    over = False
+    while trainer.iteration < total and not over:
         row = trainer.iterate()
         rows.append(row)
         with (run / "log.jsonl").open("a", encoding="utf-8") as file:
@@ -303,14 +319,9 @@ def train(
             writer.add_scalar(name, value, trainer.iteration)
         if progress:
             progress(trainer.iteration, total, "training")
-        over = minutes is not None and time.monotonic() - began > 60 * minutes
-        if over or trainer.iteration % save_every == 0 or trainer.iteration == total:
-            _save(trainer, run, keep_env=keep_env)
-            saved = trainer.iteration
-        if over:
-            break
-    if saved != trainer.iteration:
-        _save(trainer, run, keep_env=keep_env)
+        over = options.minutes is not None and time.monotonic() - began > 60 * options.minutes
+        if over or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
+            _save(trainer, run, keep_env=options.keep_env)
     writer.close()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
     return TeacherResult(run, trainer.iteration, steps, time.monotonic() - began, tuple(rows))

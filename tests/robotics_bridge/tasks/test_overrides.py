@@ -6,13 +6,13 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
-from robotics_bridge.tasks.overrides import changed
+from robotics_bridge.tasks.overrides import apply_overrides
 
 TASK = tasks.load("in_palm_rotate")
 
 
 def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() -> None:
-    new = changed(
+    new = apply_overrides(
         TASK,
         [
             "is_dropped=-300", "rotation_progress.clip=2", "obj_dist_penalty.target=0,0,0.51", "obj_dropped.height=.44",
@@ -30,8 +30,8 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
     assert new.goal is not None
     assert new.push is not None
     assert (new.episode, new.goal.start_threshold, new.push.interval) == (15.0, 0.3, (1.0, 2.0))
-    assert changed(new, ["goal.start_threshold=0.4"]).goal == TASK.goal
-    none = changed(new, ["goal.start_threshold=none"]).goal
+    assert apply_overrides(new, ["goal.start_threshold=0.4"]).goal == TASK.goal
+    none = apply_overrides(new, ["goal.start_threshold=none"]).goal
     assert none is not None
     assert none.start_threshold is None
     # What no word names stays.
@@ -58,4 +58,4 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
 )
 def test_words_that_name_nothing_or_hold_no_such_value_are_refused(word: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        changed(TASK, [word])
+        apply_overrides(TASK, [word])

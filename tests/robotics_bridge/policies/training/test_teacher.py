@@ -19,7 +19,8 @@ from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.training import state_tree
-from robotics_bridge.policies.training.teacher import RESUME, Trainer, load_teacher, newest, train
+from robotics_bridge.policies.training.teacher import RESUME, TeacherRun, Trainer, load_teacher, newest
+from robotics_bridge.policies.training.teacher import train as train_teacher
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.settings import TeacherSettings
 
@@ -28,6 +29,10 @@ SMALL = TeacherSettings(num_envs=4, steps_per_env=6, iterations=4, epochs=2, min
 
 def _env(seed: int = 0, **changes: Any) -> Env:
     return tasks.make(replace(tasks.load("in_palm_rotate"), **changes), num_envs=4, threads=1, seed=seed)
+
+
+def train(env: Env, run: Path, *, settings: TeacherSettings, **options: Any) -> Any:
+    return train_teacher(env, run, TeacherRun(**options), settings=settings)
 
 
 def test_settings_become_those_of_rsl_rl() -> None:
@@ -58,8 +63,7 @@ def test_a_run_that_stops_halfway_goes_on_exactly(tmp_path: Path) -> None:
 def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
     text = f"""
 from pathlib import Path
-from tests.robotics_bridge.policies.training.test_teacher import SMALL, _env
-from robotics_bridge.policies.training.teacher import train
+from tests.robotics_bridge.policies.training.test_teacher import SMALL, _env, train
 train(_env(), Path({str(tmp_path / "killed")!r}), settings=SMALL, iterations=10000, save_every=1)
 """
     root = Path(__file__).parents[4]
