@@ -182,7 +182,9 @@ class SweepLauncher:
         frames, real = len(self.readings), self.real
         out.wrench = wp.zeros((count, frames, whiskers, 6), dtype=real, device=device)
         out.contact = wp.full((count, frames, whiskers), -1.0, dtype=real, device=device)
-        out.points, out.contact_wrench = (wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2))
+        out.points, out.contact_wrench = (
+            wp.zeros((1, 1, 1), dtype=kernels.structs.vec3, device=device) for _ in range(2)
+        )
         out.depth, out.failed, out.miss, out.load = (wp.zeros(len(row), dtype=real, device=device) for _ in range(4))
         names = ("status", "steps", "touching", "crowded", "unsolved")
         for name in names:
