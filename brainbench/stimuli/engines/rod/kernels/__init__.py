@@ -92,10 +92,7 @@ def build_kernels(
         specialize("distance_queue", group_size=group, **common).measure_distances,
         group,
         tuple(
-            (
-                specialize("contact_queue", max_contacts=held, group_size=threads, queue=rank, **common).solve_queue,
-                threads,
-            )
-            for rank, (held, threads) in enumerate(sizes)
+            (specialize("contact_queue", max_contacts=held, group_size=size, queue=rank, **common).solve_queue, size)
+            for rank, (held, size) in enumerate(sizes)
         ),
     )

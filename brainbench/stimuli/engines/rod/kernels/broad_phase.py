@@ -46,8 +46,9 @@ class SearchRange:
 
 @wp.func(inline=True)
 def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerState], h: real) -> SearchRange:
+    """Return how far a step of length h looks for contacts."""
     reach = SearchRange()
-    # Contacts that may close may_be_near this step.
+    # Contacts that may close within this step.
     travel = h * (state.top_speed + job.object_speed)
     reach.margin = wp.min(real(1.5) * travel + h * state.velocity_jump + real(0.001), real(wp.static(WIDEST)))
     # How far links and objects have come since the last step: its rates at the end are those now.
@@ -118,7 +119,7 @@ def candidate_slot(
 ) -> int:
     """Return where to keep a candidate (``count``: a further one; −1: nowhere)."""
     slot = count
-    # The same contact count from two links, or from both ends of a short gap.
+    # The same contact seen from two links, or from both ends of a short gap.
     for j in range(count):
         apart = wp.length_sq(row(candidates.point, j) - point)
         same = wp.dot(row(candidates.normal, j), normal) > real(0.85)

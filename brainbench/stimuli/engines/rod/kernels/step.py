@@ -158,26 +158,24 @@ def run(
     wait = int(0)
     first_reading = state.reading
     for reading in range(first_reading, readings.shape[0] + 1):
-        reading_end = state.reading_time + job.longest_step
+        until = state.reading_time + job.longest_step
         if reading < readings.shape[0]:
-            reading_end = readings[reading]
-        span = reading_end - state.reading_time
+            until = readings[reading]
+        span = until - state.reading_time
         if span <= zero:
             # A reading at the very start.
             state.pending_reading = reading
             continue
-        if state.at_rest == 1 and reading_end > state.safe_until and state.time_left == zero:
+        if state.at_rest == 1 and until > state.safe_until and state.time_left == zero:
             end = readings[readings.shape[0] - 1]
-            wait = check_rest(
-                chains, motions, shapes, job, paused, chain, proximity, state, options.start, reading_end, end
-            )
+            wait = check_rest(chains, motions, shapes, job, paused, chain, proximity, state, options.start, until, end)
             if wp.static(sliced):
                 if wait != 0:
                     state.reading = reading
                     break
-        if state.at_rest == 1 and reading_end <= state.safe_until and state.time_left == zero:
+        if state.at_rest == 1 and until <= state.safe_until and state.time_left == zero:
             # At rest, and nothing can have come near: the wrench stays zero.
-            state.reading_time = reading_end
+            state.reading_time = until
             state.pending_reading = int(-1)
             continue
         left = span
@@ -192,17 +190,17 @@ def run(
                     wait = WAIT_SLICE
                     break
                 used = used + 1
-            now = reading_end - left
-            count = wp.max(1, int(wp.ceil(left / preferred_step(job, state) - real(1e-3))))
-            h = left / real(count)
+            now = until - left
+            steps = wp.max(1, int(wp.ceil(left / preferred_step(job, state) - real(1e-3))))
+            h = left / real(steps)
             left_whole = left
             left = left - h
-            if count == 1:
+            if steps == 1:
                 last = 1
                 if options.quasistatic == 1 and reading < readings.shape[0]:
                     state.pending_reading = reading
             state.largest_change = zero
-            candidate_count = int(0)
+            count = int(0)
             solved = int(0)
             origin = none
             base_wrench = Wrench()
@@ -213,7 +211,7 @@ def run(
                 state.time_left = zero
                 state.is_near = state.step_is_near
                 state.top_speed = state.step_top_speed
-                candidate_count = 1
+                count = 1
                 solved = 1
             else:
                 pose = pose_at(motions, job.base, now)
@@ -249,46 +247,24 @@ def run(
                         )
                     state.last_step = h
                     if near_count > 0:
-                        candidate_count = find_candidates(
-                            chains,
-                            motions,
-                            shapes,
-                            job,
-                            paused,
-                            chain,
-                            proximity,
-                            candidates,
-                            state,
-                            pose,
-                            reach.margin,
-                            now,
-                            h,
-                        )
+                        count = find_candidates(
+                            chains, motions, shapes, job, paused, chain, proximity, candidates, state, pose,
+                            reach.margin, now, h
+                        )  # fmt: skip
                 if wp.static(sliced):
                     state.waiting_for = 0
                     state.time_left = zero
-                base_wrench = articulated_inertia(
-                    chains, jobs, job, chain, proximity, tip, base, now, h, candidate_count
-                )
+                base_wrench = articulated_inertia(chains, jobs, job, chain, proximity, tip, base, now, h, count)
                 tip_acceleration = joint_accelerations(
-                    job, options, chain, candidates, state, moving, base, now, h, candidate_count
+                    job, options, chain, candidates, state, moving, base, now, h, count
                 )
-                if wp.static(against > NOTHING) and candidate_count > 0:
-                    solved = any_gap_closes(candidates, candidate_count, h)
+                if wp.static(against > NOTHING) and count > 0:
+                    solved = any_gap_closes(candidates, count, h)
                     if solved == 1:
                         write_problem(
-                            problems,
-                            chains,
-                            job,
-                            chain,
-                            proximity,
-                            candidates,
-                            state,
-                            base_wrench,
-                            tip_acceleration,
-                            h,
-                            candidate_count,
-                        )
+                            problems, chains, job, chain, proximity, candidates, state, base_wrench, tip_acceleration,
+                            h, count
+                        )  # fmt: skip
                         if wp.static(sliced):
                             wait = WAIT_FORCES
                             state.step_is_near = state.is_near
@@ -296,7 +272,7 @@ def run(
                             state.is_near = previously_near
                             state.top_speed = previous_speed
                             state.time_left = left_whole
-                            queue_problem(paused, index, candidate_count)
+                            queue_problem(paused, index, count)
                             break
                         else:
                             solve_contacts(problems, index, 0, 1)
@@ -317,22 +293,12 @@ def run(
             state.touching = state.touching + touched
             if state.pending_reading >= 0:
                 write_reading(
-                    results,
-                    jobs,
-                    options,
-                    problems,
-                    job,
-                    chain,
-                    state.pending_reading,
-                    origin,
-                    base_wrench,
-                    force_sum,
-                    arc_sum,
-                    solved,
-                )
+                    results, jobs, options, problems, job, chain, state.pending_reading, origin, base_wrench,
+                    force_sum, arc_sum, solved
+                )  # fmt: skip
                 state.pending_reading = int(-1)
             state.steps = state.steps + 1
-            if candidate_count > 0:
+            if count > 0:
                 for i in range(job.links):
                     integrate_joint(chain, state, i, row(chain.acceleration, i), h, now + h, options.quasistatic)
             state.at_rest = int(0)
@@ -344,7 +310,7 @@ def run(
         if wait != 0:
             state.reading = reading
             break
-        state.reading_time = reading_end
+        state.reading_time = until
         if options.quasistatic == 0:
             state.pending_reading = reading
         if state.status != 0:
