@@ -84,6 +84,14 @@ def count_near_links(
 
 
 @wp.func(inline=True)
+def lower_clearance(job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange):
+    """Lower the bound of each link by how much nearer it may have come."""
+    for i in range(job.links):
+        nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
+        proximity.clearance[i] = row(proximity.clearance, i) - nearer
+
+
+@wp.func(inline=True)
 def query_distances(
     chains: ChainArrays,
     job: WhiskerJob,

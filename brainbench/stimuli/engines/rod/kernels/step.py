@@ -12,7 +12,7 @@ from brainbench.stimuli.engines.rod.limits import FINEST, NOTHING, REST, TRAVEL
 
 from .algebra import vec3
 from .articulated_body import articulated_inertia, forward_kinematics, integrate_joint, joint_accelerations
-from .broad_phase import count_near_links, find_candidates, query_distances, search_range
+from .broad_phase import count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
 from .motion import pose_at
@@ -241,10 +241,7 @@ def run(
                             state.is_near = previously_near
                             state.top_speed = previous_speed
                             break
-                    for i in range(job.links):
-                        proximity.clearance[i] = row(proximity.clearance, i) - reach.time * (
-                            row(proximity.end_speed, i) + reach.unknown_speed
-                        )
+                    lower_clearance(job, proximity, reach)
                     state.last_step = h
                     if near_count > 0:
                         count = find_candidates(
