@@ -1,4 +1,5 @@
-"""The interface of a robot hand: what it must offer to run a policy, and what it tells. Radians, seconds; pressure in the maker's unit."""
+"""The interface of a robot hand: what it must offer to run a policy, and what it tells. Radians, seconds; pressure in
+the maker's unit."""
 
 from __future__ import annotations
 

@@ -33,6 +33,27 @@ class Memory:
         self.values[key] = value
 
 
+class Records(Memory):
+    """An array of Warp's, given as numpy's; elements of a structured one have fields that can be read and set."""
+
+    def __getitem__(self, key: object) -> object:
+        return _Record(self.values, key) if self.values.dtype.names else super().__getitem__(key)
+
+
+class _Record:
+    def __init__(self, values: np.ndarray, key: object) -> None:
+        object.__setattr__(self, "_at", (values, key))
+
+    def __getattr__(self, name: str) -> object:
+        values, key = self._at
+        found = values[name][key]
+        return found.copy() if isinstance(found, np.ndarray) else found
+
+    def __setattr__(self, name: str, value: object) -> None:
+        values, key = self._at
+        values[name][key] = value
+
+
 class ThreadWarp:
     """32 threads whose shuffles wait for each other."""
 

@@ -1,4 +1,5 @@
-"""Calibration: what a newton on the skin of a hand is to an encoder that was made for whiskers of a few micronewtons."""
+"""Calibration: what a newton on the skin of a hand is to an encoder that was made for whiskers of a few
+micronewtons."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import score_rdms
-from brainbench.metrics.inference.power import ExperimentDesign, simulate_experiments, needed, power
+from brainbench.metrics.inference.power import ExperimentDesign, needed, power, simulate_experiments
 from tests.factories.animals import STIMULI, make_subject
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics.measures.classifier import class_assignments, fit_softmax, decode
+from brainbench.metrics.measures.classifier import class_assignments, decode, fit_softmax
 
 SHAPES = ["convex"] * 3 + ["concave"] * 3
 DISTANCES = ["close", "medium", "far"] * 2

@@ -60,7 +60,7 @@ class Slices:
             **dict.fromkeys(("queue_size", "problem_size", "next_queue_size", "next_problem_size"), 3),
             **dict.fromkeys(("query_count", "next_query_count"), 1),
             **dict.fromkeys(("state", "query_time", "query_margin"), lanes),
-            **dict.fromkeys(("joint", "proximity"), links),
+            link=links,
             **dict.fromkeys(("query", "answer"), queries),
         )
         on.budget = budget or (1 if lanes < FEW else BUDGET)
@@ -129,9 +129,9 @@ def make_problems(kernels: Any, capacity: int, lanes: int, device: Any) -> Any:
     return allocate(
         kernels.structs.ContactProblems,
         device,
-        **dict.fromkeys(("size", "step", "solution"), lanes),
+        **dict.fromkeys(("given", "solution"), lanes),
         joint=lanes * capacity,
-        **dict.fromkeys(("candidate_link", "candidate_size", "candidate", "predicted_gap"), lanes * candidates),
+        **dict.fromkeys(("candidate", "candidate_link", "predicted_gap"), lanes * candidates),
         held=(lanes, held),
         **dict.fromkeys(("free_acceleration", "added_acceleration"), (lanes, capacity)),
     )

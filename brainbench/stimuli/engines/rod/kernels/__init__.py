@@ -78,7 +78,7 @@ def build_kernels(
     """
     most = contacts_for(capacity)
     common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda}
-    whole = {"contacts": most, "bounds": bounds, **common}
+    whole = {"max_contacts": most, "bounds": bounds, **common}
     run, structs = specialize("step", **whole).run, specialize("state", **whole)
     if not sliced:
         return Kernels(run, structs)
@@ -92,7 +92,7 @@ def build_kernels(
         specialize("distance_queue", group_size=group, **common).measure_distances,
         group,
         tuple(
-            (specialize("contact_queue", contacts=held, group_size=threads, queue=rank, **common).solve_queue, threads)
-            for rank, (held, threads) in enumerate(sizes)
+            (specialize("contact_queue", max_contacts=held, group_size=size, queue=rank, **common).solve_queue, size)
+            for rank, (held, size) in enumerate(sizes)
         ),
     )

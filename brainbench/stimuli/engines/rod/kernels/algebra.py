@@ -1,4 +1,4 @@
-"""Vectors, quaternions and symmetric matrices of the solver's precision."""
+"""Vectors, quaternions (w, x, y, z) and symmetric matrices of the solver's precision."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ single = real is wp.float32
 
 @wp.func
 def symmetric_times(a: vec6, x: vec3) -> vec3:
-    """Product of a symmetric matrix (xx yy zz xy xz yz) and a vector."""
+    """Return the product of a symmetric matrix (xx yy zz xy xz yz) and a vector."""
     return vec3(
         a[0] * x[0] + a[3] * x[1] + a[4] * x[2],
         a[3] * x[0] + a[1] * x[1] + a[5] * x[2],
@@ -27,7 +27,7 @@ def symmetric_times(a: vec6, x: vec3) -> vec3:
 
 @wp.func
 def symmetric_outer(a: vec3, b: vec3, c: vec3, d: vec3) -> vec6:
-    """Symmetric matrix a bᵀ + c dᵀ, given that it is symmetric."""
+    """Return the matrix a bᵀ + c dᵀ, given that it is symmetric."""
     return vec6(
         a[0] * b[0] + c[0] * d[0],
         a[1] * b[1] + c[1] * d[1],
@@ -40,6 +40,7 @@ def symmetric_outer(a: vec3, b: vec3, c: vec3, d: vec3) -> vec6:
 
 @wp.func
 def sine(x: real) -> real:
+    """Return the sine; in single precision by a series, good to 1e-7 up to 1.5 rad: joints bend no further."""
     if wp.static(single):
         y = x * x
         return x * (
@@ -51,6 +52,7 @@ def sine(x: real) -> real:
 
 @wp.func
 def cosine(x: real) -> real:
+    """Return the cosine as :func:`sine` does."""
     if wp.static(single):
         y = x * x
         return real(1.0) + y * (
@@ -62,13 +64,14 @@ def cosine(x: real) -> real:
 
 @wp.func
 def first_axis(z: vec3, along: vec3, angle: real) -> vec3:
-    """Axis of a joint's first hinge from that of its second, the link behind it and the second angle."""
+    """Return the axis of a joint's first hinge from that of its second, the link behind it and the second angle."""
     x = wp.normalize(along)
     return wp.cross(z, x) * cosine(angle) + x * sine(angle)
 
 
 @wp.func
 def rotate(q: vec4, x: vec3) -> vec3:
+    """Return the vector turned by a unit quaternion."""
     u = vec3(q[1], q[2], q[3])
     t = real(2.0) * wp.cross(u, x)
     return x + q[0] * t + wp.cross(u, t)
@@ -76,12 +79,17 @@ def rotate(q: vec4, x: vec3) -> vec3:
 
 @wp.func
 def unrotate(q: vec4, x: vec3) -> vec3:
+    """Return the vector turned back by a unit quaternion."""
     u = vec3(-q[1], -q[2], -q[3])
     t = real(2.0) * wp.cross(u, x)
     return x + q[0] * t + wp.cross(u, t)
 
 
 def chosen(name: str, sign: str) -> str:
+    """Return native code that picks one of two numbers.
+
+    Warp's own functions make sure on a processor, at four times the cost, that a value that is no number loses.
+    """
     return f"#if defined(__CUDA_ARCH__)\nreturn {name}(a, b);\n#else\nreturn a {sign} b ? a : b;\n#endif\n"
 
 

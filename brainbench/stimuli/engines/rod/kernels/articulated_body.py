@@ -1,4 +1,12 @@
-"""The passes over a chain within a step."""
+"""Articulated-body algorithm: three passes over the chain of one thread, O(links).
+
+Featherstone, Rigid Body Dynamics Algorithms (2008), table 7.1, in world axes about the base point: spatial vectors are
+(rotation, translation at the base point), so nothing is transformed between links. Joints are universal, with two
+axes; in the names below S = (s, m) is an axis and its moment, Iᴬ = (ia ib; ibᵀ ic), pᴬ = (pw, pv), U = IᴬS.
+
+Joint springs and dampers act at the end of the step (linearly implicit), so the joint-space inertia is
+D = SᵀU + h d + h² k, with stiffness k and damping d = βk, and stiffness limits no time step.
+"""
 
 import warp as wp
 
@@ -32,7 +40,7 @@ def forward_kinematics(
     proximity: wp.ref[ProximityState],
     state: wp.ref[WhiskerState],
 ) -> Twist:
-    """Down the chain: where the links are and how they move; returned is the motion of the last one."""
+    """First pass, down the chain: place links and find their velocities; return the twist of the last one."""
     zero = real(0.0)
     x = rotate(pose.turn, vec3(real(1.0), zero, zero))
     y = rotate(pose.turn, vec3(zero, real(1.0), zero))
@@ -85,11 +93,11 @@ def articulated_inertia(
     base: SpatialAcceleration,
     now: real,
     h: real,
-    seen: int,
+    candidate_count: int,
 ) -> Wrench:
-    """Up the chain: articulated inertia, bias and what each joint does with them.
+    """Second pass, up the chain: articulated inertia Iᴬ and bias pᴬ, gains UD⁻¹ and forces D⁻¹u of each joint.
 
-    ``last`` is the motion of the last link, ``base`` the acceleration of the base; returned is what the base feels.
+    ``last`` is the twist of the last link, ``base`` the acceleration of the base; returned is the wrench on the base.
     """
     zero = real(0.0)
     one = real(1.0)
@@ -108,6 +116,7 @@ def articulated_inertia(
         at = row(chain.node, i)
         xa = (row(chain.node, i + 1) - at) / link.length
         com = at + xa * inertia.centre
+        # Inertia of the link about the base point: parallel axes, and a thin part along the axis xa.
         m = link.mass
         thin = inertia.axial - inertia.transverse
         common = m * wp.dot(com, com) + inertia.transverse
@@ -127,10 +136,10 @@ def articulated_inertia(
         pw = pw + wp.cross(vw, spin) + wp.cross(vv, momentum)
         pv = pv + wp.cross(vw, momentum)
         if job.end_load > job.first_load:
-            for given in range(job.first_load, job.end_load):
-                if jobs.load_link[given] == i and now < jobs.load_stop[given]:
-                    pull = jobs.load_force[given]
-                    pw = pw - wp.cross(at + xa * (link.length * jobs.load_share[given]), pull)
+            for load in range(job.first_load, job.end_load):
+                if jobs.load_link[load] == i and now < jobs.load_stop[load]:
+                    pull = jobs.load_force[load]
+                    pw = pw - wp.cross(at + xa * (link.length * jobs.load_share[load]), pull)
                     pv = pv - pull
         angle = row(chain.angle, i)
         s2 = row(chain.axis2, i)
@@ -147,6 +156,7 @@ def articulated_inertia(
         rate = row(chain.rate, i)
         spring1 = angle[0] + lag * rate[0]
         spring2 = angle[1] + lag * rate[1]
+        # A joint bent beyond FOLD stiffens.
         soft1 = soft
         soft2 = soft
         bend = wp.abs(angle[0])
@@ -159,6 +169,7 @@ def articulated_inertia(
             soft2 = soft * real(1.0 + wp.static(STOP))
             past = angle[1] * (one - real(wp.static(FOLD)) / bend)
             spring2 = spring2 + real(wp.static(STOP)) * (past + lag * rate[1])
+        # D of both axes, its inverse, and u = τ − Sᵀpᴬ.
         d11 = wp.dot(s1, u1w) + wp.dot(m1, u1v) + soft1
         d12 = wp.dot(s1, u2w) + wp.dot(m1, u2v)
         d22 = wp.dot(s2, u2w) + wp.dot(m2, u2v) + soft2
@@ -179,7 +190,7 @@ def articulated_inertia(
         chain.gain2_w[i] = g2w
         chain.gain2_v[i] = g2v
         chain.acceleration[i] = vec2(f1, f2)
-        if seen > 0:
+        if candidate_count > 0:
             proximity.inverse_inertia[i] = vec3(i11, i12, i22)
         # Velocity-product acceleration of the joint.
         jw = s1 * rate[0] + s2 * rate[1]
@@ -189,6 +200,7 @@ def articulated_inertia(
         both = rate[0] * rate[1]
         cw = wp.cross(vw, jw) + wp.cross(s1, s2) * both
         cv = wp.cross(vw, jv) + wp.cross(vv, jw) + (wp.cross(s1, m2) + wp.cross(m1, s2)) * both
+        # Iᴬ − UD⁻¹Uᵀ, and pᴬ + Iᴬc + UD⁻¹u with the velocity product c.
         ia = ia - symmetric_outer(u1w, g1w, u2w, g2w)
         ic = ic - symmetric_outer(u1v, g1v, u2v, g2v)
         ib = ib - wp.outer(u1w, g1v) - wp.outer(u2w, g2v)
@@ -233,11 +245,12 @@ def joint_accelerations(
     base: SpatialAcceleration,
     now: real,
     h: real,
-    seen: int,
+    candidate_count: int,
 ) -> vec3:
-    """Down again: accelerations without contact; joints that can have none move on at once.
+    """Third pass, down the chain: joint accelerations without contact, q̈ = D⁻¹u − (UD⁻¹)ᵀa.
 
-    ``moving`` is the velocity of the base, ``base`` its acceleration; returned is the acceleration of the tip.
+    Without contact candidates the joints move on at once. ``moving`` is the twist of the base, ``base`` its
+    acceleration; returned is the acceleration of the tip.
     """
     aw = base.angular
     av = base.linear
@@ -262,11 +275,11 @@ def joint_accelerations(
         a2 = f[1] - wp.dot(row(chain.gain2_w, i), aw) - wp.dot(row(chain.gain2_v, i), av)
         aw = aw + s1 * a1 + s2 * a2
         av = av + m1 * a1 + m2 * a2
-        if seen > 0:
+        if candidate_count > 0:
             chain.acceleration[i] = vec2(a1, a2)
         else:
             integrate_joint(chain, state, i, vec2(a1, a2), h, now + h, options.quasistatic)
-        for j in range(seen):
+        for j in range(candidate_count):
             if row(candidates.link, j) == i:
                 # Gravity was added to the base's acceleration; it moves nothing by itself.
                 candidates.free_velocity[j] = (

@@ -1,4 +1,9 @@
-"""Which links may found something within a step, and where."""
+"""Broad phase: which links may touch something within a step, and the candidates for contact that are found there.
+
+Each link keeps a lower bound of its distance from all objects (``clearance``). Links and objects come nearer by no more
+than their speeds allow, so a link is measured again only when its bound comes near its radius. A contact takes part
+before it closes (g + h vₙ ≥ 0, gap g, approach vₙ), so nothing passes through anything within a step.
+"""
 
 import warp as wp
 
@@ -29,20 +34,21 @@ from .state import (
 
 @wp.struct
 class SearchRange:
-    """How far a step looks."""
+    """How far a step looks for contacts."""
 
     margin: real
-    """Gap up to which a contact takes part."""
+    """Gap (mm) up to which a contact takes part."""
     time: real
-    """Time over which links and objects may have come nearer since the last step."""
+    """Time (ms) over which links and objects may have come nearer since the last step."""
     unknown_speed: real
-    """Speed at which what is not known of them may have come."""
+    """Speed (mm/ms) of whatever is not known of them."""
 
 
 @wp.func(inline=True)
 def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerState], h: real) -> SearchRange:
+    """Return how far a step of length h looks for contacts."""
     reach = SearchRange()
-    # Contacts that may close may_be_near this step.
+    # Contacts that may close within this step.
     travel = h * (state.top_speed + job.object_speed)
     reach.margin = wp.min(real(1.5) * travel + h * state.velocity_jump + real(0.001), real(wp.static(WIDEST)))
     # How far links and objects have come since the last step: its rates at the end are those now.
@@ -57,7 +63,7 @@ def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerSta
 def may_be_near(
     chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange, i: int
 ) -> bool:
-    """Whether a link may be so near, for all that is known without a look."""
+    """Return whether a link may be so near, for all that its bound tells."""
     taper = chains.taper[i, job.whisker]
     return (
         row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
@@ -69,12 +75,20 @@ def may_be_near(
 def count_near_links(
     chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange
 ) -> int:
-    """Number of links that must look."""
+    """Return the number of links whose distance must be measured."""
     near_count = int(0)
     for i in range(job.links):
         if may_be_near(chains, job, proximity, reach, i):
             near_count = near_count + 1
     return near_count
+
+
+@wp.func(inline=True)
+def lower_clearance(job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange):
+    """Lower the bound of each link by how much nearer it may have come."""
+    for i in range(job.links):
+        nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
+        proximity.clearance[i] = row(proximity.clearance, i) - nearer
 
 
 @wp.func(inline=True)
@@ -90,7 +104,7 @@ def query_distances(
     now: real,
     near_count: int,
 ) -> int:
-    """Ask for looks; returned is what to wait for. When there is no room for more, try again."""
+    """Ask for the distances of these links; return what to wait for: the next slice, when there is no room for more."""
     state.first_query = wp.atomic_add(paused.next_query_count, 0, near_count)
     if state.first_query + near_count > paused.query.shape[0]:
         return WAIT_SLICE
@@ -109,20 +123,20 @@ def query_distances(
 
 @wp.func(inline=True)
 def candidate_slot(
-    candidates: wp.ref[ContactCandidates], seen: int, point: vec3, normal: vec3, ahead: real, link: vec3
+    candidates: wp.ref[ContactCandidates], count: int, point: vec3, normal: vec3, ahead: real, link: vec3
 ) -> int:
-    """Where to keep a place of possible contact (``seen``: a further one; −1: nowhere)."""
-    slot = seen
+    """Return where to keep a candidate (``count``: a further one; −1: nowhere)."""
+    slot = count
     # The same contact seen from two links, or from both ends of a short gap.
-    for j in range(seen):
+    for j in range(count):
         apart = wp.length_sq(row(candidates.point, j) - point)
         same = wp.dot(row(candidates.normal, j), normal) > real(0.85)
         if same and apart < real(0.0625) * wp.length_sq(link):
             slot = j
-    if slot < seen:
+    if slot < count:
         if row(candidates.predicted_gap, slot) <= ahead:
             slot = int(-1)
-    elif seen >= wp.static(most_candidates):
+    elif count >= wp.static(most_candidates):
         slot = int(0)
         for j in range(1, wp.static(most_candidates)):
             if row(candidates.predicted_gap, j) > row(candidates.predicted_gap, slot):
@@ -148,23 +162,23 @@ def find_candidates(
     now: real,
     h: real,
 ) -> int:
-    """Find the places of possible contact of all links; returned is their number."""
+    """Find the contact candidates of all links and renew their bounds; return the number of candidates."""
     zero = real(0.0)
     # Counts that the compiler does not know keep it from writing loops out.
     sides = int(2) + wp.min(0, job.index)
     origin = pose.place
-    seen = int(0)
-    asked = state.first_query
-    cvw = pose.spin
-    cvv = pose.velocity
+    count = int(0)
+    query = state.first_query
+    angular = pose.spin
+    linear = pose.velocity
     for i in range(job.links):
         rate = row(chain.rate, i)
         joint = row(chain.node, i)
         link = row(chain.node, i + 1) - joint
         e2 = row(chain.axis2, i)
         spun = first_axis(e2, link, row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
-        cvw = cvw + spun
-        cvv = cvv + wp.cross(joint, spun)
+        angular = angular + spun
+        linear = linear + wp.cross(joint, spun)
         taper = chains.taper[i, job.whisker]
         if row(proximity.clearance, i) <= margin + taper.start_radius:
             closest = real(1e20)
@@ -173,8 +187,8 @@ def find_candidates(
                 turn_s = shapes.turn[s]
                 found = LinkDistance()
                 if wp.static(sliced):
-                    found = paused.answer[asked]
-                    asked = asked + 1
+                    found = paused.answer[query]
+                    query = query + 1
                 else:
                     a = joint + origin
                     b = row(chain.node, i + 1) + origin
@@ -197,13 +211,13 @@ def find_candidates(
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         point = joint + link * share - normal * radius
                         half = pose_at(motions, shapes.track[s], now + real(0.5) * h)
-                        carried = half.velocity + wp.cross(half.spin, point + origin - half.place)
-                        approach = wp.dot(normal, cvv + wp.cross(cvw, point) - carried)
+                        object_velocity = half.velocity + wp.cross(half.spin, point + origin - half.place)
+                        approach = wp.dot(normal, linear + wp.cross(angular, point) - object_velocity)
                         # Where the gap will be: tells apart what only passes by.
                         ahead = gap + real(1.5) * h * wp.min(approach, zero)
-                        slot = candidate_slot(candidates, seen, point, normal, ahead, link)
-                        if slot == seen:
-                            seen = seen + 1
+                        slot = candidate_slot(candidates, count, point, normal, ahead, link)
+                        if slot == count:
+                            count = count + 1
                         if slot >= 0:
                             mu = shapes.friction[s]
                             if mu < zero:
@@ -214,7 +228,7 @@ def find_candidates(
                             candidates.friction[slot] = mu
                             candidates.point[slot] = point
                             candidates.arc[slot] = taper.arc + taper.arc_length * share
-                            candidates.object_velocity[slot] = carried
+                            candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
             proximity.clearance[i] = closest
-    return seen
+    return count

@@ -49,14 +49,14 @@ def write_problem(
 ):
     """Write the factorised chain and its candidates where the solver reads them."""
     index = job.index
-    problems.size[index].links = job.links
-    problems.size[index].candidates = count
-    problems.size[index].contacts = state.contacts
-    problems.step[index].length = h
-    problems.step[index].tip = row(chain.node, job.links)
-    problems.solution[index].base_moment = base_wrench.moment
-    problems.solution[index].base_force = base_wrench.force
-    problems.solution[index].tip_acceleration = tip_acceleration
+    problems.given[index].links = job.links
+    problems.given[index].candidates = count
+    problems.given[index].contacts = state.contacts
+    problems.given[index].step = h
+    problems.given[index].tip = row(chain.node, job.links)
+    problems.given[index].base_moment = base_wrench.moment
+    problems.given[index].base_force = base_wrench.force
+    problems.given[index].tip_acceleration = tip_acceleration
     for i in range(job.links):
         at = row(chain.node, i)
         s2 = row(chain.axis2, i)
@@ -76,10 +76,10 @@ def write_problem(
         i = row(candidates.link, j)
         place = index * wp.static(most_candidates) + j
         problems.candidate_link[place] = i
-        problems.candidate_size[place].gap = row(candidates.gap, j)
-        problems.candidate_size[place].arc = row(candidates.arc, j)
-        problems.candidate_size[place].friction = row(candidates.friction, j)
-        problems.candidate_size[place].link_arc = chains.taper[i, job.whisker].arc_length
+        problems.candidate[place].gap = row(candidates.gap, j)
+        problems.candidate[place].arc = row(candidates.arc, j)
+        problems.candidate[place].friction = row(candidates.friction, j)
+        problems.candidate[place].link_arc = chains.taper[i, job.whisker].arc_length
         problems.candidate[place].point = row(candidates.point, j)
         problems.candidate[place].normal = row(candidates.normal, j)
         problems.candidate[place].free_velocity = row(candidates.free_velocity, j)
@@ -103,9 +103,9 @@ def queue_problem(paused: PausedWhiskers, index: int, count: int):
 def read_solution(problems: ContactProblems, job: WhiskerJob, chain: wp.ref[ChainState], state: wp.ref[WhiskerState]):
     """Add the contacts' part to the accelerations of the joints, and to the totals how well it was found."""
     index = job.index
-    state.contacts = problems.size[index].contacts
-    state.crowded = state.crowded + problems.size[index].crowded
-    state.unsolved = state.unsolved + problems.size[index].unsolved
+    state.contacts = problems.solution[index].contacts
+    state.crowded = state.crowded + problems.solution[index].crowded
+    state.unsolved = state.unsolved + problems.solution[index].unsolved
     state.miss = state.miss + problems.solution[index].miss
     state.load = state.load + problems.solution[index].load
     for i in range(job.links):

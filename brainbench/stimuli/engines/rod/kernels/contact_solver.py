@@ -1,4 +1,15 @@
-"""CONTACT SOLVER"""
+"""Forces of rigid, unilateral contacts with Coulomb friction.
+
+For the forces f of all contacts, with the Delassus matrix G and the rates b without forces, the rate v = Gf + b obeys
+at each contact 0 ≤ fₙ ⊥ vₙ + g/h ≥ 0 (Signorini; g the gap, h the step) and |fₜ| ≤ μfₙ, with fₜ against the slip vₜ
+where it slides. Projected block Gauss-Seidel finds the forces (Jourdan, Alart & Jean 1998, Comput. Methods Appl. Mech.
+Eng. 155); after every other sweep all normal forces are solved for at once by an active set, because neighbouring
+contacts share a load in ways that single contacts find slowly.
+
+A group of threads takes one whisker, each thread one contact; the others learn of its forces by broadcast. Groups of a
+GPU warp stay together: what one has finished it repeats without keeping it. On a processor one thread has all contacts;
+the source is the same. Forces in mN, compliance in mm/ms per mN.
+"""
 
 import warp as wp
 
@@ -14,18 +25,22 @@ from .delassus import (
     build_delassus,
     own_contacts,
     row,
-    rows,
+    row_size,
     select_contacts,
-    tall,
+    stride,
 )
-from .parameters import capacity, contacts, group_size, real
+from .parameters import capacity, group_size, max_contacts, real
 from .state import ContactProblems, PerLink2, most_candidates
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 
 
 @wp.func
 def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0: real, mu: real, tries: int) -> vec3:
-    """Forces of one contact alone (normal, two tangents), given the rates without it and its last slip."""
+    """Return the forces (normal, two tangents) of one contact alone.
+
+    ``own6`` is its compliance to them (nn, n1, n2, 11, 12, 22); bn, b1, b2 are its rates without them, p0 and q0 its
+    last friction.
+    """
     zero = real(0.0)
     one = real(1.0)
     nn = own6[0]
@@ -62,19 +77,19 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
                 # Sliding: find the direction of slip by a fixed point.
                 f1 = p0
                 f2 = q0
-                pace = one / (c11 + c22)
+                relaxation = one / (c11 + c22)
                 for _ in range(tries):
                     fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
-                    s1_ = f1 - pace * (b1 + n1 * fn + c11 * f1 + c12 * f2)
-                    s2_ = f2 - pace * (b2 + n2 * fn + c12 * f1 + c22 * f2)
-                    size = wp.sqrt(s1_ * s1_ + s2_ * s2_)
+                    slip1 = f1 - relaxation * (b1 + n1 * fn + c11 * f1 + c12 * f2)
+                    slip2 = f2 - relaxation * (b2 + n2 * fn + c12 * f1 + c22 * f2)
+                    size = wp.sqrt(slip1 * slip1 + slip2 * slip2)
                     bound = mu * fn
                     if size > bound:
-                        s1_ = s1_ * (bound / size)
-                        s2_ = s2_ * (bound / size)
-                    moved_by = wp.abs(f1 - s1_) + wp.abs(f2 - s2_)
-                    f1 = s1_
-                    f2 = s2_
+                        slip1 = slip1 * (bound / size)
+                        slip2 = slip2 * (bound / size)
+                    moved_by = wp.abs(f1 - slip1) + wp.abs(f2 - slip2)
+                    f1 = slip1
+                    f2 = slip2
                     if moved_by <= real(1e-4) * bound:
                         break
                 fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
@@ -87,8 +102,8 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
 
 
 @wp.func(inline=True)
-def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], refresh: int):
-    """Rates at the contacts, less those that would just close the gaps."""
+def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], matrix: wp.ref[DelassusRows], refresh: int):
+    """Compute the rates at the contacts, less those that would just close the gaps."""
     if refresh == 1:
         for k in range(solver.own_count):
             own.rate[3 * k] = row(own.free_rate, 3 * k) - row(own.closing_rate, k)
@@ -96,28 +111,28 @@ def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], tabl
             own.rate[3 * k + 2] = row(own.free_rate, 3 * k + 2)
     for e in range(solver.warp_contacts):
         for b in range(3):
-            pull = broadcast(row(own.force, wp.static(3 * tall) * e + b), e)
+            force_k = broadcast(row(own.force, wp.static(3 * stride) * e + b), e)
             if refresh == 1:
                 for r in range(3 * solver.own_count):
-                    own.rate[r] = row(own.rate, r) + row(table, r * wp.static(rows) + 3 * e + b) * pull
+                    own.rate[r] = row(own.rate, r) + row(matrix, r * wp.static(row_size) + 3 * e + b) * force_k
 
 
 @wp.func(inline=True)
 def gauss_seidel_sweep(
-    solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], table: wp.ref[DelassusRows], tries: int
+    solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], matrix: wp.ref[DelassusRows], tries: int
 ):
-    """One contact at a time."""
+    """Solve each contact once, given the others; note how much changed."""
     zero = real(0.0)
-    far_off = zero
-    by_now = zero
-    in_all = zero
+    gap_error = zero
+    force_change = zero
+    force_sum = zero
     for c in range(solver.warp_contacts):
         d0 = zero
         d1 = zero
         d2 = zero
         mine = wp.static(group_size == 1) or c == solver.thread
         if mine and solver.converged == 0 and c < solver.contacts:
-            k = wp.static(tall) * c
+            k = wp.static(stride) * c
             n0 = row(own.force, 3 * k)
             p0 = row(own.force, 3 * k + 1)
             q0 = row(own.force, 3 * k + 2)
@@ -137,87 +152,86 @@ def gauss_seidel_sweep(
             if n0 == zero:
                 missed = wp.min(missed, zero)
             slipped = block[3] * wp.abs(d1) + block[5] * wp.abs(d2)
-            far_off = wp.max(far_off, solver.step * (wp.abs(missed) + slipped))
-            by_now += wp.abs(d0) + wp.abs(d1) + wp.abs(d2)
-            in_all += found[0]
+            gap_error = wp.max(gap_error, solver.step * (wp.abs(missed) + slipped))
+            force_change += wp.abs(d0) + wp.abs(d1) + wp.abs(d2)
+            force_sum += found[0]
         d0 = broadcast(d0, c)
         d1 = broadcast(d1, c)
         d2 = broadcast(d2, c)
         for r in range(3 * solver.own_count):
-            e = r * wp.static(rows) + 3 * c
-            own.rate[r] = row(own.rate, r) + row(table, e) * d0 + row(table, e + 1) * d1 + row(table, e + 2) * d2
-    far_off = group_max(far_off)
-    by_now = group_sum(by_now)
-    in_all = group_sum(in_all)
+            e = r * wp.static(row_size) + 3 * c
+            own.rate[r] = row(own.rate, r) + row(matrix, e) * d0 + row(matrix, e + 1) * d1 + row(matrix, e + 2) * d2
+    gap_error = group_max(gap_error)
+    force_change = group_sum(force_change)
+    force_sum = group_sum(force_sum)
     if solver.converged == 0:
-        solver.gap_error = far_off
-        solver.force_change = by_now
-        solver.force_sum = in_all
-        if far_off <= real(1e-4) or by_now <= real(1e-4) * in_all:
+        solver.gap_error = gap_error
+        solver.force_change = force_change
+        solver.force_sum = force_sum
+        if gap_error <= real(1e-4) or force_change <= real(1e-4) * force_sum:
             solver.converged = 1
 
 
 @wp.func(inline=True)
 def solve_normal_forces(
     solver: wp.ref[SolverState],
-    square: wp.ref[NormalMatrix],
+    normals: wp.ref[NormalMatrix],
     work: wp.ref[NormalMatrix],
     load: wp.ref[PerContact1],
     asked: wp.ref[PerContact1],
     pressing: int,
 ):
-    """Gauss-Jordan, every contact its own row: normal forces of those that press."""
+    """Find the normal forces of the contacts that press, by Gauss-Jordan; every contact has its own row."""
     share = PerContact1()
     part = solver.thread
     each = solver.own_count
-    span = solver.warp_contacts
+    count = solver.warp_contacts
     for k in range(each):
         mine_in = (pressing >> (part + k)) % 2
-        for e in range(span):
+        for e in range(count):
             keep = real(0.0)
             if mine_in == 1 and (pressing >> e) % 2 == 1:
-                keep = row(square, k * wp.static(contacts) + e)
+                keep = row(normals, k * wp.static(max_contacts) + e)
             elif part + k == e:
                 keep = real(1.0)
-            work[k * wp.static(contacts) + e] = keep
+            work[k * wp.static(max_contacts) + e] = keep
         load[k] = real(0.0)
         if mine_in == 1:
             load[k] = row(asked, k)
-    for p in range(span):
-        at = wp.static(tall * contacts) * p
+    for p in range(count):
+        at = wp.static(stride * max_contacts) * p
         pivot = broadcast(row(work, at + p), p)
-        known = broadcast(row(load, wp.static(tall) * p), p)
+        known = broadcast(row(load, wp.static(stride) * p), p)
         for k in range(each):
             share[k] = real(0.0)
             if part + k != p:
-                share[k] = row(work, k * wp.static(contacts) + p) / pivot
+                share[k] = row(work, k * wp.static(max_contacts) + p) / pivot
             load[k] = row(load, k) - share[k] * known
-        for e in range(p + 1, span):
+        for e in range(p + 1, count):
             value = broadcast(row(work, at + e), p)
             for k in range(each):
-                c = k * wp.static(contacts) + e
+                c = k * wp.static(max_contacts) + e
                 work[c] = row(work, c) - share[k] * value
     for k in range(each):
-        if part + k < span:
-            load[k] = row(load, k) / row(work, k * wp.static(contacts) + part + k)
+        if part + k < count:
+            load[k] = row(load, k) / row(work, k * wp.static(max_contacts) + part + k)
 
 
 @wp.func(inline=True)
 def share_normal_forces(
     solver: wp.ref[SolverState],
     own: wp.ref[ThreadContacts],
-    table: wp.ref[DelassusRows],
-    square: wp.ref[NormalMatrix],
+    matrix: wp.ref[DelassusRows],
+    normals: wp.ref[NormalMatrix],
     work: wp.ref[NormalMatrix],
     guessing: int,
     tries: int,
 ) -> int:
-    """Neighbouring contacts share a load in ways that Gauss-Seidel finds slowly: solve for all normal forces at
-    once, those of sliding contacts with their friction. Returned is whether the forces were changed."""
+    """Solve for all normal forces at once, with the friction of sliding contacts; return whether forces changed."""
     zero = real(0.0)
     part = solver.thread
     each = solver.own_count
-    span = solver.warp_contacts
+    count = solver.warp_contacts
     contacts = solver.contacts
     ratio1 = PerContact1()
     ratio2 = PerContact1()
@@ -240,40 +254,40 @@ def share_normal_forces(
                 ratio1[k] = row(own.friction, k) * f1 / size
                 ratio2[k] = row(own.friction, k) * f2 / size
     pressing = group_or(pressing)
-    for e in range(span):
-        slide1 = broadcast(ratio1[wp.static(tall) * e], e)
-        slide2 = broadcast(ratio2[wp.static(tall) * e], e)
-        stick1 = broadcast(row(own.force, wp.static(3 * tall) * e + 1), e)
-        stick2 = broadcast(row(own.force, wp.static(3 * tall) * e + 2), e)
+    for e in range(count):
+        slide1 = broadcast(ratio1[wp.static(stride) * e], e)
+        slide2 = broadcast(ratio2[wp.static(stride) * e], e)
+        stick1 = broadcast(row(own.force, wp.static(3 * stride) * e + 1), e)
+        stick2 = broadcast(row(own.force, wp.static(3 * stride) * e + 2), e)
         if slide1 != zero or slide2 != zero:
             stick1 = zero
             stick2 = zero
         for k in range(each):
-            r = 3 * k * wp.static(rows) + 3 * e
-            square[k * wp.static(contacts) + e] = (
-                row(table, r) + row(table, r + 1) * slide1 + row(table, r + 2) * slide2
+            r = 3 * k * wp.static(row_size) + 3 * e
+            normals[k * wp.static(max_contacts) + e] = (
+                row(matrix, r) + row(matrix, r + 1) * slide1 + row(matrix, r + 2) * slide2
             )
-            asked[k] = asked[k] - row(table, r + 1) * stick1 - row(table, r + 2) * stick2
+            asked[k] = asked[k] - row(matrix, r + 1) * stick1 - row(matrix, r + 2) * stick2
     agreed = 1 - guessing
     for _ in range(tries):
         if warp_max(1 - agreed) == 1:
-            solve_normal_forces(solver, square, work, load, asked, pressing)
+            solve_normal_forces(solver, normals, work, load, asked, pressing)
             worst = int(-1)
             lowest = zero
             for k in range(each):
                 opening[k] = -asked[k]
-            for e in range(span):
-                value = broadcast(load[wp.static(tall) * e], e)
+            for e in range(count):
+                value = broadcast(load[wp.static(stride) * e], e)
                 if value < lowest:
                     lowest = value
                     worst = e
                 for k in range(each):
-                    opening[k] = opening[k] + row(square, k * wp.static(contacts) + e) * value
+                    opening[k] = opening[k] + row(normals, k * wp.static(max_contacts) + e) * value
             # A contact that pulls lets go; one that would open into the object presses.
             flip = worst
             lowest = real(-1e-6) / solver.step
-            for e in range(span):
-                value = broadcast(opening[wp.static(tall) * e], e)
+            for e in range(count):
+                value = broadcast(opening[wp.static(stride) * e], e)
                 if worst < 0 and e < contacts and (pressing >> e) % 2 == 0 and value < lowest:
                     lowest = value
                     flip = e
@@ -282,13 +296,13 @@ def share_normal_forces(
                     agreed = 1
                 else:
                     pressing = pressing ^ (1 << flip)
-    wild = zero
+    diverged = zero
     for k in range(each):
         if part + k < contacts and not (wp.abs(load[k]) < real(1e6)):
-            wild = real(1.0)
-    wild = group_max(wild)
+            diverged = real(1.0)
+    diverged = group_max(diverged)
     changed = int(0)
-    if guessing == 1 and agreed == 1 and wild == zero:
+    if guessing == 1 and agreed == 1 and diverged == zero:
         changed = int(1)
         for k in range(each):
             if part + k < contacts:
@@ -311,10 +325,10 @@ def share_normal_forces(
 
 @wp.func(inline=True)
 def contact_force(own: wp.ref[ThreadContacts], k: int) -> vec3:
-    """Force of a contact."""
-    pull = row(own.axis, 3 * k) * row(own.force, 3 * k)
+    """Return the force of a contact in world axes."""
+    force_k = row(own.axis, 3 * k) * row(own.force, 3 * k)
     return (
-        pull
+        force_k
         + row(own.axis, 3 * k + 1) * row(own.force, 3 * k + 1)
         + row(own.axis, 3 * k + 2) * row(own.force, 3 * k + 2)
     )
@@ -324,62 +338,62 @@ def contact_force(own: wp.ref[ThreadContacts], k: int) -> vec3:
 def iterate_forces(
     solver: wp.ref[SolverState],
     own: wp.ref[ThreadContacts],
-    table: wp.ref[DelassusRows],
-    square: wp.ref[NormalMatrix],
+    matrix: wp.ref[DelassusRows],
+    normals: wp.ref[NormalMatrix],
     work: wp.ref[NormalMatrix],
-    doing: int,
+    active: int,
 ):
-    """Gauss-Seidel sweeps until the forces hold, with all normal forces solved for at once after every other."""
+    """Sweep until the forces hold, with all normal forces solved for at once after every other sweep."""
     slip_tries = int(8) + solver.unknown_zero
     guess_tries = int(10) + solver.unknown_zero
     sweeps_most = int(wp.static(SWEEPS)) + solver.unknown_zero
-    solver.converged = 1 - doing
-    refresh = doing
+    solver.converged = 1 - active
+    refresh = active
     solver.gap_error = real(0.0)
     solver.force_change = real(0.0)
     solver.force_sum = real(0.0)
     for turn in range(sweeps_most):
         if warp_max(1 - solver.converged) == 1:
             if warp_max(refresh) == 1:
-                contact_rates(solver, own, table, refresh)
+                contact_rates(solver, own, matrix, refresh)
                 refresh = 0
-            gauss_seidel_sweep(solver, own, table, slip_tries)
+            gauss_seidel_sweep(solver, own, matrix, slip_tries)
             guessing = int(0)
             if solver.converged == 0 and solver.contacts > 1 and turn % 2 == 1:
                 guessing = 1
             if warp_max(guessing) == 1:
-                refresh = share_normal_forces(solver, own, table, square, work, guessing, guess_tries)
+                refresh = share_normal_forces(solver, own, matrix, normals, work, guessing, guess_tries)
 
 
 @wp.func(inline=True)
 def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts]):
-    """What the contacts do together, and their forces for the next step."""
+    """Write what the contacts do together, and their forces for the next step."""
     zero = real(0.0)
-    pressed = vec3(zero, zero, zero)
-    twisted = vec3(zero, zero, zero)
-    heavy = zero
-    arm = zero
+    force = vec3(zero, zero, zero)
+    moment = vec3(zero, zero, zero)
+    normal_sum = zero
+    arc_sum = zero
     for k in range(solver.own_count):
         if solver.thread + k < solver.contacts and solver.live == 1:
-            pull = contact_force(own, k)
+            force_k = contact_force(own, k)
             arc = row(own.arc, k)
             problems.held[solver.job, solver.thread + k].arc = arc
-            problems.held[solver.job, solver.thread + k].force = pull
-            pressed = pressed + pull
-            twisted = twisted + wp.cross(row(own.point, k), pull)
+            problems.held[solver.job, solver.thread + k].force = force_k
+            force = force + force_k
+            moment = moment + wp.cross(row(own.point, k), force_k)
             fn = row(own.force, 3 * k)
             if fn > zero:
-                heavy += fn
-                arm += fn * arc
-    heavy = group_sum(heavy)
-    arm = group_sum(arm)
-    pressed = vec3(group_sum(pressed[0]), group_sum(pressed[1]), group_sum(pressed[2]))
-    twisted = vec3(group_sum(twisted[0]), group_sum(twisted[1]), group_sum(twisted[2]))
+                normal_sum += fn
+                arc_sum += fn * arc
+    normal_sum = group_sum(normal_sum)
+    arc_sum = group_sum(arc_sum)
+    force = vec3(group_sum(force[0]), group_sum(force[1]), group_sum(force[2]))
+    moment = vec3(group_sum(moment[0]), group_sum(moment[1]), group_sum(moment[2]))
     if solver.thread == 0 and solver.live == 1:
-        problems.solution[solver.job].normal_sum = heavy
-        problems.solution[solver.job].arc_sum = arm
-        problems.solution[solver.job].contact_force = pressed
-        problems.solution[solver.job].contact_moment = twisted
+        problems.solution[solver.job].normal_sum = normal_sum
+        problems.solution[solver.job].arc_sum = arc_sum
+        problems.solution[solver.job].contact_force = force
+        problems.solution[solver.job].contact_moment = moment
 
 
 @wp.func(inline=True)
@@ -387,75 +401,69 @@ def apply_forces(
     problems: ContactProblems,
     solver: wp.ref[SolverState],
     own: wp.ref[ThreadContacts],
-    lift: wp.ref[PerLink2],
+    joint_change: wp.ref[PerLink2],
     last: int,
-    doing: int,
+    active: int,
 ) -> int:
-    """Forces up the chain, then the change of acceleration down.
+    """Carry the forces up the chain, then the change of acceleration down.
 
-    ``last`` says that there will be no further round. Returned is whether the forces press the whisker onto places
+    ``last`` says that there will be no further round. Returned is whether the forces press the whisker onto candidates
     that do not take part, with room for them: then another round is needed.
     """
     zero = real(0.0)
     none = vec3(zero, zero, zero)
-    link0 = solver.job * wp.static(capacity)
-    spot0 = solver.job * wp.static(most_candidates)
+    first_joint = solver.job * wp.static(capacity)
+    first_candidate = solver.job * wp.static(most_candidates)
     tw = none
     tv = none
     for back in range(solver.last_link + 1):
         i = solver.last_link - back
         for k in range(solver.own_count):
             if solver.thread + k < solver.contacts and row(own.link, k) == i:
-                pull = contact_force(own, k)
-                tv = tv + pull
-                tw = tw + wp.cross(row(own.point, k), pull)
+                force_k = contact_force(own, k)
+                tv = tv + force_k
+                tw = tw + wp.cross(row(own.point, k), force_k)
         u1 = zero
         u2 = zero
         if i < solver.links:
-            u1 = wp.dot(problems.joint[link0 + i].axis1, tw) + wp.dot(problems.joint[link0 + i].moment1, tv)
-            u2 = wp.dot(problems.joint[link0 + i].axis2, tw) + wp.dot(problems.joint[link0 + i].moment2, tv)
-            tw = tw - problems.joint[link0 + i].gain1_w * u1 - problems.joint[link0 + i].gain2_w * u2
-            tv = tv - problems.joint[link0 + i].gain1_v * u1 - problems.joint[link0 + i].gain2_v * u2
+            joint = problems.joint[first_joint + i]
+            u1 = wp.dot(joint.axis1, tw) + wp.dot(joint.moment1, tv)
+            u2 = wp.dot(joint.axis2, tw) + wp.dot(joint.moment2, tv)
+            tw = tw - joint.gain1_w * u1 - joint.gain2_w * u2
+            tv = tv - joint.gain1_v * u1 - joint.gain2_v * u2
         u1 = group_sum(u1)
         u2 = group_sum(u2)
         if i < solver.links:
-            inv = problems.joint[link0 + i].inverse_inertia
-            lift[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
+            inv = problems.joint[first_joint + i].inverse_inertia
+            joint_change[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
     tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
     tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
     more = int(0)
-    if doing == 1:
+    if active == 1:
         aw = none
         av = none
         for i in range(solver.links):
             extra = vec2(zero, zero)
             if i <= solver.last_link:
-                extra = row(lift, i)
-            a1 = (
-                extra[0] - wp.dot(problems.joint[link0 + i].gain1_w, aw) - wp.dot(problems.joint[link0 + i].gain1_v, av)
-            )
-            a2 = (
-                extra[1] - wp.dot(problems.joint[link0 + i].gain2_w, aw) - wp.dot(problems.joint[link0 + i].gain2_v, av)
-            )
-            aw = aw + problems.joint[link0 + i].axis1 * a1 + problems.joint[link0 + i].axis2 * a2
-            av = av + problems.joint[link0 + i].moment1 * a1 + problems.joint[link0 + i].moment2 * a2
+                extra = row(joint_change, i)
+            joint = problems.joint[first_joint + i]
+            a1 = extra[0] - wp.dot(joint.gain1_w, aw) - wp.dot(joint.gain1_v, av)
+            a2 = extra[1] - wp.dot(joint.gain2_w, aw) - wp.dot(joint.gain2_v, av)
+            aw = aw + joint.axis1 * a1 + joint.axis2 * a2
+            av = av + joint.moment1 * a1 + joint.moment2 * a2
             if solver.thread == 0:
                 problems.added_acceleration[solver.job, i] = vec2(a1, a2)
             if solver.contacts < solver.candidates:
                 for j in range(solver.candidates):
-                    if problems.candidate_link[spot0 + j] == i and (solver.selected >> j) % 2 == 0:
-                        moved = (
-                            problems.candidate[spot0 + j].free_velocity
-                            + (av + wp.cross(aw, problems.candidate[spot0 + j].point)) * solver.step
-                        )
-                        ahead = problems.candidate_size[spot0 + j].gap + solver.step * wp.dot(
-                            problems.candidate[spot0 + j].normal, moved
-                        )
-                        problems.predicted_gap[spot0 + j] = ahead
-                        if ahead < real(-wp.static(CLOSED)):
+                    if problems.candidate_link[first_candidate + j] == i and (solver.selected >> j) % 2 == 0:
+                        candidate = problems.candidate[first_candidate + j]
+                        moved = candidate.free_velocity + (av + wp.cross(aw, candidate.point)) * solver.step
+                        predicted = candidate.gap + solver.step * wp.dot(candidate.normal, moved)
+                        problems.predicted_gap[first_candidate + j] = predicted
+                        if predicted < real(-wp.static(CLOSED)):
                             more = int(1)
         crowded = int(0)
-        if more == 1 and (solver.contacts == wp.static(contacts) or last == 1):
+        if more == 1 and (solver.contacts == wp.static(max_contacts) or last == 1):
             more = int(0)
             crowded = int(1)
         if more == 0 and solver.thread == 0:
@@ -469,13 +477,13 @@ def apply_forces(
                 unsolved = int(1)
                 miss = solver.force_change * solver.force_change
             index = solver.job
-            problems.size[index].contacts = solver.contacts
-            problems.size[index].crowded = crowded
-            problems.size[index].unsolved = unsolved
-            problems.solution[index].base_moment = problems.solution[index].base_moment - tw
-            problems.solution[index].base_force = problems.solution[index].base_force - tv
+            problems.solution[index].contacts = solver.contacts
+            problems.solution[index].crowded = crowded
+            problems.solution[index].unsolved = unsolved
+            problems.solution[index].base_moment = problems.given[index].base_moment - tw
+            problems.solution[index].base_force = problems.given[index].base_force - tv
             problems.solution[index].tip_acceleration = (
-                problems.solution[index].tip_acceleration + av + wp.cross(aw, problems.step[index].tip)
+                problems.given[index].tip_acceleration + av + wp.cross(aw, problems.given[index].tip)
             )
             problems.solution[index].miss = miss
             problems.solution[index].load = solver.force_sum * solver.force_sum
@@ -484,31 +492,35 @@ def apply_forces(
 
 @wp.func
 def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
+    """Solve the problem of one job in place.
+
+    ``part`` is the thread's place in its group, ``live`` whether the group has a whisker or only keeps others company.
+    """
     solver = SolverState()
     solver.job = index
     solver.thread = part
     solver.live = live
-    solver.links = problems.size[index].links
-    solver.candidates = problems.size[index].candidates
-    solver.previous_contacts = problems.size[index].contacts
-    solver.step = problems.step[index].length
+    solver.links = problems.given[index].links
+    solver.candidates = problems.given[index].candidates
+    solver.previous_contacts = problems.given[index].contacts
+    solver.step = problems.given[index].step
     solver.unknown_zero = wp.min(0, index)
-    solver.own_count = int(wp.static(own_contacts)) + wp.static(tall) * solver.unknown_zero
+    solver.own_count = int(wp.static(own_contacts)) + wp.static(stride) * solver.unknown_zero
     own = ThreadContacts()
-    table = DelassusRows()
-    square = NormalMatrix()
+    matrix = DelassusRows()
+    normals = NormalMatrix()
     work = NormalMatrix()
-    lift = PerLink2()
+    joint_change = PerLink2()
     rounds_most = int(wp.static(CONTACT_ROUNDS)) + solver.unknown_zero
     more = live
     for round_ in range(rounds_most):
-        doing = more
-        if warp_max(doing) == 1:
-            select_contacts(problems, solver, own, doing)
-            build_delassus(problems, solver, own, table)
-            iterate_forces(solver, own, table, square, work, doing)
+        active = more
+        if warp_max(active) == 1:
+            select_contacts(problems, solver, own, active)
+            build_delassus(problems, solver, own, matrix)
+            iterate_forces(solver, own, matrix, normals, work, active)
             last = int(0)
             if round_ == wp.static(CONTACT_ROUNDS - 1):
                 last = 1
-            more = apply_forces(problems, solver, own, lift, last, doing)
+            more = apply_forces(problems, solver, own, joint_change, last, active)
     store_forces(problems, solver, own)

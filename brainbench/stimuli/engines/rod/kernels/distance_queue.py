@@ -42,7 +42,7 @@ def measure_distances(
         margin = paused.query_margin[index]
         start = paused.query[which].start
         stop = paused.query[which].stop
-        leaf = paused.proximity[i, index].leaf
+        leaf = paused.link[i, index].leaf
         taper = chains.taper[i, jobs.whisker[index]]
         found = link_shape_distance(shapes, s, body, start, stop, taper, margin, leaf, part, live)
         if live == 1 and part == 0:

@@ -1,6 +1,8 @@
 """Distances between a link and the shapes it may touch: closed forms and exact triangles.
 
-Lengths in mm, in the frame of the shape. A link is a segment with a radius that varies linearly along it.
+Lengths in mm, in the frame of the shape. A link is a segment with a radius that varies linearly along it. The distance
+of a segment from a triangle is the least of ``segment_triangle`` and of ``point_triangle`` at both of its ends.
+Closest points as in Ericson, Real-Time Collision Detection (2005), chapter 5.
 """
 
 import warp as wp
@@ -16,7 +18,7 @@ tiny = 1e-12 if real is wp.float32 else 1e-24
 
 @wp.func
 def primitive(kind: int, size: vec3, x: vec3) -> vec4:
-    """Outward direction and signed distance of a point."""
+    """Return the outward direction at a point and its signed distance from a primitive."""
     zero = real(0.0)
     out = vec4(zero, zero, real(1.0), zero)
     if kind == wp.static(SPHERE) or kind == wp.static(CAPSULE):
@@ -69,7 +71,10 @@ def primitive(kind: int, size: vec3, x: vec3) -> vec4:
 
 @wp.func
 def segment_primitive(kind: int, size: vec3, a: vec3, b: vec3, ra: real, rb: real) -> vec5:
-    """Share, gap and normal where the gap is least; convex along the segment, so halving its slope finds it."""
+    """Return the place along a–b (0 to 1) of the least gap, that gap (negative inside) and the normal.
+
+    The gap is convex along the segment: its slope is halved to zero.
+    """
     low = real(0.0)
     high = real(1.0)
     along = b - a
@@ -92,7 +97,7 @@ def segment_primitive(kind: int, size: vec3, a: vec3, b: vec3, ra: real, rb: rea
 
 @wp.func
 def point_triangle(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
-    """Barycentric coordinates of q and r of the point of a triangle that is closest to x."""
+    """Return the barycentric coordinates of q and r of the point of a triangle that is closest to x."""
     pq = q - p
     pr = r - p
     px = x - p
@@ -128,7 +133,7 @@ def point_triangle(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
 
 @wp.func
 def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
-    """Shares of the closest points of the segments a + s d1 and p + t d2."""
+    """Return s and t of the closest points of the segments a + s d1 and p + t d2."""
     r = a - p
     aa = wp.dot(d1, d1)
     ee = wp.dot(d2, d2)
@@ -153,10 +158,8 @@ def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
 
 @wp.func
 def segment_triangle(a: vec3, b: vec3, p: vec3, q: vec3, r: vec3) -> vec4:
-    """Squared distance, share of the segment, barycentric q and r of the closest points of edges and interior.
-
-    The segment's ends over the face are left to ``point_triangle``.
-    """
+    """Return (squared distance, place along a–b, barycentric q, barycentric r) of the closest points of a segment and
+    the edges of a triangle; distance 0 where the segment pierces the face."""
     along = b - a
     pq = q - p
     pr = r - p

@@ -1,4 +1,10 @@
-"""How near a segment comes to a triangle surface: the nearest triangles first, by a group of threads."""
+"""Nearest triangles of a surface to a link: a group of threads goes down the surface's bounding volume hierarchy.
+
+The tree is that of ``brainbench.stimuli.engines.rod.mesh_bvh``: eight children a node, without pointers. The search
+always opens the box that may hold something nearer and is nearest, one thread a child, and measures triangles at the
+leaves, one thread a triangle. It begins at the leaf where the last search of the same link ended, so that hardly
+anything else is left to open. All lengths are in units of the surface.
+"""
 
 from typing import Any
 
@@ -12,8 +18,8 @@ from .parameters import group_size, real
 from .state import ShapeArrays
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
 
-own = WIDE // group_size
-Kept: Any = wp.types.matrix((LEVELS, own), real)
+children = WIDE // group_size
+Kept: Any = wp.types.matrix((LEVELS, children), real)
 beyond = 1e30
 none_left = 2**31 - 1
 
@@ -42,7 +48,7 @@ class NearestTriangles:
 
 @wp.func
 def level_size(count: int, level: int) -> int:
-    """Boxes of a level, of a surface of so many triangles."""
+    """Return the number of boxes of a level, of a surface of ``count`` triangles."""
     size = (count + wp.static(WIDE - 1)) // wp.static(WIDE)
     for _ in range(level):
         size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
@@ -53,6 +59,12 @@ def level_size(count: int, level: int) -> int:
 def nearest_triangles(
     shapes: ShapeArrays, s: int, a: vec3, b: vec3, radius: real, within: real, leaf: int, part: int, live: int
 ) -> NearestTriangles:
+    """Return the triangle nearest of all to the segment a–b (by edges, or a face that it pierces), to b or to a.
+
+    Nothing further than ``radius`` is found; ``within`` so much the nearest to the segment and to b are found each.
+    ``leaf`` is where to begin (−1: anywhere), ``part`` the thread's place in its group, ``live`` whether the group
+    has a question or only keeps others company.
+    """
     zero = real(0.0)
     far = real(wp.static(beyond))
     # Rounding must not hide a triangle.
@@ -98,12 +110,12 @@ def nearest_triangles(
     own_only = within * within
     side_kept = Kept()
     end_kept = Kept()
-    each = int(wp.static(own)) + wp.min(0, part)
+    each = int(wp.static(children)) + wp.min(0, part)
 
     while warp_max(busy) == 1:
         if busy == 1 and opened >= 0:
             for k in range(each):
-                place = wp.static(WIDE) * opened + part * wp.static(own) + k
+                place = wp.static(WIDE) * opened + part * wp.static(children) + k
                 if place < count:
                     p = shapes.corner[first_face + place, 0]
                     q = shapes.corner[first_face + place, 1]
@@ -157,7 +169,7 @@ def nearest_triangles(
         if busy == 1 and measure == 1:
             # How near the children of the node can be: beside the segment, and from its end.
             for k in range(each):
-                place = wp.static(WIDE) * node + part * wp.static(own) + k
+                place = wp.static(WIDE) * node + part * wp.static(children) + k
                 side_kept[level, k] = far
                 end_kept[level, k] = far
                 if place < size:
@@ -195,7 +207,7 @@ def nearest_triangles(
         for k in range(each):
             bound = side_kept[level, k]
             if sure * bound < side_most or sure * end_kept[level, k] < end_most:
-                rank = part * wp.static(own) + k
+                rank = part * wp.static(children) + k
                 code = wp.min(code, ((wp.cast(wp.float32(bound), wp.int32) >> 3) << 3) + rank)
         code = group_min_int(code)
         if busy == 1:
@@ -209,9 +221,9 @@ def nearest_triangles(
                     node = node // wp.static(WIDE)
             else:
                 rank = code % wp.static(WIDE)
-                if rank // wp.static(own) == part:
-                    side_kept[level, rank % wp.static(own)] = far
-                    end_kept[level, rank % wp.static(own)] = far
+                if rank // wp.static(children) == part:
+                    side_kept[level, rank % wp.static(children)] = far
+                    end_kept[level, rank % wp.static(children)] = far
                 node = wp.static(WIDE) * node + rank
                 if level == 0:
                     if node != begun:

@@ -1,6 +1,6 @@
-"""Motion of bases and obstacles: cubic Hermite pieces between equally spaced knots.
+"""Motion of bases and objects: cubic Hermite pieces between equally spaced knots.
 
-A track with one knot stands still or moves straight at the knot's velocity. Units: mm, ms, rad.
+A track with one knot stands still, or moves straight at the knot's velocity. Units: mm, ms, rad.
 """
 
 import warp as wp
@@ -12,6 +12,8 @@ from .state import MotionArrays
 
 @wp.struct
 class BodyMotion:
+    """Position, velocity, quaternion and angular velocity of a body at one time."""
+
     place: vec3
     velocity: vec3
     turn: vec4
@@ -20,7 +22,7 @@ class BodyMotion:
 
 @wp.func
 def turning(q: vec4, w: vec3) -> vec4:
-    """Rate of a quaternion: half of (0, w) times q."""
+    """Return the rate of a quaternion: half of (0, w) times q."""
     half = real(0.5)
     return vec4(
         -half * (w[0] * q[1] + w[1] * q[2] + w[2] * q[3]),
@@ -32,6 +34,7 @@ def turning(q: vec4, w: vec3) -> vec4:
 
 @wp.func
 def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
+    """Return the motion of a track at a time."""
     first = motions.first[index]
     count = motions.count[index]
     pose = BodyMotion()

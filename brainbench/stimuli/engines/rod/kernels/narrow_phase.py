@@ -1,4 +1,8 @@
-"""How near a link comes to a shape."""
+"""Exact distance of a link from a shape: from the triangles of a surface by its tree, from primitives in closed form.
+
+The sign of a distance from a surface is that of the angle-weighted pseudo-normal at the closest point (Bærentzen &
+Aanæs 2005). On a processor one thread searching for one link; on a GPU a group of threads.
+"""
 
 import warp as wp
 
@@ -15,7 +19,7 @@ from .state import LinkDistance, LinkTaper, ShapeArrays
 
 @wp.func
 def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
-    """Pseudo-normal of the corner, edge or face on which the point with these barycentric coordinates lies."""
+    """Return the pseudo-normal of the corner, edge or face that holds a point of these barycentric coordinates."""
     u = real(1.0) - v - w
     low = real(1e-4)
     on_p = u > low
@@ -39,13 +43,14 @@ def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
 
 @wp.func
 def surface_point(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
+    """Return the point of a triangle with these barycentric coordinates."""
     p = shapes.corner[face, 0]
     return p + (shapes.corner[face, 1] - p) * v + (shapes.corner[face, 2] - p) * w
 
 
 @wp.func
-def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
-    """Direction out of a mesh and signed distance, given the way from the closest point and the pseudo-normal."""
+def signed_direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
+    """Return the signed_direction out of a mesh and the signed distance, given the way from the closest point."""
     if distance < real(1e-3) * radius:
         return vec4(outward[0], outward[1], outward[2], distance)
     side = real(1.0) / distance
@@ -60,7 +65,7 @@ def direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
 def mesh_distance(
     shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: real, within: real, got: NearestTriangles
 ) -> LinkDistance:
-    """What a search found: contacts no further than ``within`` from the axis, or that the link lies far inside."""
+    """Return contacts no further than ``within`` from the link's axis, or that the link lies far inside."""
     found = LinkDistance()
     found.between = 0
     found.end = 0
@@ -88,7 +93,7 @@ def mesh_distance(
         if found.clearance > within:
             away = a + (b - a) * share - surface_point(shapes, first + face, v, w)
             radius = ra + (rb - ra) * share
-            out = direction(away, found.clearance, pseudo_normal(shapes, first + face, v, w), radius)
+            out = signed_direction(away, found.clearance, pseudo_normal(shapes, first + face, v, w), radius)
             if out[3] < real(0.0):
                 found.between = 1
                 found.share = share
@@ -105,7 +110,7 @@ def mesh_distance(
         if got.share > real(1e-3) and got.share < real(1.0 - 1e-3) and not (flat and got.side > real(0.0)):
             radius = ra + (rb - ra) * got.share
             away = a + (b - a) * got.share - surface_point(shapes, face, got.v, got.w)
-            out = direction(away, wp.sqrt(got.side), out_here, radius)
+            out = signed_direction(away, wp.sqrt(got.side), out_here, radius)
             found.between = 1
             found.share = got.share
             found.gap = out[3] - radius
@@ -113,7 +118,7 @@ def mesh_distance(
     if got.end_face >= 0 and got.end <= within * within:
         face = first + got.end_face
         away = b - surface_point(shapes, face, got.end_v, got.end_w)
-        out = direction(away, wp.sqrt(got.end), pseudo_normal(shapes, face, got.end_v, got.end_w), rb)
+        out = signed_direction(away, wp.sqrt(got.end), pseudo_normal(shapes, face, got.end_v, got.end_w), rb)
         found.end = 1
         found.end_gap = out[3] - rb
         found.end_normal = vec3(out[0], out[1], out[2])
@@ -133,9 +138,9 @@ def link_shape_distance(
     part: int,
     live: int,
 ) -> LinkDistance:
-    """How near a link comes to a shape, in lengths of the scene but directions of the shape.
+    """Return how near a link comes to a shape, in lengths of the scene but directions of the shape.
 
-    A negative margin asks only for a bound of the distance, up to so far.
+    Contacts are told up to a gap of ``margin``; a negative one asks only for a bound of the distance, up to so far.
     """
     turn_s = shapes.turn[s]
     scale = shapes.scale[s]
@@ -148,16 +153,16 @@ def link_shape_distance(
     found = LinkDistance()
     meshed = int(0)
     if wp.static(against == MESHES):
-        asks = int(0)
+        searching = int(0)
         if shapes.kind[s] == wp.static(MESH):
             meshed = 1
-            asks = live
+            searching = live
         within = (wp.max(taper.start_radius, taper.end_radius) + margin) / scale
         radius = wp.max(within, real(wp.static(FAR)) / scale)
         if margin < real(0.0):
             within = real(0.0)
             radius = -margin / scale
-        got = nearest_triangles(shapes, s, a, b, radius, within, leaf - 1, part, asks)
+        got = nearest_triangles(shapes, s, a, b, radius, within, leaf - 1, part, searching)
         found = mesh_distance(shapes, s, a, b, ra, rb, within, got)
     if meshed == 0:
         nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, a, b, ra, rb)

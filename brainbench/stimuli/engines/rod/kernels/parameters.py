@@ -17,8 +17,8 @@ cuda = False
 """Whether the code is for a GPU."""
 bounds: tuple[int, int] | None = None
 """CUDA launch bounds of the kernel that takes steps."""
-contacts = contacts_for(capacity)
-"""Contacts that are solved together."""
+max_contacts = contacts_for(capacity)
+"""Contacts that fit: they are solved together."""
 group_size = 1
 """Threads that work together on one whisker's contacts, or on one link's distance."""
 queue = 0

@@ -1,4 +1,8 @@
-"""Whiskers in slices: which whisker a thread takes, and what is kept of it until the next slice."""
+"""Whiskers in slices: which whisker a thread takes, and what is kept of it until the next slice.
+
+Where one thread walks through a tree of triangles, or solves for the forces of eight contacts, 31 neighbours wait. So
+on a GPU a whisker pauses where it needs distances or contact forces; kernels of their own find these for all.
+"""
 
 import warp as wp
 
@@ -35,10 +39,10 @@ def resume(
 ):
     """Read the joints of a whisker that paused."""
     for i in range(links):
-        chain.angle[i] = paused.joint[i, index].angle
-        chain.rate[i] = paused.joint[i, index].rate
-        proximity.clearance[i] = paused.proximity[i, index].clearance
-        proximity.leaf[i] = paused.proximity[i, index].leaf
+        chain.angle[i] = paused.link[i, index].angle
+        chain.rate[i] = paused.link[i, index].rate
+        proximity.clearance[i] = paused.link[i, index].clearance
+        proximity.leaf[i] = paused.link[i, index].leaf
 
 
 @wp.func(inline=True)
@@ -53,10 +57,10 @@ def pause(
     """Keep all that the next slice needs, and queue for it."""
     paused.state[index] = state
     for i in range(links):
-        paused.joint[i, index].angle = row(chain.angle, i)
-        paused.joint[i, index].rate = row(chain.rate, i)
-        paused.proximity[i, index].clearance = row(proximity.clearance, i)
-        paused.proximity[i, index].leaf = row(proximity.leaf, i)
+        paused.link[i, index].angle = row(chain.angle, i)
+        paused.link[i, index].rate = row(chain.rate, i)
+        paused.link[i, index].clearance = row(proximity.clearance, i)
+        paused.link[i, index].leaf = row(proximity.leaf, i)
     queue = wp.static(AFTER_DISTANCES)
     if state.waiting_for == WAIT_FORCES:
         queue = wp.static(AFTER_CONTACTS)

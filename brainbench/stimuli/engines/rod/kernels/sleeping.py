@@ -1,4 +1,8 @@
-"""Whiskers at rest: straight out of a base that stands still, until an object may come near."""
+"""Whiskers at rest: straight out of a base that stands still, without loads, until an object may come near.
+
+While a whisker rests, ``clearance`` of a link is the time until which nothing can reach it, from its distance and the
+speed of the fastest object; no step is computed until the first such time is over.
+"""
 
 import warp as wp
 
@@ -31,9 +35,9 @@ def query_rest_distances(
     state: wp.ref[WhiskerState],
     fresh: int,
     upto: real,
-    look: real,
+    far: real,
 ) -> int:
-    """Ask for these distances like for all others; returned is what to wait for."""
+    """Ask for the distances of links whose time is over, or of all (``fresh``); return what to wait for."""
     near_count = int(0)
     for i in range(job.links):
         if fresh == 1 or row(proximity.clearance, i) < upto:
@@ -42,7 +46,7 @@ def query_rest_distances(
     if state.first_query + near_count > paused.query.shape[0]:
         return WAIT_SLICE
     paused.query_time[job.index] = state.reading_time
-    paused.query_margin[job.index] = -look
+    paused.query_margin[job.index] = -far
     return WAIT_REST
 
 
@@ -60,6 +64,10 @@ def check_rest(
     upto: real,
     end: real,
 ) -> int:
+    """Find in ``state.safe_until`` the time until which nothing can come near; return what to wait for, 0 nothing.
+
+    ``start`` and ``end`` are the times of the launch, ``upto`` that of the next reading.
+    """
     zero = real(0.0)
     one = real(1.0)
     before = state.reading_time
@@ -72,14 +80,14 @@ def check_rest(
         y = rotate(pose.turn, vec3(zero, one, zero))
         at = pose.place
         # Nothing can come near after the last reading.
-        look = job.object_speed * (end - before) + real(0.5)
+        far = job.object_speed * (end - before) + real(0.5)
         fresh = int(0)
         if idle_before == zero or before == start:
             fresh = 1
         wait = int(0)
         if wp.static(sliced):
             if state.waiting_for != WAIT_REST:
-                wait = query_rest_distances(paused, job, proximity, state, fresh, upto, look)
+                wait = query_rest_distances(paused, job, proximity, state, fresh, upto, far)
         place = state.first_query
         links = job.links
         if wait == WAIT_SLICE:
@@ -89,14 +97,14 @@ def check_rest(
             turned = x * link.bend_cosine + y * link.bend_sine
             y = y * link.bend_cosine - x * link.bend_sine
             x = turned
-            ahead_at = at + x * link.length
+            end_at = at + x * link.length
             proximity.safe_until[i] = row(proximity.clearance, i)
             if fresh == 1 or row(proximity.clearance, i) < upto:
                 if wp.static(sliced) and wait == WAIT_REST:
                     paused.query[place].job = job.index
                     paused.query[place].link = i
                     paused.query[place].start = at
-                    paused.query[place].stop = ahead_at
+                    paused.query[place].stop = end_at
                 else:
                     slack = real(1e30)
                     taper = chains.taper[i, job.whisker]
@@ -107,7 +115,7 @@ def check_rest(
                         for s in range(job.first_shape, job.end_shape):
                             body = pose_at(motions, shapes.track[s], before)
                             found = link_shape_distance(
-                                shapes, s, body, at, ahead_at, taper, -look, row(proximity.leaf, i), 0, 1
+                                shapes, s, body, at, end_at, taper, -far, row(proximity.leaf, i), 0, 1
                             )
                             slack = wp.min(slack, found.clearance)
                             proximity.leaf[i] = found.leaf
@@ -119,7 +127,7 @@ def check_rest(
                         proximity.safe_until[i] = before + slack / (real(1.02) * job.object_speed)
                 place = place + 1
             state.safe_until = wp.min(state.safe_until, row(proximity.safe_until, i))
-            at = ahead_at
+            at = end_at
         if wp.static(sliced):
             if wait != 0:
                 state.safe_until = idle_before

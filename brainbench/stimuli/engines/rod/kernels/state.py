@@ -412,25 +412,18 @@ class LinkDistance:
 
 
 @wp.struct
-class ProblemSize:
-    """Counts of a contact problem; the last three are of its solution."""
+class ContactProblem:
+    """A step before contact: its size and length, and what the base and the tip do without contact forces."""
 
     links: wp.int32
     candidates: wp.int32
     contacts: wp.int32
-    """Contacts of the last step; then of this one."""
-    crowded: wp.int32
-    """1: there was no room for a contact."""
-    unsolved: wp.int32
-    """1: the forces did not converge."""
-
-
-@wp.struct
-class ProblemStep:
-    """Time step, and the tip of the whisker from the base point."""
-
-    length: real
+    """Contacts of the last step."""
+    step: real
     tip: vec3
+    base_moment: vec3
+    base_force: vec3
+    tip_acceleration: vec3
 
 
 @wp.struct
@@ -450,20 +443,14 @@ class JointRecord:
 
 
 @wp.struct
-class CandidateSize:
-    """Numbers of a contact candidate."""
+class CandidateRecord:
+    """A contact candidate, see :class:`ContactCandidates`."""
 
     gap: real
     arc: real
     friction: real
     link_arc: real
     """Arc length of its link."""
-
-
-@wp.struct
-class CandidatePlace:
-    """Vectors of a contact candidate."""
-
     point: vec3
     normal: vec3
     free_velocity: vec3
@@ -481,16 +468,21 @@ class HeldContact:
 
 @wp.struct
 class ContactSolution:
-    """Reaction of the base and acceleration of the tip, completed by the contacts, and what these do together."""
+    """Contact forces of a step, and what the base and the tip do with them."""
 
+    contacts: wp.int32
+    crowded: wp.int32
+    """1: there was no room for a contact."""
+    unsolved: wp.int32
+    """1: the forces did not converge."""
+    miss: real
+    """Square of what the last iteration changed in the forces; of the forces."""
+    load: real
     base_moment: vec3
     base_force: vec3
     tip_acceleration: vec3
-    miss: real
-    """Squares of what the last iteration changed in the forces, and of the forces."""
-    load: real
     normal_sum: real
-    """Sum of the normal forces, and of these times arc."""
+    """Sum of the normal forces; of these times arc."""
     arc_sum: real
     contact_force: vec3
     contact_moment: vec3
@@ -500,17 +492,13 @@ class ContactSolution:
 class ContactProblems:
     """Contact problem of each job's step, and its solution. Links and candidates of jobs lie one behind the other."""
 
-    size: wp.array(dtype=ProblemSize)
-    """[job]"""
-    step: wp.array(dtype=ProblemStep)
+    given: wp.array(dtype=ContactProblem)
     """[job]"""
     joint: wp.array(dtype=JointRecord)
     """[job · link]"""
+    candidate: wp.array(dtype=CandidateRecord)
+    """[job · candidate]"""
     candidate_link: wp.array(dtype=wp.int32)
-    """[job · candidate]"""
-    candidate_size: wp.array(dtype=CandidateSize)
-    """[job · candidate]"""
-    candidate: wp.array(dtype=CandidatePlace)
     """[job · candidate]"""
     predicted_gap: wp.array(dtype=real)
     """[job · candidate] gap at the end of the step."""
@@ -525,17 +513,11 @@ class ContactProblems:
 
 
 @wp.struct
-class PausedJoint:
-    """Angles and rates of a joint."""
+class PausedLink:
+    """Joint, clearance and leaf of a link, see :class:`ChainState` and :class:`ProximityState`."""
 
     angle: vec2
     rate: vec2
-
-
-@wp.struct
-class PausedProximity:
-    """Clearance and leaf of a link, see :class:`ProximityState`."""
-
     clearance: real
     leaf: wp.int32
 
@@ -574,9 +556,7 @@ class PausedWhiskers:
     next_query_count: wp.array(dtype=wp.int32)
     state: wp.array(dtype=WhiskerState)
     """[job]"""
-    joint: wp.array2d(dtype=PausedJoint)
-    """[link, job]"""
-    proximity: wp.array2d(dtype=PausedProximity)
+    link: wp.array2d(dtype=PausedLink)
     """[link, job]"""
     query_time: wp.array(dtype=real)
     """[job] time for which distances are asked."""

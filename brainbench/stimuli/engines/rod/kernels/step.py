@@ -1,4 +1,10 @@
-"""STEP"""
+"""Kernel that takes steps: one thread takes one whisker from reading to reading.
+
+A step of length h is the articulated-body algorithm, linearly implicit in the springs (``articulated_body``). Contacts
+are rigid and unilateral: the factorised chain gives their exact compliance in one more pass (``delassus``), a small
+Coulomb problem is solved for their forces, and one pass applies them (``contact_solver``). Everything is O(links).
+Units: mg, mm, ms, mN, µN·m; results are in N, N·m and m.
+"""
 
 import warp as wp
 
@@ -6,7 +12,7 @@ from brainbench.stimuli.engines.rod.limits import FINEST, NOTHING, REST, TRAVEL
 
 from .algebra import vec3
 from .articulated_body import articulated_inertia, forward_kinematics, integrate_joint, joint_accelerations
-from .broad_phase import count_near_links, find_candidates, query_distances, search_range
+from .broad_phase import count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
 from .motion import pose_at
@@ -41,6 +47,7 @@ from .state import (
 def load_job(
     chains: ChainArrays, motions: MotionArrays, shapes: ShapeArrays, jobs: JobArrays, options: StepOptions, index: int
 ) -> WhiskerJob:
+    """Return the constants of a job."""
     zero = real(0.0)
     job = WhiskerJob()
     job.index = index
@@ -64,7 +71,7 @@ def load_job(
 
 @wp.func(inline=True)
 def preferred_step(job: WhiskerJob, state: wp.ref[WhiskerState]) -> real:
-    """Where something is near, a step moves no point of the whisker further than a contact search looks."""
+    """Return the step to take: near an object, no point of the whisker moves further in it than contacts are sought."""
     wanted = job.longest_step
     pace = state.top_speed + job.object_speed
     if state.is_near == 1 and pace * job.longest_step > real(wp.static(TRAVEL)):
@@ -87,7 +94,7 @@ def write_reading(
     arc_sum: real,
     solved: int,
 ):
-    """Write the action on the base and what there is of contact, as of the beginning of the step."""
+    """Write the wrench on the base and the contact, as of the beginning of the step."""
     none = vec3(real(0.0), real(0.0), real(0.0))
     index = job.index
     first = jobs.row[index]
@@ -121,6 +128,11 @@ def run(
     problems: ContactProblems,
     paused: PausedWhiskers,
 ):
+    """Take each whisker to its last reading, or to where it pauses.
+
+    Without slices thread and job have one number and ``problems`` is each thread's room; with slices threads follow the
+    queues of ``paused``. ``readings`` are times (ms), ascending.
+    """
     index = wp.tid()
     if wp.static(sliced):
         index = next_job(paused, index)
@@ -146,24 +158,24 @@ def run(
     wait = int(0)
     first_reading = state.reading
     for reading in range(first_reading, readings.shape[0] + 1):
-        upto = state.reading_time + job.longest_step
+        until = state.reading_time + job.longest_step
         if reading < readings.shape[0]:
-            upto = readings[reading]
-        span = upto - state.reading_time
+            until = readings[reading]
+        span = until - state.reading_time
         if span <= zero:
             # A reading at the very start.
             state.pending_reading = reading
             continue
-        if state.at_rest == 1 and upto > state.safe_until and state.time_left == zero:
+        if state.at_rest == 1 and until > state.safe_until and state.time_left == zero:
             end = readings[readings.shape[0] - 1]
-            wait = check_rest(chains, motions, shapes, job, paused, chain, proximity, state, options.start, upto, end)
+            wait = check_rest(chains, motions, shapes, job, paused, chain, proximity, state, options.start, until, end)
             if wp.static(sliced):
                 if wait != 0:
                     state.reading = reading
                     break
-        if state.at_rest == 1 and upto <= state.safe_until and state.time_left == zero:
+        if state.at_rest == 1 and until <= state.safe_until and state.time_left == zero:
             # At rest, and nothing can have come near: the wrench stays zero.
-            state.reading_time = upto
+            state.reading_time = until
             state.pending_reading = int(-1)
             continue
         left = span
@@ -178,17 +190,17 @@ def run(
                     wait = WAIT_SLICE
                     break
                 used = used + 1
-            now = upto - left
-            count = wp.max(1, int(wp.ceil(left / preferred_step(job, state) - real(1e-3))))
-            h = left / real(count)
+            now = until - left
+            steps = wp.max(1, int(wp.ceil(left / preferred_step(job, state) - real(1e-3))))
+            h = left / real(steps)
             left_whole = left
             left = left - h
-            if count == 1:
+            if steps == 1:
                 last = 1
                 if options.quasistatic == 1 and reading < readings.shape[0]:
                     state.pending_reading = reading
             state.largest_change = zero
-            seen = int(0)
+            count = int(0)
             solved = int(0)
             origin = none
             base_wrench = Wrench()
@@ -199,7 +211,7 @@ def run(
                 state.time_left = zero
                 state.is_near = state.step_is_near
                 state.top_speed = state.step_top_speed
-                seen = 1
+                count = 1
                 solved = 1
             else:
                 pose = pose_at(motions, job.base, now)
@@ -213,8 +225,8 @@ def run(
                 base.linear = (
                     (later.velocity - moving.linear) / h - wp.cross(moving.angular, moving.linear) - options.gravity
                 )
-                was_near = state.is_near
-                was_quickest = state.top_speed
+                previously_near = state.is_near
+                previous_speed = state.top_speed
                 tip = forward_kinematics(chains, job, pose, chain, proximity, state)
                 state.is_near = 0
                 if wp.static(against > NOTHING):
@@ -226,61 +238,38 @@ def run(
                             wait = query_distances(
                                 chains, job, paused, chain, proximity, state, reach, origin, now, near_count
                             )
-                            state.is_near = was_near
-                            state.top_speed = was_quickest
+                            state.is_near = previously_near
+                            state.top_speed = previous_speed
                             break
-                    for i in range(job.links):
-                        proximity.clearance[i] = row(proximity.clearance, i) - reach.time * (
-                            row(proximity.end_speed, i) + reach.unknown_speed
-                        )
+                    lower_clearance(job, proximity, reach)
                     state.last_step = h
                     if near_count > 0:
-                        seen = find_candidates(
-                            chains,
-                            motions,
-                            shapes,
-                            job,
-                            paused,
-                            chain,
-                            proximity,
-                            candidates,
-                            state,
-                            pose,
-                            reach.margin,
-                            now,
-                            h,
-                        )
+                        count = find_candidates(
+                            chains, motions, shapes, job, paused, chain, proximity, candidates, state, pose,
+                            reach.margin, now, h
+                        )  # fmt: skip
                 if wp.static(sliced):
                     state.waiting_for = 0
                     state.time_left = zero
-                base_wrench = articulated_inertia(chains, jobs, job, chain, proximity, tip, base, now, h, seen)
+                base_wrench = articulated_inertia(chains, jobs, job, chain, proximity, tip, base, now, h, count)
                 tip_acceleration = joint_accelerations(
-                    job, options, chain, candidates, state, moving, base, now, h, seen
+                    job, options, chain, candidates, state, moving, base, now, h, count
                 )
-                if wp.static(against > NOTHING) and seen > 0:
-                    solved = any_gap_closes(candidates, seen, h)
+                if wp.static(against > NOTHING) and count > 0:
+                    solved = any_gap_closes(candidates, count, h)
                     if solved == 1:
                         write_problem(
-                            problems,
-                            chains,
-                            job,
-                            chain,
-                            proximity,
-                            candidates,
-                            state,
-                            base_wrench,
-                            tip_acceleration,
-                            h,
-                            seen,
-                        )
+                            problems, chains, job, chain, proximity, candidates, state, base_wrench, tip_acceleration,
+                            h, count
+                        )  # fmt: skip
                         if wp.static(sliced):
                             wait = WAIT_FORCES
                             state.step_is_near = state.is_near
                             state.step_top_speed = state.top_speed
-                            state.is_near = was_near
-                            state.top_speed = was_quickest
+                            state.is_near = previously_near
+                            state.top_speed = previous_speed
                             state.time_left = left_whole
-                            queue_problem(paused, index, seen)
+                            queue_problem(paused, index, count)
                             break
                         else:
                             solve_contacts(problems, index, 0, 1)
@@ -301,22 +290,12 @@ def run(
             state.touching = state.touching + touched
             if state.pending_reading >= 0:
                 write_reading(
-                    results,
-                    jobs,
-                    options,
-                    problems,
-                    job,
-                    chain,
-                    state.pending_reading,
-                    origin,
-                    base_wrench,
-                    force_sum,
-                    arc_sum,
-                    solved,
-                )
+                    results, jobs, options, problems, job, chain, state.pending_reading, origin, base_wrench,
+                    force_sum, arc_sum, solved
+                )  # fmt: skip
                 state.pending_reading = int(-1)
             state.steps = state.steps + 1
-            if seen > 0:
+            if count > 0:
                 for i in range(job.links):
                     integrate_joint(chain, state, i, row(chain.acceleration, i), h, now + h, options.quasistatic)
             state.at_rest = int(0)
@@ -328,7 +307,7 @@ def run(
         if wait != 0:
             state.reading = reading
             break
-        state.reading_time = upto
+        state.reading_time = until
         if options.quasistatic == 0:
             state.pending_reading = reading
         if state.status != 0:

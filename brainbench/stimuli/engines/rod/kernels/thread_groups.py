@@ -1,7 +1,8 @@
 """Groups of threads that work on one thing and tell each other what they found.
 
-All threads of a GPU warp must call these functions together. A group of one thread has nobody to ask; on a processor
-groups have one thread.
+``broadcast(value, source)`` is the value that the thread ``source`` of the group has; ``group_sum``, ``group_max``,
+``group_min``, ``group_min_int`` and ``group_or`` (of bits) are taken over the group, ``warp_max`` over its warp. All
+threads of a warp must call them together. A group of one thread, as on a processor, has nobody to ask.
 """
 
 import warp as wp
@@ -52,8 +53,7 @@ else:
         )
 
     @wp.func_native(native(f"return __shfl_sync(0xffffffffu, value, source, {group_size});"))
-    def broadcast(value: real, source: int) -> real:
-        """Return the value of the thread ``source`` of the group."""
+    def broadcast(value: real, source: int) -> real: ...
 
     @wp.func_native(reduce("value += other;"))
     def group_sum(value: real) -> real: ...
@@ -71,5 +71,4 @@ else:
     def group_or(bits: int) -> int: ...
 
     @wp.func_native(reduce("value = other > value ? other : value;", width=32))
-    def warp_max(value: int) -> int:
-        """Return the greatest value of all threads of the warp."""
+    def warp_max(value: int) -> int: ...

@@ -1,0 +1,126 @@
+"""The three passes over a chain, against its dense mass matrix."""
+
+import numpy as np
+import pytest
+
+from brainbench.core.devices import to_struct
+from tests.factories.rod_chain import DenseChain, in_double
+
+wp = pytest.importorskip("warp")
+
+STEP = 0.5
+
+
+def _passes(chain, accelerations, load=None):
+    """Joint accelerations [n, link, 2], wrenches on the base [n, 6] and accelerations of the tip [n, 3]."""
+    kernels = in_double("articulated_body")
+    real, vec2, vec3 = wp.float64, kernels.vec2, kernels.vec3
+    ChainArrays, JobArrays, StepOptions = kernels.ChainArrays, kernels.JobArrays, kernels.StepOptions
+    WhiskerJob, WhiskerState, ChainState = kernels.WhiskerJob, kernels.WhiskerState, kernels.ChainState
+    ProximityState, ContactCandidates, BodyMotion = (
+        kernels.ProximityState,
+        kernels.ContactCandidates,
+        kernels.BodyMotion,
+    )
+    Twist, SpatialAcceleration = kernels.Twist, kernels.SpatialAcceleration
+    forward_kinematics, articulated_inertia = kernels.forward_kinematics, kernels.articulated_inertia
+    joint_accelerations, row = kernels.joint_accelerations, kernels.row
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def passes(
+        chains: ChainArrays,
+        jobs: JobArrays,
+        options: StepOptions,
+        pose: BodyMotion,
+        angle: wp.array(dtype=vec2),
+        rate: wp.array(dtype=vec2),
+        acceleration: wp.array2d(dtype=vec3),
+        h: real,
+        loads: int,
+        joints: wp.array2d(dtype=vec2),
+        wrench: wp.array2d(dtype=vec3),
+        tip: wp.array(dtype=vec3),
+    ):
+        k = wp.tid()
+        job = WhiskerJob()
+        job.links = chains.links[0]
+        job.beta = chains.beta[0]
+        job.end_load = loads
+        chain = ChainState()
+        proximity = ProximityState()
+        candidates = ContactCandidates()
+        state = WhiskerState()
+        for i in range(job.links):
+            chain.angle[i] = angle[i]
+            chain.rate[i] = rate[i]
+        moving = Twist()
+        moving.angular = pose.spin
+        moving.linear = pose.velocity
+        base = SpatialAcceleration()
+        base.angular = acceleration[k, 0]
+        base.linear = acceleration[k, 1]
+        last = forward_kinematics(chains, job, pose, chain, proximity, state)
+        felt = articulated_inertia(chains, jobs, job, chain, proximity, last, base, real(0.0), h, 1)
+        tip[k] = joint_accelerations(job, options, chain, candidates, state, moving, base, real(0.0), h, 1)
+        wrench[k, 0] = felt.moment
+        wrench[k, 1] = felt.force
+        for i in range(job.links):
+            joints[k, i] = row(chain.acceleration, i)
+
+    loads = {name: np.zeros(2, dtype=np.int32) for name in ("whisker", "scene", "base", "row", "column", "load_first")}
+    link, share, force = load or (0, 0.0, np.zeros(3))
+    loads |= {"step": np.zeros(1), "load_link": np.array([link], dtype=np.int32), "load_share": np.array([share])}
+    loads |= {"load_force": np.array([force]), "load_stop": np.array([1e30])}
+    pose = BodyMotion()
+    pose.turn, pose.spin, pose.velocity = chain.base_turn, chain.base_twist[:3], chain.base_twist[3:]
+    n = len(accelerations)
+    joints, wrench = wp.zeros((n, chain.links), dtype=vec2), wp.zeros((n, 2), dtype=vec3)
+    tip = wp.zeros(n, dtype=vec3)
+    inputs = [
+        to_struct(ChainArrays, chain.arrays(), "cpu"), to_struct(JobArrays, loads, "cpu"), StepOptions(), pose,
+        wp.array(chain.angle, dtype=vec2), wp.array(chain.rate, dtype=vec2),
+        wp.array(np.reshape(accelerations, (n, 2, 3)), dtype=vec3), STEP, int(load is not None), joints, wrench, tip,
+    ]  # fmt: skip
+    wp.launch(passes, n, inputs, device="cpu")
+    return joints.numpy(), wrench.numpy().reshape(n, 6), tip.numpy()
+
+
+def test_the_articulated_inertia_is_the_schur_complement_of_the_mass_matrix():
+    chain = DenseChain.random()
+    chain.rate[:], chain.base_twist[:] = 0, 0
+    _, wrench, _ = _passes(chain, np.vstack([np.zeros(6), np.eye(6)]))
+    found = (wrench[1:] - wrench[0]).T
+    dense, (joints, _) = chain.mass_matrix(), chain.implicit(STEP)
+    expected = dense[:6, :6] - dense[:6, 6:] @ np.linalg.solve(joints, dense[6:, :6])
+    np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("beta", [0.1, 2.0])
+@pytest.mark.parametrize("loaded", [False, True])
+def test_joints_accelerate_as_the_dense_equation_of_motion_says(beta, loaded):
+    chain = DenseChain.random(links=8, seed=1)
+    chain.beta = beta
+    rng = np.random.default_rng(2)
+    given = rng.normal(size=(4, 6))
+    load = (5, 0.3, rng.normal(size=3)) if loaded else None
+    joints, wrench, tip = _passes(chain, given, load)
+    dense, bias, (implicit, spring) = chain.mass_matrix(), chain.bias(), chain.implicit(STEP)
+    nodes, _, _ = chain.pose()
+    pushed = np.zeros(6 + 2 * chain.links)
+    if load is not None:
+        point = nodes[load[0]] + load[1] * (nodes[load[0] + 1] - nodes[load[0]])
+        pushed = chain.point_jacobian(point, load[0])[3:].T @ load[2]
+    spin, velocity = chain.base_twist[:3], chain.base_twist[3:]
+    for k, base in enumerate(given):
+        # The base's spatial acceleration leaves out how its point is carried along.
+        base = base + np.concatenate([np.zeros(3), np.cross(spin, velocity)])
+        force = spring + (pushed - bias)[6:] - dense[6:, :6] @ base
+        expected = np.linalg.solve(implicit, force)
+        np.testing.assert_allclose(joints[k].ravel(), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+        # Newton and Euler for all links together.
+        total = dense[:6, :6] @ base + dense[:6, 6:] @ expected + (bias - pushed)[:6]
+        np.testing.assert_allclose(wrench[k], total, rtol=1e-8, atol=1e-8 * np.abs(total).max())
+    # Of two runs that differ in the acceleration of the base alone, the tips differ by what the Jacobian says.
+    jacobian = chain.point_jacobian(nodes[-1], chain.links - 1)[3:]
+    change = np.concatenate([given[1] - given[0], (joints[1] - joints[0]).ravel()])
+    np.testing.assert_allclose(tip[1] - tip[0], jacobian @ change, atol=1e-8)

@@ -1,0 +1,209 @@
+"""Contact forces of one step: Signorini's and Coulomb's conditions, against brute force over the dense chain."""
+
+from itertools import product
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from brainbench.core.devices import to_struct
+from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
+from tests.factories.rod_chain import CAPACITY, DenseChain, in_double
+from tests.factories.rod_threads import Records, thread_warp
+
+wp = pytest.importorskip("warp")
+
+STEP = 0.5
+PLACES = contacts_for(CAPACITY) + SPARE
+
+
+def _problem(count, friction, seed, links=8):
+    """A chain that something presses from a few sides, and where it would be without contact."""
+    rng = np.random.default_rng(seed)
+    chain = DenseChain.random(links, seed)
+    nodes = chain.pose()[0]
+    link = np.sort(rng.choice(np.arange(1, links), count, replace=False)).astype(np.int32)
+    share = rng.uniform(0.1, 0.9, count)
+    point = nodes[link] + share[:, None] * (nodes[link + 1] - nodes[link])
+    normal = rng.normal(size=(count, 3))
+    along = nodes[link + 1] - nodes[link]
+    normal -= 0.9 * along * (np.sum(normal * along, axis=1) / np.sum(along**2, axis=1))[:, None]
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    # Coming nearer, or a little away, so that some candidates end without force.
+    velocity = -normal * rng.uniform(-0.1, 0.3, count)[:, None] + 0.1 * rng.normal(size=(count, 3))
+    jacobian = np.array([chain.point_jacobian(p, i)[3:, 6:] for p, i in zip(point, link, strict=True)])
+    return SimpleNamespace(
+        chain=chain, link=link, point=point, normal=normal, free=velocity, jacobian=jacobian,
+        gap=rng.uniform(0, 0.01, count), friction=np.full(count, friction),
+        arc=np.cumsum(chain.length)[link] + share, along=along,
+    )  # fmt: skip
+
+
+def _factorised(problem):
+    """What ``write_problem`` leaves of these candidates: fields of ``ContactProblems`` for one job."""
+    kernels = in_double("contact_problem")
+    from brainbench.stimuli.engines.rod.scheduling import allocate
+
+    passes = in_double("articulated_body")
+    real, vec2, vec3 = wp.float64, passes.vec2, passes.vec3
+    ChainArrays, JobArrays, ContactProblems = passes.ChainArrays, passes.JobArrays, kernels.ContactProblems
+    ChainState, ProximityState, ContactCandidates = passes.ChainState, passes.ProximityState, passes.ContactCandidates
+    WhiskerJob, WhiskerState, BodyMotion = passes.WhiskerJob, passes.WhiskerState, passes.BodyMotion
+    SpatialAcceleration, forward_kinematics = passes.SpatialAcceleration, passes.forward_kinematics
+    articulated_inertia, write_problem = passes.articulated_inertia, kernels.write_problem
+    any_gap_closes = kernels.any_gap_closes
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def write(
+        chains: ChainArrays,
+        jobs: JobArrays,
+        pose: BodyMotion,
+        angle: wp.array(dtype=vec2),
+        link: wp.array(dtype=wp.int32),
+        point: wp.array(dtype=vec3),
+        normal: wp.array(dtype=vec3),
+        free: wp.array(dtype=vec3),
+        gap: wp.array(dtype=real),
+        friction: wp.array(dtype=real),
+        arc: wp.array(dtype=real),
+        h: real,
+        problems: ContactProblems,
+    ):
+        job = WhiskerJob()
+        job.links = chains.links[0]
+        job.beta = chains.beta[0]
+        chain = ChainState()
+        proximity = ProximityState()
+        candidates = ContactCandidates()
+        state = WhiskerState()
+        for i in range(job.links):
+            chain.angle[i] = angle[i]
+        for j in range(link.shape[0]):
+            candidates.link[j] = link[j]
+            candidates.point[j] = point[j]
+            candidates.normal[j] = normal[j]
+            candidates.free_velocity[j] = free[j]
+            candidates.gap[j] = gap[j]
+            candidates.friction[j] = friction[j]
+            candidates.arc[j] = arc[j]
+        last = forward_kinematics(chains, job, pose, chain, proximity, state)
+        base = SpatialAcceleration()
+        felt = articulated_inertia(chains, jobs, job, chain, proximity, last, base, real(0.0), h, 1)
+        any_gap_closes(candidates, link.shape[0], h)
+        none = vec3(real(0.0), real(0.0), real(0.0))
+        write_problem(problems, chains, job, chain, proximity, candidates, state, felt, none, h, link.shape[0])
+
+    shapes = {"given": 1, "solution": 1, "joint": CAPACITY, "held": (1, contacts_for(CAPACITY))}
+    shapes |= dict.fromkeys(("candidate", "candidate_link", "predicted_gap"), PLACES)
+    shapes |= dict.fromkeys(("free_acceleration", "added_acceleration"), (1, CAPACITY))
+    problems = allocate(ContactProblems, "cpu", **shapes)
+    pose = BodyMotion()
+    pose.turn = problem.chain.base_turn
+    vectors = (wp.array(values, dtype=vec3) for values in (problem.point, problem.normal, problem.free))
+    numbers = (wp.array(values, dtype=real) for values in (problem.gap, problem.friction, problem.arc))
+    inputs = [
+        to_struct(ChainArrays, problem.chain.arrays(), "cpu"), JobArrays(), pose,
+        wp.array(problem.chain.angle, dtype=vec2), wp.array(problem.link), *vectors, *numbers, STEP, problems,
+    ]  # fmt: skip
+    wp.launch(write, 1, inputs, device="cpu")
+    return problems, tuple(shapes)
+
+
+def _solve(problem):
+    """Forces [candidate, 3] in world axes, added accelerations [link, 2] and the solution."""
+    kernels = in_double("contact_solver")
+    solve_contacts, ContactProblems = kernels.solve_contacts, kernels.ContactProblems
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def solve(problems: ContactProblems):
+        solve_contacts(problems, 0, 0, 1)
+
+    problems, _ = _factorised(problem)
+    wp.launch(solve, 1, [problems], device="cpu")
+    solution = problems.solution.numpy()[0]
+    return _by_candidate(problem, problems.held.numpy()[0], solution), problems.added_acceleration.numpy()[0], solution
+
+
+def _by_candidate(problem, held, solution):
+    forces = np.zeros((len(problem.link), 3))
+    for one in held[: solution["contacts"]]:
+        forces[np.argmin(np.abs(problem.arc - one["arc"]))] = one["force"]
+    return forces
+
+
+def _compliance(problem):
+    """Dense Delassus matrix [candidate, 3, candidate, 3] and inverse joint inertia times Jacobians, transposed."""
+    implicit, _ = problem.chain.implicit(STEP)
+    flat = problem.jacobian.reshape(-1, implicit.shape[0])
+    moved = np.linalg.solve(implicit, flat.T)
+    count = len(problem.link)
+    return (STEP * flat @ moved).reshape(count, 3, count, 3), moved
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_without_friction_the_forces_are_those_of_the_only_consistent_set_of_contacts(seed):
+    problem = _problem(4, 0.0, seed)
+    forces, added, solution = _solve(problem)
+    compliance, moved = _compliance(problem)
+    n = problem.normal
+    normal = np.einsum("ia,iajb,jb->ij", n, compliance, n)
+    target = -problem.gap / STEP - np.sum(n * problem.free, axis=1)
+    found = []
+    for pressing in product([False, True], repeat=4):
+        on = np.array(pressing)
+        f = np.zeros(4)
+        f[on] = np.linalg.solve(normal[np.ix_(on, on)], target[on])
+        if (f >= 0).all() and (normal @ f - target >= -1e-9)[~on].all():
+            found.append(f)
+    assert len(found) == 1
+    assert solution["unsolved"] == 0
+    scale = max(np.abs(found[0]).max(), 1e-9)
+    # Sweeps stop at 1e-4 of the forces, or when gaps are met to 1e-4 mm.
+    np.testing.assert_allclose(np.sum(forces * n, axis=1), found[0], atol=2e-3 * scale)
+    np.testing.assert_allclose(forces, n * np.sum(forces * n, axis=1)[:, None], atol=1e-9 * scale)
+    # What is applied to the joints is what these forces do.
+    np.testing.assert_allclose(
+        added[: problem.chain.links].ravel(), moved @ forces.ravel(), atol=1e-9 * max(np.abs(added).max(), 1e-9)
+    )
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.6])
+@pytest.mark.parametrize("seed", range(6))
+def test_contacts_keep_signorini_and_coulomb(seed, friction):
+    problem = _problem(3, friction, seed)
+    forces, _, solution = _solve(problem)
+    assert solution["unsolved"] == 0
+    compliance, _ = _compliance(problem)
+    velocity = problem.free + np.einsum("iajb,jb->ia", compliance, forces)
+    n = problem.normal
+    normal, rate = np.sum(forces * n, axis=1), np.sum(velocity * n, axis=1)
+    gap = problem.gap + STEP * rate
+    sliding, slip = forces - normal[:, None] * n, velocity - rate[:, None] * n
+    size, speed = np.linalg.norm(sliding, axis=1), np.linalg.norm(slip, axis=1)
+    scale = np.abs(forces).max()
+    assert (normal >= 0).all()
+    assert (gap >= -1e-3).all()
+    assert (np.abs(gap[normal > 1e-3 * scale]) < 1e-3).all()
+    assert (size <= friction * normal * (1 + 1e-3)).all()
+    held = (normal > 1e-3 * scale) & (size < 0.99 * friction * normal)
+    assert (speed[held] * STEP < 2e-3).all()
+    moving = (normal > 1e-3 * scale) & (speed * STEP > 1e-2)
+    opposed = -np.sum(sliding * slip, axis=1)[moving] / (size * speed)[moving]
+    assert (opposed > 0.98).all()
+
+
+def test_a_group_of_threads_finds_what_one_finds():
+    problem = _problem(4, 0.4, 1)
+    alone, added, _ = _solve(problem)
+    problems, names = _factorised(problem)
+    size = 4
+    with thread_warp() as (threads, load):
+        solver = load("contact_solver", group_size=size, max_contacts=size, capacity=CAPACITY)
+        given = SimpleNamespace(**{name: Records(getattr(problems, name).numpy()) for name in names})
+        # The other groups of the warp have nothing to solve and keep the first company.
+        threads.run(lambda thread: solver.solve_contacts(given, 0, thread % size, int(thread < size)))
+        held, solution = given.held.values[0], given.solution.values[0]
+    assert solution["contacts"] == 4
+    scale = np.abs(alone).max()
+    np.testing.assert_allclose(_by_candidate(problem, held, solution), alone, atol=1e-6 * scale)
+    np.testing.assert_allclose(given.added_acceleration.values[0], added, atol=1e-6 * np.abs(added).max())
