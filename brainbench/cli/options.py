@@ -38,7 +38,7 @@ class OptionField:
     """One field of a dataclass as an option."""
 
     kind: Any
-    """Of one value on the command line."""
+    """Type of one value on the command line."""
     several: bool
     """True for a tuple, which is written with commas."""
     default: Any

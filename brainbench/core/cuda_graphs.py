@@ -130,11 +130,11 @@ class CudaGraphStep:
         self._graph: Graph | None = None
         self._result: Any = None
         self.failed: str = ""
-        """Why the work could not be recorded; empty if it was, or was not tried yet."""
+        """Reason why the work could not be recorded; empty if it was, or was not tried yet."""
 
     @property
     def recorded(self) -> bool:
-        """Whether the work is replayed."""
+        """True when the work is replayed."""
         return self._graph is not None
 
     def __call__(self, *subjects: Any) -> Any:

@@ -1,4 +1,4 @@
-"""How long jobs say how far they are."""
+"""Callback by which long jobs report their progress."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scores and result records: what is known about one model's match to one set of recordings, typed.
+"""Scores and result records: one model's match to one set of recordings, typed and checked.
 
 Letters: K stimulus, P = K(K−1)/2 RDM pair.
 """
@@ -58,7 +58,7 @@ class Interval(_NullIsNaN):
     level: Share = 0.95
     """Share of repetitions whose intervals hold the truth."""
     method: str = ""
-    """How it was made, over what, and why it may be unreliable."""
+    """Method that made it, over what, and why it may be unreliable."""
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,12 @@ class LayerScore(_NullIsNaN):
     """Mean raw comparison over the same animals."""
     status: Status = "ok"
     interval: Interval | None = None
-    """Of ``value``, over animals."""
+    """Interval of ``value``, over animals."""
 
 
 @dataclass(frozen=True, eq=False)
 class Provenance(Mapping[str, Any]):
-    """Where a score comes from. Read as a mapping it has the entries that are stated, as the JSON has."""
+    """Origin of a score. Read as a mapping it has the entries that are stated, as the JSON has."""
 
     version: str = ""
     """Version of this package that made the score."""
@@ -132,7 +132,7 @@ class Provenance(Mapping[str, Any]):
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Options of the run, from which the same score can be computed again."""
     statistics: Mapping[str, Any] = field(default_factory=dict)
-    """What single metrics and tests add: layer tests, bootstrap, accuracies, shares of variance."""
+    """Additions of single metrics and tests: layer tests, bootstrap, accuracies, shares of variance."""
     more: Mapping[str, Any] = field(default_factory=dict)
     """All else that was stated, and entries of another kind than above: a record is data that anyone may write."""
 
@@ -172,40 +172,40 @@ else:
 
 @dataclass(frozen=True)
 class Score(_NullIsNaN):
-    """What is known about one model's match to one set of recordings.
+    """One model's match to one set of recordings, with its statistics.
 
     Everything printed or published comes from this object. ``value`` is NaN exactly when
     ``status`` is ``undefined``. RDMs are upper triangles [P] in the order of ``stimuli``.
     """
 
     name: str
-    """Of the model."""
+    """Name of the model."""
     value: Number
     """Mean over animals, corrected for their noise where the metric can be."""
     status: Status
     """``ok``, ``unreliable`` or ``undefined``."""
     reasons: tuple[str, ...] = ()
-    """Why it is not ``ok``, and what else a reader must know, in words."""
+    """Reasons why it is not ``ok``, and what else a reader must know, in words."""
     r: Number = math.nan
     """Mean raw comparison over animals."""
     reliability: Number = math.nan
     """Mean Spearman-Brown-corrected split-half reliability over animals."""
     reliability_interval: Interval | None = None
-    """Of ``reliability``, over animals."""
+    """Interval of ``reliability``, over animals."""
     interval: Interval | None = None
-    """Of ``value``."""
+    """Interval of ``value``."""
     p: Share = math.nan
-    """Of a value as high without a match, by ``p_method``."""
+    """Probability of a value as high without a match, by ``p_method``."""
     p_method: str = ""
     """The test, what was exchanged and how often."""
     p_smallest: Share = math.nan
     """Smallest p that this number of stimuli can give."""
     ceiling: Ceiling | None = None
-    """Of ``r``; None where the metric has none."""
+    """Noise ceiling of ``r``; None where the metric has none."""
     layer: str | None = None
     """The layer chosen most often when each animal in turn is held out."""
     layer_rule: str = ""
-    """How layers were chosen."""
+    """Rule by which layers were chosen."""
     best_layer: str | None = None
     """Layer of ``best_layer_value``."""
     best_layer_value: Number = math.nan
@@ -214,7 +214,7 @@ class Score(_NullIsNaN):
     subjects: tuple[SubjectScore, ...] = ()
     estimator: str = "default"
     metric: str = ""
-    """What was compared and how, in words."""
+    """Comparison and its measure, in words."""
     stimuli: tuple[str, ...] = ()
     """Names, in the order of the RDMs."""
     model_rdm: tuple[Number, ...] = ()
@@ -244,7 +244,7 @@ class Score(_NullIsNaN):
         return _convert(cls, _parsed(source))
 
     def summary(self) -> str:
-        """One line a person reads: value, interval, p and status."""
+        """Return one line a person reads: value, interval, p and status."""
         if self.status == "undefined":
             return f"{self.name}: undefined ({'; '.join(self.reasons)})"
         text = f"{self.name}: {self.value:.3f}"
@@ -282,7 +282,7 @@ class GraphNode:
     part: str
     """``input``, ``encoder``, ``attender`` or ``decoder``."""
     kind: str
-    """What it computes, such as ``convolution 2×2``."""
+    """Kind of computation, such as ``convolution 2×2``."""
     memory: str = ""
     """Its recurrent cell; empty for none."""
     shape: tuple[Count, ...] = ()
@@ -310,7 +310,7 @@ class ModelGraph:
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What a scored model is. Fields that do not apply are None."""
+    """Facts about a scored model. Fields that do not apply are None."""
 
     name: str
     family: str = ""
@@ -324,32 +324,32 @@ class ModelCard:
     top5: Share | None = None
     """Share whose class is among its first five."""
     accuracy_interval: Interval | None = None
-    """Of ``top1``."""
+    """Interval of ``top1``."""
     accuracy_data: str | None = None
     """Content hash of the test data behind the accuracies."""
     collapsed: bool | None = None
-    """Whether it answers everything with one class, or its features fall into one point."""
+    """True when it answers everything with one class, or its features fall into one point."""
     twin: str | None = None
     """Registry name of the untrained twin."""
     seed: int | None = None
-    """Of its weights."""
+    """Seed of its weights."""
     weights: str | None = None
     """Content hash of the weights that were scored."""
     input: str = ""
-    """How the stimuli were turned into the model's input (units, normaliser)."""
+    """Preparation of the stimuli for the model (units, normaliser)."""
     encoder: str | None = None
     """Encoder with its memory, without its size, such as ``zhuang-intersection-ln``."""
     attender: str | None = None
     """``gpt``, ``mamba``, or ``none`` for a network known to have none."""
     training: Mapping[str, Any] = field(default_factory=dict)
-    """How it was trained: optimiser, epochs, batch, data, as the checkpoint states it. Empty if untrained."""
+    """Its training: optimiser, epochs, batch, data, as the checkpoint states it. Empty if untrained."""
     graph: ModelGraph | None = None
     citation: str | None = None
     """Papers that the architecture comes from."""
     twin_top1: Share | None = field(default=None, metadata={"later": True})
     """Top-1 accuracy of the untrained twin, its decoder trained on the same data."""
     twin_interval: Interval | None = field(default=None, metadata={"later": True})
-    """Of ``twin_top1``."""
+    """Interval of ``twin_top1``."""
 
 
 @dataclass(frozen=True)

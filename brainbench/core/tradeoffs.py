@@ -19,7 +19,7 @@ class TradeoffPoint:
     cost: float
     """Cost, in the unit stated beside the table; only ratios between points matter."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """What was set, by name."""
+    """Settings, by name."""
 
 
 def pareto_front(points: Iterable[TradeoffPoint]) -> list[TradeoffPoint]:

@@ -21,7 +21,7 @@ class Trials:
     """[R] name of each trial, unique and independent of its place, from which random splits are drawn; without
     names they are drawn from the trials' content. Either way the order of trials, sessions and units is irrelevant."""
     covariates: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """What else was measured in every trial, such as contacts or licks: name → [R], NaN where unknown."""
+    """Further measurements of every trial, such as contacts or licks: name → [R], NaN where unknown."""
 
     def take(self, rows: Any) -> Trials:
         """Return the trials that an index or mask [R] names, in its order."""
@@ -29,6 +29,6 @@ class Trials:
         return Trials(
             np.asarray(self.responses)[index],
             np.asarray(self.labels)[index],
-            None if self.keys is None else tuple(self.keys[row] for row in index.tolist()),
+            None if self.keys is None else tuple(self.keys[int(row)] for row in index),
             {name: np.asarray(values)[index] for name, values in self.covariates.items()},
         )

@@ -116,33 +116,43 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
         return ResolvedModel(card, None, features.activations, features.labels, {"features": path.name})
     import torch
 
+    from brainbench.models.diagram import graph_of
+    from brainbench.models.registry import describe_model, load_model
+    from brainbench.models.training.checkpoints import PREFIXES
+    from brainbench.models.user_models import load_user_model
+
     if isinstance(model, torch.nn.Module):
-        return _with_weights(model, ModelCard(type(model).__name__, family="user module"))
-    if not isinstance(model, str):
+        module, card = model, ModelCard(type(model).__name__, family="user module")
+    elif not isinstance(model, str):
         raise UsageError(
             "A model is a registry name, FILE.py:FUNCTION, a file of activations, a mapping of activations or a "
             f"torch.nn.Module; received {type(model).__name__}."
         )
-    from brainbench.models.training.checkpoints import PREFIXES
-
-    if (":" in model and not model.startswith(PREFIXES)) or model.endswith(".py"):
-        from brainbench.models.user_models import load_user_model
-
-        return _with_weights(load_user_model(model, seed=seed), ModelCard(model, family="user module", seed=seed))
-    from brainbench.models.registry import describe_model, load_model
-
-    known = describe_model(model)
-    card = ModelCard(
-        model,
-        family=known.family,
-        encoder=known.architecture.memory_encoder,
-        attender=known.architecture.attender or "none",
-        objective="untrained",
-        multiply_adds=known.multiply_adds,
-        seed=seed,
-        citation=known.citation or None,
-    )
-    return _with_weights(load_model(model, seed=seed), replace(card, **_trained(known.trained)))
+    elif (":" in model and not model.startswith(PREFIXES)) or model.endswith(".py"):
+        module, card = load_user_model(model, seed=seed), ModelCard(model, family="user module", seed=seed)
+    else:
+        known = describe_model(model)
+        card = ModelCard(
+            model,
+            family=known.family,
+            encoder=known.architecture.memory_encoder,
+            attender=known.architecture.attender or "none",
+            objective="untrained",
+            multiply_adds=known.multiply_adds,
+            seed=seed,
+            citation=known.citation or None,
+        )
+        module, card = load_model(model, seed=seed), replace(card, **_trained(known.trained))
+    lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
+    if lazy:
+        raise UsageError(
+            f"{card.name} has lazy layers without weights yet ({', '.join(lazy[:3])}): run it once, on zeros of shape "
+            "[1, 22, 30, 5, 7] for instance, before you return it."
+        )
+    state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
+    digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
+    count = sum(parameter.numel() for parameter in module.parameters())
+    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
 
 
 def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -193,24 +203,6 @@ def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -
     if stimuli.dataset is None:
         return given, scaled, "as given"
     return (scaled, scaled, "forces in 1e-4 N, moments in 1e-6 N·m") if normalize else (given, scaled, "SI (N, N·m)")
-
-
-def _with_weights(module: torch.nn.Module, card: ModelCard) -> ResolvedModel:
-    """Fill in the card what the weights tell."""
-    import torch
-
-    from brainbench.models.diagram import graph_of
-
-    lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
-    if lazy:
-        raise UsageError(
-            f"{card.name} has lazy layers without weights yet ({', '.join(lazy[:3])}): run it once, on zeros of shape "
-            "[1, 22, 30, 5, 7] for instance, before you return it."
-        )
-    state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
-    digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
-    count = sum(parameter.numel() for parameter in module.parameters())
-    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
 
 
 def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

@@ -29,7 +29,7 @@ _ELSEWHERE = ("recordings", "match", "explain")
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """How a model is scored against recordings.
+    """Options of scoring a model against recordings.
 
     Raises:
         UsageError: an unknown rule for time.

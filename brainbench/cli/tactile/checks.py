@@ -1,4 +1,4 @@
-"""What ``brainbench tactile check`` compares: each returns (found, truth, relative tolerance)."""
+"""Checks of ``brainbench tactile check``: each returns (found, truth, relative tolerance)."""
 
 from __future__ import annotations
 
