@@ -1,51 +1,12 @@
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
-from brainbench.datasets import make_session, write_recordings
 from brainbench.models.features import write_features
 
 LABELS = ("a", "b", "c", "d")
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> dict[str, str]:
-    """A recording of two animals, features and arrays for its four conditions."""
-    rng = np.random.default_rng(0)
-    for animal in "xy":
-        order = np.repeat(np.arange(4), 10)
-        starts = 1.0 + np.arange(len(order))
-        rates = rng.gamma(2.0, 8.0, size=(4, 12))
-        spikes = [
-            np.sort(
-                np.concatenate(
-                    [s + rng.uniform(0, 0.5, rng.poisson(rates[k, u])) for s, k in zip(starts, order, strict=True)]
-                )
-            )
-            for u in range(12)
-        ]
-        table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [LABELS[k] for k in order]}
-        session = make_session(animal, "1", spikes, {"trials": table}, observed=[np.array([[0.0, 60.0]])] * 12)
-        write_recordings(tmp_path / "data" / f"{animal}.h5", session)
-    features = write_features(tmp_path / "features.h5", LABELS, {"fc": rng.normal(size=(4, 6))})
-    with h5py.File(tmp_path / "arrays.h5", "w") as file:
-        file["stimuli"] = rng.normal(size=(4, 3, 2, 2, 2)).astype(np.float32)
-        file["labels"] = np.array(LABELS, dtype=h5py.string_dtype())
-    (tmp_path / "mine.py").write_text(
-        "from torch import nn\n\n\nclass Mine(nn.Module):\n"
-        "    def __init__(self):\n        super().__init__()\n        self.gru = nn.GRU(8, 6, batch_first=True)\n\n"
-        "    def forward(self, x):\n        return self.gru(x.flatten(2))[0][:, -1]\n"
-    )
-    return {
-        "recordings": str(tmp_path / "data"),
-        "features": str(features),
-        "arrays": str(tmp_path / "arrays.h5"),
-        "model": f"{tmp_path / 'mine.py'}:Mine",
-        "out": str(tmp_path / "out"),
-    }
 
 
 def _score(run, files: dict[str, str], model: str, *more: str):

@@ -12,13 +12,12 @@ from brainbench.cli.leaderboard.scoring import find_models, parse_seeds, read_ba
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import ResultRecord
 from leaderboards.store import read_record, record_name
-from tests.cli.test_commands import files  # noqa: F401 - a fixture
 
 PARTS = ("--conditions", "trials:texture")
 
 
 @pytest.fixture
-def scored(run, files) -> tuple[Path, str]:  # noqa: F811
+def scored(run, files) -> tuple[Path, str]:
     """A record of a user's module on two animals, and where the recordings are."""
     where = files["recordings"]
     result = run(
@@ -100,7 +99,7 @@ def test_diff_names_what_changed(run, scored, tmp_path):
     assert "No difference." in run("leaderboard", "diff", old, old).out
 
 
-def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, files, tmp_path):  # noqa: F811
+def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, files, tmp_path):
     batch = tmp_path / "batch.toml"
     options = f'recordings = "{files["recordings"]}"\nstimuli = "{files["arrays"]}"\nconditions = "trials:texture"\n'
     batch.write_text(f'[options]\n{options}\n[[entries]]\nmodels = ["{files["model"]}"]\nseeds = [0, 1]\n')
@@ -123,7 +122,7 @@ def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, file
     assert {path.name for path in to.glob("*.json")} == {item["record"] for item in results}
 
 
-def test_a_folder_becomes_a_site_and_a_report_and_a_score_its_own(run, scored, files, tmp_path):  # noqa: F811
+def test_a_folder_becomes_a_site_and_a_report_and_a_score_its_own(run, scored, files, tmp_path):
     path, where = scored
     site = tmp_path / "site"
     assert json.loads(run("leaderboard", "build", str(path.parent), "--out", str(site), "--json").out)["records"] == 1

@@ -2,11 +2,9 @@ import json
 
 import pytest
 
-from tests.cli.test_commands import files  # noqa: F401
-
 
 @pytest.mark.parametrize("metric", ["ridge", "cka", "procrustes", "rsa-crossnobis", "rsa-partial", "decoding"])
-def test_a_score_by_another_metric_has_record_and_report(run, files, metric):  # noqa: F811
+def test_a_score_by_another_metric_has_record_and_report(run, files, metric):
     found = run(
         *("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture"),
         *("--metric", metric, "--out", files["out"], "--json"),
@@ -17,7 +15,7 @@ def test_a_score_by_another_metric_has_record_and_report(run, files, metric):  #
     assert data["record"]["animal_to_animal"]["metric"]
 
 
-def test_the_text_names_the_metric_and_an_unknown_one_is_refused(run, files):  # noqa: F811
+def test_the_text_names_the_metric_and_an_unknown_one_is_refused(run, files):
     arguments = ("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture")
     found = run(*arguments, "--metric", "ridge", "--out", files["out"])
     assert found.status == 0, found.err
@@ -27,7 +25,7 @@ def test_the_text_names_the_metric_and_an_unknown_one_is_refused(run, files):  #
     assert "did you mean 'ridge'" in wrong.err
 
 
-def test_decoding_and_partial_rsa_print_what_they_add_and_layers_have_p_in_json(run, files):  # noqa: F811
+def test_decoding_and_partial_rsa_print_what_they_add_and_layers_have_p_in_json(run, files):
     arguments = ("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture")
     found = run(*arguments, "--metric", "decoding", "--out", files["out"])
     assert found.status == 0, found.err
@@ -40,7 +38,7 @@ def test_decoding_and_partial_rsa_print_what_they_add_and_layers_have_p_in_json(
     assert all(0 < item["p"] <= item["p_corrected"] <= 1 for item in tests.values())
 
 
-def test_the_walk_from_the_published_estimator_is_printed_and_recorded(run, files):  # noqa: F811
+def test_the_walk_from_the_published_estimator_is_printed_and_recorded(run, files):
     arguments = ("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture")
     found = run(*arguments, "--explain-estimator", "--out", files["out"])
     assert found.status == 0, found.err
