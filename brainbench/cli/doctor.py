@@ -9,22 +9,6 @@ from typing import Any
 
 from brainbench.cli.output import JsonOption, emit, table
 
-REQUIRED = (
-    "torch",
-    "warp-lang",
-    "msgspec",
-    "mujoco-core",
-    "numpy",
-    "scipy",
-    "xarray",
-    "h5py",
-    "h5netcdf",
-    "trimesh",
-    "manifold3d",
-    "typer",
-    "rich",
-)
-
 OPTIONAL = {
     "pynwb": ("nwb", "checking NWB files against the schema"),
     "nwbinspector": ("nwb", "best-practice checks of NWB files"),
@@ -76,12 +60,18 @@ def diagnose() -> dict[str, Any]:
         "cuda": _cuda(),
         "cache": str(cache),
         "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),
-        "required": {name: _version(name) for name in REQUIRED},
+        "required": {name: _version(name) for name in _required()},
         "optional": {
             name: {"version": _version(name), "enables": purpose, "install": f"pip install 'brainbench[{extra}]'"}
             for name, (extra, purpose) in OPTIONAL.items()
         },
     }
+
+
+def _required() -> list[str]:
+    """Return the packages that this one cannot do without, as its own metadata states them."""
+    stated = metadata.requires("brainbench") or []
+    return [line.split(">")[0].split("<")[0] for line in stated if "extra ==" not in line]
 
 
 def _version(package: str) -> str | None:

@@ -37,17 +37,11 @@ def join_labels(
     alone = [label for label, partner in pairs.items() if partner not in labels]
     unused = [] if explicit else [label for label in labels if label not in pairs.values()]
     if alone or unused:
+        lonely = {"without a stimulus": alone, "without recordings": unused}
+        told = "; ".join(f"{what}: {listing(found, limit=40)}" for what, found in lonely.items() if found)
         raise UsageError(
-            "The labels of recordings and stimuli do not match ("
-            + "; ".join(
-                part
-                for part in (
-                    f"without a stimulus: {listing(alone, limit=40)}" if alone else "",
-                    f"without recordings: {listing(unused, limit=40)}" if unused else "",
-                )
-                if part
-            )
-            + f"). The {sides}. Map them with --match FILE (recording label → stimulus label)."
+            f"The labels of recordings and stimuli do not match ({told}). The {sides}. Map them with --match FILE "
+            "(recording label → stimulus label)."
         )
     partners = list(pairs.values())
     for partner in partners:

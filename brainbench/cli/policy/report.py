@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, table
+from brainbench.cli.output import JsonOption, emit, table, table_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,15 +68,14 @@ def report(
     pairs = _pairs(results) if differences else []
     lines = [text, *(f"Note: {note}." for note in students.remarks(results))]
     if differences:
-        columns = ["first", "second", "success", "95 % interval", "p (Holm)"]
-        found = [
-            [
-                item["first"], item["second"], f"{item['difference']:+.3f}",
-                "[{:+.3f}, {:+.3f}]".format(*item["interval"]), f"{item['p']:.2g}",
-            ]
-            for item in pairs
-        ]  # fmt: skip
-        lines.append("\n" + table("First less second", columns, found, right=(2, 3, 4)))
+        shown = {
+            "first": "{0[first]}",
+            "second": "{0[second]}",
+            ">success": "{0[difference]:+.3f}",
+            ">95 % interval": lambda item: "[{:+.3f}, {:+.3f}]".format(*item["interval"]),
+            ">p (Holm)": "{0[p]:.2g}",
+        }
+        lines.append("\n" + table_of("First less second", pairs, shown))
     data = {"students": data, "agents": agents, "records": written, "differences": pairs}
     emit(data, "\n".join([*lines, *written]), as_json=as_json)
 
