@@ -99,7 +99,7 @@ def measure_tradeoff(
     model, brain, threshold = _p_near_five_percent()
 
     def p_value(seed: int, count: int) -> float:
-        return (1 + int((_relabelled(model, brain, count, seed) >= threshold).sum())) / (count + 1)
+        return (1 + int((_permuted(model, brain, count, seed) >= threshold).sum())) / (count + 1)
 
     jobs: list[tuple[str, int, str, bool, Callable[[int], float]]] = [
         *(("splits", n, "score", n == 1000, lambda seed, n=n: value(seed, n)) for n in splits),
@@ -127,7 +127,7 @@ def measure_tradeoff(
     return tuple(points)
 
 
-def _relabelled(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
+def _permuted(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
     """Return comparisons [N] under random orders of the stimuli."""
     orders = np.random.default_rng(seed).permuted(np.tile(np.arange(_STIMULI), (count, 1)), axis=1)
     return compare(model[permuted_pairs(orders)], brain)
@@ -137,7 +137,7 @@ def _p_near_five_percent() -> tuple[Floats, Floats, float]:
     """Return RDMs of more stimuli than are permuted exactly, and the statistic whose p is .05."""
     rng = np.random.default_rng(1)
     model, brain = (rdm(rng.normal(size=(_STIMULI, 10))) for _ in range(2))
-    return model, brain, float(np.quantile(_relabelled(model, brain, 20_000, 2), 0.95))
+    return model, brain, float(np.quantile(_permuted(model, brain, 20_000, 2), 0.95))
 
 
 def _data(animals: int, units: int, trials: int, noise: float) -> tuple[list[Trials], Floats]:
