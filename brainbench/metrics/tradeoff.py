@@ -18,6 +18,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.trials import Trials
 from brainbench.metrics.inference.bootstrap import bootstrap_score
+from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, permuted_pairs
@@ -129,7 +130,8 @@ def measure_tradeoff(
 
 def _permuted(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
     """Return comparisons [N] under random orders of the stimuli."""
-    orders = np.random.default_rng(seed).permuted(np.tile(np.arange(_STIMULI), (count, 1)), axis=1)
+    _, *chunks = label_orders(_STIMULI, seed, exact=0, draws=count)
+    orders = np.concatenate(chunks)
     return compare(model[permuted_pairs(orders)], brain)
 
 
