@@ -41,7 +41,7 @@ def score_animals(
     """Score each reliable animal against the mean RDM of the others, both sides corrected for noise.
 
     The reliability of the others' mean RDM comes from the same split halves, averaged over them. The
-    p-value relabels every animal's stimuli independently (10,000 times, (b+1)/(n+1)).
+    p-value permutes every animal's stimuli independently (10,000 times, (b+1)/(n+1)).
 
     Args:
         subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
@@ -191,7 +191,7 @@ def _factor(result: Corrected) -> float:
 
 
 def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) -> float:
-    """Return P(mean corrected agreement ≥ observed) when every animal's stimuli are relabelled alone."""
+    """Return P(mean corrected agreement ≥ observed) when every animal's stimuli are permuted independently."""
     animals, pairs = rdms.shape
     stimuli = stimulus_count(pairs)
     rdms = rdms[:, permuted_pairs(canonical_order(rdms)[None])[0]]
@@ -201,8 +201,8 @@ def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) ->
     while done < RANDOM_PERMUTATIONS:
         rows = min(max(1, _CHUNK_ELEMENTS // rdms.size), RANDOM_PERMUTATIONS - done)
         orders = generator.permuted(np.tile(np.arange(stimuli), (rows, animals, 1)), axis=-1)
-        relabelled = np.take_along_axis(rdms[None], permuted_pairs(orders), axis=-1)
-        reached += int((_agreement(relabelled, factors, comparison) >= observed - TIE).sum())
+        permuted = np.take_along_axis(rdms[None], permuted_pairs(orders), axis=-1)
+        reached += int((_agreement(permuted, factors, comparison) >= observed - TIE).sum())
         done += rows
     return (reached + 1) / (RANDOM_PERMUTATIONS + 1)
 
@@ -214,7 +214,7 @@ def _agreement(rdms: Floats, factors: Floats, comparison: str) -> Floats:
 
 
 def smallest_p_of_animals(stimuli: int, animals: int) -> float:
-    """Return the smallest p that relabelling the animals can give."""
+    """Return the smallest p that permuting the animals' stimuli can give."""
     if stimuli < 3:
         return 1.0
     orders = math.lgamma(stimuli + 1) * (animals - 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -234,39 +234,33 @@ def _choose(
     rdms: Floats, animals: Animals, estimator: str, comparison: str, test_options: dict[str, Any]
 ) -> _Choice | None:
     """Choose layers by the estimator's rule, with a test that repeats the choice."""
+    if len(animals.scored) == 1 and len(rdms) > 1 and estimator == "default":
+        return _choose_on_halves(rdms, animals.subjects[animals.scored[0]], comparison, test_options)
     # An animal's factor does not change when labels are permuted, so permutations repeat r alone.
     brain, factors = animals.rdms(animals.scored), animals.factors(animals.scored)
     r = compare_all(rdms, brain, method=comparison)
-    count = len(animals.scored)
-    every = np.arange(count)
+    if len(rdms) == 1:
+        chosen = np.zeros(len(brain), dtype=np.int64)
+        rule = "only layer"
+    elif estimator == "default":
+        chosen = choose_on_others(r)
+        rule = "chosen on the other animals, evaluated on the animal held out"
+    else:
+        # The published rule; the test takes the same maximum, so its p stays honest where the value is not.
+        chosen = np.full(len(brain), first_best((r * factors).mean(axis=1)))
+        rule = "maximum over layers on the data that are scored (as published; optimistic)"
     means: list[Floats] = []
 
-    def test(statistic: Callable[[Floats], Floats]) -> PermutationTest:
-        """Test a statistic of r [N, L, A], and keep every layer's mean on the way."""
+    def statistic(x: Floats) -> Floats:
+        """Return the score [N] of comparisons [N, L, A], and keep every layer's mean on the way."""
+        means.append((x * factors).mean(axis=-1))
+        if estimator != "default":
+            return means[-1].max(axis=-1)
+        return (x[:, 0] if len(rdms) == 1 else held_out(x)) @ factors / len(brain)
 
-        def kept(x: Floats) -> Floats:
-            means.append((x * factors).mean(axis=-1))
-            return statistic(x)
-
-        return permuted_statistic(rdms, brain, kept, method=comparison, **test_options)
-
-    if len(rdms) == 1:
-        alone = test(lambda x: x[:, 0] @ factors / count)
-        return _Choice(r[0], r[0] * factors, (0,) * count, 0, "only layer", alone, tuple(means))
-    # The published rule; the test takes the same maximum, so its p stays honest where the value is not.
-    if estimator != "default":
-        best = first_best((r * factors).mean(axis=1))
-        largest = test(lambda x: (x * factors).mean(axis=-1).max(axis=-1))
-        rule = "maximum over layers on the data that are scored (as published; optimistic)"
-        return _Choice(r[best], r[best] * factors, (best,) * count, best, rule, largest, tuple(means))
-    if count == 1:
-        return _choose_on_halves(rdms, animals.subjects[animals.scored[0]], comparison, test_options)
-    chosen = choose_on_others(r)
-    held = test(lambda x: held_out(x) @ factors / count)
-    rule = "chosen on the other animals, evaluated on the animal held out"
-    picked = r[chosen, every]
-    layers = tuple(chosen.tolist())
-    return _Choice(picked, picked * factors, layers, most_chosen(chosen), rule, held, tuple(means))
+    test = permuted_statistic(rdms, brain, statistic, method=comparison, **test_options)
+    picked = r[chosen, np.arange(len(brain))]
+    return _Choice(picked, picked * factors, tuple(chosen.tolist()), most_chosen(chosen), rule, test, tuple(means))
 
 
 def _choose_on_halves(

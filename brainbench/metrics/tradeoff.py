@@ -18,6 +18,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.trials import Trials
 from brainbench.metrics.inference.bootstrap import bootstrap_score
+from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, permuted_pairs
@@ -99,7 +100,7 @@ def measure_tradeoff(
     model, brain, threshold = _p_near_five_percent()
 
     def p_value(seed: int, count: int) -> float:
-        return (1 + int((_relabelled(model, brain, count, seed) >= threshold).sum())) / (count + 1)
+        return (1 + int((_permuted(model, brain, count, seed) >= threshold).sum())) / (count + 1)
 
     jobs: list[tuple[str, int, str, bool, Callable[[int], float]]] = [
         *(("splits", n, "score", n == 1000, lambda seed, n=n: value(seed, n)) for n in splits),
@@ -127,9 +128,10 @@ def measure_tradeoff(
     return tuple(points)
 
 
-def _relabelled(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
+def _permuted(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
     """Return comparisons [N] under random orders of the stimuli."""
-    orders = np.random.default_rng(seed).permuted(np.tile(np.arange(_STIMULI), (count, 1)), axis=1)
+    _, *chunks = label_orders(_STIMULI, seed, exact=0, draws=count)
+    orders = np.concatenate(chunks)
     return compare(model[permuted_pairs(orders)], brain)
 
 
@@ -137,7 +139,7 @@ def _p_near_five_percent() -> tuple[Floats, Floats, float]:
     """Return RDMs of more stimuli than are permuted exactly, and the statistic whose p is .05."""
     rng = np.random.default_rng(1)
     model, brain = (rdm(rng.normal(size=(_STIMULI, 10))) for _ in range(2))
-    return model, brain, float(np.quantile(_relabelled(model, brain, 20_000, 2), 0.95))
+    return model, brain, float(np.quantile(_permuted(model, brain, 20_000, 2), 0.95))
 
 
 def _data(animals: int, units: int, trials: int, noise: float) -> tuple[list[Trials], Floats]:

@@ -1,7 +1,7 @@
 """Tests of many models or layers at once, and of models against one another.
 
-``p`` of a single model says how often relabelled stimuli score as high. Among many models some do by
-luck; the corrected p asks how often *the luckiest of them all* would, under the same relabelling for
+``p`` of a single model is the share of permutations of the stimuli that score as high. Among many models some do by
+luck; the corrected p asks how often *the luckiest of them all* would, under the same permutations for
 all (Westfall & Young 1993, step-down maximum statistic), which keeps the correlations between models.
 
 Models are compared with one another on the same animals: the test flips the signs of the animals'
@@ -44,7 +44,7 @@ class ModelTest:
 
     score: Score
     p_corrected: float
-    """P(the best of all models under relabelled stimuli scores as high), step-down; NaN where p is."""
+    """P(the best of all models under permuted stimuli scores as high), step-down; NaN where p is."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def compare_models(
             for ((a, b), difference, interval, p, reason), q in zip(pairs, adjusted, strict=True)
         ),
         correction=correction,
-        method=f"models: step-down maximum over {len(tested)} models, same relabelling for all; "
+        method=f"models: step-down maximum over {len(tested)} models, same permutations for all; "
         f"pairs: sign flips over animals, {correction}",
     )
 
@@ -135,7 +135,7 @@ class LayerTest:
     """Mean noise-corrected comparison over the reliable animals."""
     p: float
     p_corrected: float
-    """P(the largest of all layers under relabelled stimuli reaches this layer's value)."""
+    """P(the largest of all layers under permuted stimuli reaches this layer's value)."""
 
 
 def layer_tests(

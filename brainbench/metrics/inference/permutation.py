@@ -96,7 +96,7 @@ def make_test(null: Floats, *, exact: bool, smallest: float | None = None) -> Pe
 def permutation_test(
     model_rdm: ArrayLike, brain_rdms: ArrayLike, *, method: str = "pearson", seed: int = 0, device: Any = None
 ) -> PermutationTest:
-    """Test whether the model's RDM compares better with the animals' than relabelled ones do.
+    """Test whether the model's RDM compares better with the animals' than permuted ones do.
 
     The statistic is the mean comparison over animals; the test is one-sided (greater), since only
     likeness is evidence for a model.
@@ -140,7 +140,7 @@ def permuted_statistic(
     """Test any statistic of the comparisons of layers with brain RDMs.
 
     Args:
-        layers: [L, P] RDMs of one model; a permutation relabels all of them alike.
+        layers: [L, P] RDMs of one model; a permutation moves the stimuli of all of them alike.
         brain: [A, P] RDMs.
         statistic: Takes comparisons [N, L, A] under N permutations, returns [N]. What is chosen on the
             data (a layer) must be chosen inside, or p is too small.
@@ -179,7 +179,7 @@ def permuted_values(
 ) -> Floats:
     """Return a statistic [N, ...] of comparisons [N, L, A] under every order of the stimuli, the given one first.
 
-    Orders depend on the brain's RDMs and the seed alone, so entry n of two models is the same relabelling.
+    Orders depend on the brain's RDMs and the seed alone, so entry n of two models is the same permutation.
     """
     layers, brain = _canonical(layers, brain)
     step = max(1, _CHUNK_ELEMENTS // layers.size)

@@ -41,9 +41,9 @@ class VariancePartition:
     partial_r: float
     """Mean correlation of model and animals, both without what the nuisances explain linearly."""
     p: float
-    """P(partial r under relabelled stimuli of the model ≥ observed); NaN below 4 stimuli."""
+    """P(partial r under permuted stimuli of the model ≥ observed); NaN below 4 stimuli."""
     chance: float
-    """Mean unique share of the model under relabelling: what fitting few pairs gives for nothing."""
+    """Mean unique share of the model under permutation: what fitting few pairs gives for nothing."""
     nuisances: tuple[str, ...]
     reason: str = ""
     """Why p is undefined."""
@@ -79,7 +79,7 @@ def variance_partition(
     """Partition the variance of animals' RDMs [A, P] between a model's RDM [P] and nuisance RDMs.
 
     Ordinary least squares per animal, with an intercept; the R² are averaged over animals. The p-value
-    relabels the model's stimuli, as in :func:`permutation_test`, and tests the partial correlation.
+    permutes the model's stimuli, as in :func:`permutation_test`, and tests the partial correlation.
 
     Raises:
         UsageError: no nuisances, or RDMs of different numbers of stimuli.

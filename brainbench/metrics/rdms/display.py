@@ -101,33 +101,30 @@ class RDM:
         parts, matrix = [], self.matrix
         # Two figures of the largest difference tell values apart; more do not fit in a cell.
         digits = min(max(1 - math.floor(math.log10(high - low)), 0), 4) if high > low else 2
-        for row, name in enumerate(self.stimuli):
+        for row, name in enumerate(map(escape, self.stimuli)):
             y = top + row * cell
-            for column, other in enumerate(self.stimuli):
+            for column, other in enumerate(map(escape, self.stimuli)):
                 if row == column:
                     continue
                 value, x = float(matrix[row, column]), left + column * cell
                 colour, ink = _colour(value, low, high)
-                told = f"{escape(name)} – {escape(other)}: {value:.3g}"
                 parts.append(
                     f'<rect x="{x:.1f}" y="{y:.1f}" width="{cell:.2f}" height="{cell:.2f}" fill="{colour}">'
-                    f"<title>{told}</title></rect>"
+                    f"<title>{name} – {other}: {value:.3g}</title></rect>"
                 )
                 if named and cell >= 26 and math.isfinite(value):
-                    parts.append(
-                        f'<text x="{x + cell / 2:.1f}" y="{y + cell / 2 + 4:.1f}" text-anchor="middle" fill="{ink}" '
-                        f'pointer-events="none">{value:.{digits}f}</text>'
-                    )
+                    how = f'text-anchor="middle" fill="{ink}" pointer-events="none"'
+                    parts.append(_text(x + cell / 2, y + cell / 2 + 4, f"{value:.{digits}f}", how))
             if named:
                 middle = row * cell + cell / 2
-                parts.append(
-                    f'<text x="{left - 6:.1f}" y="{top + middle + 4:.1f}" text-anchor="end">{escape(name)}</text>'
-                )
                 below = f"{left + middle + 4:.1f},{top + _SIDE + 6:.1f}"
-                parts.append(
-                    f'<text transform="translate({below}) rotate(-90)" text-anchor="end">{escape(name)}</text>'
-                )
+                parts.append(_text(left - 6, top + middle + 4, name, 'text-anchor="end"'))
+                parts.append(f'<text transform="translate({below}) rotate(-90)" text-anchor="end">{name}</text>')
         return parts
+
+
+def _text(x: float, y: float, text: str, how: str = "") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}"{how and " " + how}>{text}</text>'
 
 
 def _colour(value: float, low: float, high: float) -> tuple[str, str]:
@@ -146,6 +143,4 @@ def _scale(x: float, top: float, low: float, high: float) -> list[str]:
         colour, _ = _colour(step / (steps - 1), 0.0, 1.0)
         y = top + _SIDE * (1 - (step + 1) / steps)
         parts.append(f'<rect x="{x:.1f}" y="{y:.1f}" width="12" height="{_SIDE / steps + 0.5:.2f}" fill="{colour}"/>')
-    parts.append(f'<text x="{x + 18:.1f}" y="{top + 10:.1f}">{high:.3g}</text>')
-    parts.append(f'<text x="{x + 18:.1f}" y="{top + _SIDE:.1f}">{low:.3g}</text>')
-    return parts
+    return [*parts, _text(x + 18, top + 10, f"{high:.3g}"), _text(x + 18, top + _SIDE, f"{low:.3g}")]

@@ -37,14 +37,6 @@ def test_a_session_holds_one_response_label_and_key_per_trial(tmp_path):
     assert trials.keys[0] == "m2/1/5"
 
 
-def test_trials_are_taken_with_all_that_belongs_to_them(tmp_path):
-    trials = trials_by_subject(make_dataset(tmp_path))["m2"][0]
-    some = trials.take(trials.labels > 0)
-    assert some.keys == tuple(key for key, label in zip(trials.keys, trials.labels, strict=True) if label)
-    np.testing.assert_array_equal(some.responses, trials.responses[trials.labels > 0])
-    np.testing.assert_array_equal(trials.take([3, 1]).labels, trials.labels[[3, 1]])
-
-
 def test_units_lost_in_some_trials_stay_missing_there(tmp_path):
     observed = [[[0, 100]], [[0, 10.5]], [[0, 100]]]
     responses = trials_by_subject(make_dataset(tmp_path, observed=observed))["m1"][0].responses[:, 0]

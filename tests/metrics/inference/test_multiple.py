@@ -53,7 +53,7 @@ def test_the_step_down_maximum_equals_counting_by_hand():
     assert step_down(lone).tolist() == [1 / 5, 2 / 5, 3 / 5]
 
 
-def test_two_models_meet_the_same_relabellings():
+def test_two_models_meet_the_same_permutations():
     rng = np.random.default_rng(1)
     brain = np.stack([make_rdm(rng, 9) for _ in range(3)])
     one, two = make_rdm(rng, 9), np.stack([make_rdm(rng, 9) for _ in range(40)])
