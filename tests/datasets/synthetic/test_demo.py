@@ -2,7 +2,6 @@ import json
 import multiprocessing
 import os
 import shutil
-import time
 
 import h5py
 import numpy as np
@@ -142,11 +141,9 @@ def test_the_order_of_the_stimuli_does_not_matter(folder, tmp_path):
         assert file_hash(path) == file_hash(folder / path.name)
 
 
-def test_it_is_quick_and_small(tmp_path):
+def test_it_is_small_and_tells_its_progress(tmp_path):
     calls = []
-    began = time.process_time()
     paths = demo.make_demo(tmp_path, make_stimuli(), progress=lambda *state: calls.append(state))
-    assert time.process_time() - began < 10
     assert sum(path.stat().st_size for path in paths) < 15e6
     assert calls[-1][:2] == (len(paths), len(paths))
 
