@@ -19,13 +19,13 @@ CRACK = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A mesh as mended, with what was done and what is still wrong, in words."""
+    """A repaired mesh, with the repairs and the remaining faults in words."""
 
     mesh: Mesh
     done: tuple[str, ...]
     """Repairs, such as "3 duplicate triangles were removed"."""
     remaining: tuple[str, ...]
-    """Faults that no repair here mends."""
+    """Faults that are left."""
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -64,21 +64,21 @@ def test_a_folder_gets_one_file_per_session(tmp_path):
     assert {item["subject"]: item["synthetic"] for item in joined.attrs["sessions"]} == {"m/1": False, "m2": True}
     one = export(path, tmp_path / "m2", select="subjects=m2")
     assert len(one) == 1
-    with pytest.raises(UsageError, match="Unknown subject 'm3'; did you mean 'm2'"):
+    with pytest.raises(UsageError, match="'m3'; did you mean 'm2'"):
         export(path, tmp_path / "m3", select="subjects=m3")
 
 
 def test_what_cannot_be_written_is_refused_in_words(tmp_path):
     session = make_simple_session()
     path = write_recordings(tmp_path / "a.h5", [session, make_simple_session(session="2", seed=1)])
-    with pytest.raises(UsageError, match="An NWB file holds one session, these are 2"):
+    with pytest.raises(UsageError, match="one session, these are 2"):
         export(path, tmp_path / "b.nwb")
-    with pytest.raises(UsageError, match=r"written to \.nwb, \.h5 or a folder; received 'b\.mat'"):
+    with pytest.raises(UsageError, match=r"received 'b\.mat'"):
         export(path, tmp_path / "b.mat")
-    with pytest.raises(DataError, match=r"No unit of .* passes units: at least 9999 spikes"):
+    with pytest.raises(DataError, match=r"at least 9999 spikes"):
         export(path, tmp_path / "b.h5", select="min_spikes=9999")
     del session.tables["trials"].data["stop_time"]
-    with pytest.raises(DataError, match="has no stop_time, which NWB needs"):
+    with pytest.raises(DataError, match="has no stop_time"):
         export(write_recordings(tmp_path / "c.h5", session), tmp_path / "c.nwb")
     assert not (tmp_path / "c.nwb").exists()
     with pytest.raises(DataError, match="None of the 1 files"):

@@ -47,16 +47,14 @@ def test_a_version_of_the_future_is_refused(tmp_path):
     path = write_recordings(tmp_path / "a.h5", make_simple_session())
     with h5py.File(path, "a") as file:
         file.attrs["version"] = 2
-    with pytest.raises(
-        DataError, match=r"version 2, kind 'spikes'; this brainbench reads version 1, .* A newer brainbench wrote it"
-    ):
+    with pytest.raises(DataError, match=r"version 2.*version 1.*newer"):
         open_recordings(path, conditions="trials:stimulus")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = write_recordings(tmp_path / "a.h5", make_simple_session())
     before = path.read_bytes()
-    with pytest.raises(UsageError, match="Two sessions are called 'mouse-1'"):
+    with pytest.raises(UsageError, match="called 'mouse-1'"):
         write_recordings(path, [make_simple_session(), make_simple_session()])
     assert path.read_bytes() == before
     assert [item.name for item in tmp_path.iterdir()] == ["a.h5"]
@@ -66,5 +64,5 @@ def test_a_missing_part_of_the_layout_is_named(tmp_path):
     path = write_recordings(tmp_path / "a.h5", make_simple_session())
     with h5py.File(path, "a") as file:
         del file["sessions/mouse-1/tables"]
-    with pytest.raises(DataError, match="lacks /sessions/mouse-1/tables"):
+    with pytest.raises(DataError, match="/sessions/mouse-1/tables"):
         open_recordings(path, conditions="trials:stimulus")

@@ -44,14 +44,14 @@ def test_files_without_units_are_skipped_in_a_folder_and_refused_alone(tmp_path)
     alone = write_nwb(tmp_path / "sub" / "b.nwb", session="2", units=False)
     dataset = open_recordings(tmp_path, conditions="trials:texture")
     assert "b.nwb has no units table" in "".join(dataset.attrs["notes"])
-    with pytest.raises(DataError, match=r"b\.nwb has no units table .*\(it holds interval tables trials, pokes\)"):
+    with pytest.raises(DataError, match=r"b\.nwb .*trials, pokes"):
         open_recordings(alone, conditions="trials:texture")
 
 
 def test_a_copy_under_another_session_name_is_recognised(tmp_path):
     write_nwb(tmp_path / "a.nwb", session="1", identifier="same")
     write_nwb(tmp_path / "b.nwb", session="2", identifier="same")
-    with pytest.raises(DataError, match=r"are the same session \(equal identifier: same\)"):
+    with pytest.raises(DataError, match=r"\(equal identifier: same\)"):
         open_recordings(tmp_path, conditions="trials:texture")
 
 
@@ -64,7 +64,7 @@ def test_synthetic_files_are_recognised_by_keyword_or_description(tmp_path):
 def test_nwb_1_is_refused(tmp_path):
     with h5py.File(tmp_path / "old.nwb", "w") as file:
         file["nwb_version"] = "NWB-1.0.6"
-    with pytest.raises(DataError, match=r"is NWB NWB-1\.0\.6; brainbench reads NWB 2\.x"):
+    with pytest.raises(DataError, match=r"NWB-1\.0\.6; .*2\.x"):
         open_recordings(tmp_path / "old.nwb")
 
 
@@ -169,9 +169,7 @@ def test_human_counts_equal_those_of_pynwb(reference):
 @pytest.mark.parametrize(("name", "series"), INTRACELLULAR.items())
 def test_intracellular_files_are_refused_in_one_sentence_and_inspected(reference, name, series):
     path = reference / "nwb" / name
-    with pytest.raises(
-        DataError, match=rf"has no units table: it holds \d+ intracellular series \({series}\)"
-    ) as error:
+    with pytest.raises(DataError, match=rf"\d+ intracell.*\({series}\)") as error:
         open_recordings(path, conditions="trials:stimulus")
     assert "\n" not in str(error.value)
     report = inspect(path)
@@ -186,7 +184,7 @@ def test_a_probe_export_without_trials_says_what_it_lacks(reference):
     report = inspect(path)
     assert (report.sessions[0].units.units, report.sessions[0].units.spikes) == (3, 21_354)
     assert report.sessions[0].subject == path.stem
-    with pytest.raises(DataError, match=r"no interval table with a column that could label trials .*'epochs'"):
+    with pytest.raises(DataError, match=r"no interval.*'epochs'"):
         open_recordings(path)
     with pytest.raises(UsageError, match="Unknown table 'trials'"):
         open_recordings(path, conditions="trials:stimulus")

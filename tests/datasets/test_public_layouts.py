@@ -93,7 +93,7 @@ def test_a_spike_train_of_zeros_and_ones_is_a_unit_recorded_in_trials_only(tmp_p
         dataset["counts"].values[:, 0, 0], [np.sum((spikes >= begin) & (spikes < begin + 0.1)) for begin in low]
     )
     # Between trials nothing was sampled: that is missing, not silence.
-    with pytest.raises(DataError, match="outside the recorded span removed 24"):
+    with pytest.raises(DataError, match="recorded span removed 24"):
         open_recordings(tmp_path / "a.nwb", window="stop-0.2..+0.4", select="none")
 
 
@@ -103,9 +103,9 @@ def test_series_of_zeros_and_ones_say_what_is_wrong_with_them():
     np.testing.assert_allclose(Series("s", "", flags, start=5.0, rate=10.0).active_times(), [5.1, 5.3])
     with pytest.raises(DataError, match="4 samples"):
         Series("s", "", flags, stamps[:3]).active_times()
-    with pytest.raises(DataError, match="neither timestamps nor a rate"):
+    with pytest.raises(DataError, match="timestamps nor a rate"):
         Series("s", "", flags).active_times()
-    with pytest.raises(DataError, match="should hold zeros and ones; it reaches 7"):
+    with pytest.raises(DataError, match="it reaches 7"):
         Series("s", "", flags * 7, stamps).active_times()
     np.testing.assert_allclose(recorded_runs(np.array([0, 0.1, 0.2, 5, 5.1])), [[0, 0.3], [5, 5.2]])
 
@@ -134,9 +134,9 @@ def test_bumps_and_reaches_are_told_apart_by_direction(tmp_path):
 
 def test_the_test_trials_of_the_benchmark_are_refused_in_words(tmp_path):
     write_area2(tmp_path / "a.nwb", test=True)
-    with pytest.raises(DataError, match="no interval table with a column that could label trials"):
+    with pytest.raises(DataError, match="no interval table"):
         open_recordings(tmp_path / "a.nwb")
-    with pytest.raises(UsageError, match="Unknown column 'movement'"):
+    with pytest.raises(UsageError, match="column 'movement'"):
         open_recordings(f"area2-bump:{tmp_path / 'a.nwb'}")
 
 
@@ -173,9 +173,9 @@ def test_a_registered_layout_is_found_by_name_and_by_layout(registry, tmp_path):
     assert dataset.attrs["vocabulary"] == ["c", "b", "a"]
     other = write_recordings(tmp_path / "b.h5", make_simple_session())
     assert open_recordings(f"my-lab:{other}").attrs["window"] == "start..+0.5"
-    with pytest.raises(UsageError, match="already a recording layout 'my-lab'"):
+    with pytest.raises(UsageError, match="layout 'my-lab'"):
         register_layout(my_layout(remarks=("other",)))
-    with pytest.raises(UsageError, match="A layout's name is a word"):
+    with pytest.raises(UsageError, match="received 'c'"):
         register_layout(my_layout("c"))
 
 
@@ -235,12 +235,10 @@ def test_installed_packages_add_layouts_and_one_that_fails_takes_nothing_away(re
 
 def test_without_the_client_nothing_is_tried(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(
-        MissingDependencyError, match=r"pip install 'brainbench\[dandi\]'\. Or get DANDI:000231 elsewhere"
-    ):
+    with pytest.raises(MissingDependencyError, match=r"\[dandi\].*DANDI:000231"):
         fetch("rodgers", tmp_path / "data")
     assert not (tmp_path / "data").exists()
-    with pytest.raises(UsageError, match="Unknown data set 'rogers'; did you mean 'rodgers'"):
+    with pytest.raises(UsageError, match="'rogers'; did you mean 'rodgers'"):
         fetch("rogers", tmp_path)
 
 
@@ -265,5 +263,5 @@ def test_the_client_is_asked_for_the_files_with_units(monkeypatch, tmp_path, nam
     assert asked[-1] == source
     assert ("glob" in asked) == ("dandi://" in source)
     client.write_text("#!/bin/sh\nexit 3\n")
-    with pytest.raises(DataError, match="ended with status 3 while fetching"):
+    with pytest.raises(DataError, match="status 3"):
         fetch(name, tmp_path / "data", assets=assets)

@@ -129,10 +129,10 @@ def test_units_with_no_spikes_are_removed_and_counted_or_kept_on_request(tmp_pat
 def test_a_session_of_silent_units_has_no_recorded_span(tmp_path):
     table = {"start_time": np.arange(4.0), "stop_time": np.arange(4.0) + 1, "stimulus": ["a", "b", "a", "b"]}
     path = write(tmp_path / "a.h5", make_session("m", "1", [np.zeros(0)] * 2, {"trials": table}))
-    with pytest.raises(DataError, match=r"No trial remains of .*units: no spikes removed 2"):
+    with pytest.raises(DataError, match=r"trial.*no spikes removed 2"):
         open_recordings(path, conditions="trials:stimulus")
     path = write(tmp_path / "b.h5", make_session("m", "1", [], {"trials": table}))
-    with pytest.raises(DataError, match="no units table with spike_times"):
+    with pytest.raises(DataError, match="table with spike_times"):
         open_recordings(path, conditions="trials:stimulus")
 
 
@@ -142,7 +142,7 @@ def test_units_are_chosen_by_layer_depth_and_number_of_spikes(tmp_path):
     chosen = open_recordings(path, conditions="trials:stimulus", select="units.layer=4; units.inhibitory=false")
     assert chosen["depth"].values.tolist() == [500.0]
     assert chosen.attrs["removed"]["units: layer=4"] == 1
-    with pytest.raises(DataError, match=r"No unit remains of .*units: fewer than 9999 spikes removed 3"):
+    with pytest.raises(DataError, match=r"unit.*9999.*removed 3"):
         open_recordings(path, conditions="trials:stimulus", select="min_spikes=9999")
 
 
@@ -151,31 +151,31 @@ def test_one_subject_can_be_chosen_and_an_unknown_one_is_named(tmp_path):
     write(tmp_path / "b.h5", subject="m2", seed=1)
     dataset = open_recordings(tmp_path, conditions="trials:stimulus", select=Selection(subjects=("m2",)))
     assert set(dataset["subject"].values) == {"m2"}
-    with pytest.raises(UsageError, match="Unknown subject 'm3'; did you mean 'm"):
+    with pytest.raises(UsageError, match="'m3'; did you mean 'm"):
         open_recordings(tmp_path, conditions="trials:stimulus", select=Selection(subjects=("m3",)))
 
 
 def test_without_conditions_the_message_proposes_some(tmp_path):
-    with pytest.raises(UsageError, match=r"pass conditions TABLE:COLUMN, such as 'trials:stimulus'"):
+    with pytest.raises(UsageError, match=r"as 'trials:stimulus'"):
         open_recordings(write(tmp_path / "a.h5"))
 
 
 def test_unknown_tables_and_columns_suggest_the_nearest(tmp_path):
     path = write(tmp_path / "a.h5")
-    with pytest.raises(UsageError, match="Unknown table 'trails'; did you mean 'trials'"):
+    with pytest.raises(UsageError, match="'trails'; did you mean 'trials'"):
         open_recordings(path, conditions="trails:stimulus")
-    with pytest.raises(UsageError, match="Unknown column 'stimuls'; did you mean 'stimulus'"):
+    with pytest.raises(UsageError, match="'stimuls'; did you mean 'stimulus'"):
         open_recordings(path, conditions="trials:stimuls")
 
 
 def test_one_condition_only_is_refused(tmp_path):
     path = write(tmp_path / "a.h5", columns={"stimulus": ["a"] * 12})
-    with pytest.raises(DataError, match=r"have the one condition 'a' .* needs at least two"):
+    with pytest.raises(DataError, match=r"the one condition 'a'"):
         open_recordings(path, conditions="trials:stimulus")
 
 
 def test_no_trial_left_tells_which_rules_removed_them(tmp_path):
-    with pytest.raises(DataError, match=r"No trial remains of .*trials: stimulus=z removed 12"):
+    with pytest.raises(DataError, match=r"stimulus=z removed 12"):
         open_recordings(write(tmp_path / "a.h5"), conditions="trials:stimulus", select="stimulus=z")
 
 
@@ -195,7 +195,7 @@ def test_spike_times_that_are_not_finite_are_refused(tmp_path):
     path = write(tmp_path / "a.h5", unit_columns={"id": [7, 8, 9]})
     with h5py.File(path, "a") as file:
         file["sessions/mouse-1/units/spike_times"][500] = np.nan
-    with pytest.raises(DataError, match=r"1 spike times of table 'units' .* are not finite \(first in unit 8\)"):
+    with pytest.raises(DataError, match=r"\(first in unit 8\)"):
         open_recordings(path, conditions="trials:stimulus")
 
 
@@ -203,20 +203,20 @@ def test_an_inconsistent_ragged_index_is_refused(tmp_path):
     path = write(tmp_path / "a.h5")
     with h5py.File(path, "a") as file:
         file["sessions/mouse-1/units/spike_times_index"][-1] = 7
-    with pytest.raises(DataError, match=r"ragged index spike_times_index .* is inconsistent"):
+    with pytest.raises(DataError, match=r"spike_times_index"):
         open_recordings(path, conditions="trials:stimulus")
 
 
 def test_the_same_session_twice_is_refused(tmp_path):
     write(tmp_path / "a.h5")
     (tmp_path / "copy.h5").write_bytes((tmp_path / "a.h5").read_bytes())
-    with pytest.raises(DataError, match=r"are the same session \(equal subject and session: mouse / 1\)"):
+    with pytest.raises(DataError, match=r"mouse / 1\)"):
         open_recordings(tmp_path, conditions="trials:stimulus")
 
 
 def test_missing_files_and_empty_searches_are_named(tmp_path):
     write(tmp_path / "session.h5")
-    with pytest.raises(DataFileNotFoundError, match=r"There is no file .*sesion.h5'; did you mean 'session.h5'"):
+    with pytest.raises(DataFileNotFoundError, match=r"sesion.h5'; did you mean 'session.h5'"):
         open_recordings(tmp_path / "sesion.h5", conditions="trials:stimulus")
     with pytest.raises(DataFileNotFoundError, match=r"matches no file"):
         open_recordings(str(tmp_path / "*.nwb"), conditions="trials:stimulus")
@@ -247,7 +247,7 @@ def test_damage_inside_a_file_names_the_file(tmp_path, use):
     with path.open("r+b") as stream:
         stream.seek(chunk.byte_offset)
         stream.write(bytes(chunk.size))
-    with pytest.raises(DataError, match=r"a\.h5 cannot be read, it seems damaged"):
+    with pytest.raises(DataError, match=r"a\.h5 .* damaged"):
         use(path)
     assert "seems damaged" in check(path).findings[0].message
 
@@ -255,7 +255,7 @@ def test_damage_inside_a_file_names_the_file(tmp_path, use):
 def test_foreign_hdf5_is_refused_with_what_it_holds(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["voltage"] = np.zeros(3)
-    with pytest.raises(DataError, match="neither NWB nor the brainbench-recordings layout: it holds voltage"):
+    with pytest.raises(DataError, match="it holds voltage"):
         open_recordings(tmp_path / "a.h5", conditions="trials:stimulus")
 
 
@@ -271,9 +271,9 @@ def test_globs_lists_and_layouts_name_sources(tmp_path):
     by_glob = open_recordings(str(tmp_path / "m[01].h5"), conditions="trials:stimulus")
     by_list = open_recordings(paths[:2], conditions="trials:stimulus")
     xr.testing.assert_identical(by_glob.drop_attrs(), by_list.drop_attrs())
-    with pytest.raises(UsageError, match="Unknown recording layout 'rodgrs'; did you mean 'rodgers'"):
+    with pytest.raises(UsageError, match="'rodgrs'; did you mean 'rodgers'"):
         open_recordings(f"rodgrs:{tmp_path}")
-    with pytest.raises(UsageError, match="no file; write rodgers:PATH"):
+    with pytest.raises(UsageError, match="write rodgers:PATH"):
         open_recordings("rodgers:")
-    with pytest.raises(UsageError, match="demo recordings are made from simulated stimuli"):
+    with pytest.raises(UsageError, match="simulated stimuli"):
         open_recordings("demo")

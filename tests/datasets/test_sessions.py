@@ -35,7 +35,7 @@ def test_natural_order_does_not_depend_on_appearance(labels, random):
 
 def test_a_column_of_another_length_is_refused():
     table = SessionTable("trials", {"id": np.arange(3), "stimulus": np.array(["a", "b"])}, "file.nwb")
-    with pytest.raises(DataError, match=r"Column 'stimulus' of table 'trials' of file.nwb has 2 values for 3 rows"):
+    with pytest.raises(DataError, match=r"file.nwb has 2 values"):
         table.column("stimulus")
 
 
@@ -62,7 +62,7 @@ def test_an_unknown_column_suggests_the_nearest():
 
 
 def test_make_session_refuses_columns_of_different_length():
-    with pytest.raises(DataError, match="'stimulus' of table 'trials' of 1 has 1 of 2 rows"):
+    with pytest.raises(DataError, match=r"'stimulus' .* 1 of 2 rows"):
         make_session("m", "1", [np.zeros(1)], {"trials": {"start_time": [0.0, 1.0], "stimulus": ["a"]}})
     with pytest.raises(UsageError, match="start_time"):
         make_session("m", "1", [np.zeros(1)], {"trials": {"stimulus": ["a"]}})

@@ -18,8 +18,16 @@ def _angle_bracket(name="bracket"):
     return Mesh(flat, bottom + top + sides, name)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def own_cache(tmp_path_factory):
+    """An empty cache, also where the tests share one between runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BRAINBENCH_CACHE", str(tmp_path_factory.mktemp("collision")))
+        yield
+
+
 @pytest.fixture(scope="module")
-def bracket():
+def bracket(own_cache):
     return decompose(_angle_bracket())
 
 
@@ -69,12 +77,12 @@ def test_a_damaged_cache_is_made_again(monkeypatch, caplog):
 
 
 def test_the_limit_of_time_is_kept_in_words():
-    with pytest.raises(DataError, match=r"'slow' \(20 triangles\) took longer than 0.05 s and was stopped; raise the"):
+    with pytest.raises(DataError, match=r"'slow' .*0.05 s .*raise"):
         decompose(_angle_bracket("slow"), DecompositionSettings(seconds=0.05, seed=7))
 
 
 def test_the_limit_of_memory_is_kept_in_words():
-    with pytest.raises(DataError, match=r"'big' .* needed more than 0.1 GB of memory and was stopped"):
+    with pytest.raises(DataError, match=r"'big' .*0.1 GB of memory"):
         decompose(_angle_bracket("big"), DecompositionSettings(memory=1e8, seed=7))
 
 

@@ -99,12 +99,12 @@ def test_impossible_meshes_are_refused(vertices, faces, message):
 
 
 def test_an_unknown_unit_names_the_nearest(tmp_path):
-    with pytest.raises(UsageError, match="Unknown length unit 'mmm'; did you mean 'mm'"):
+    with pytest.raises(UsageError, match="'mmm'; did you mean 'mm'"):
         load_mesh(_cube_file(tmp_path), unit="mmm")
 
 
 def test_a_missing_mesh_file_is_named(tmp_path):
-    with pytest.raises(DataFileNotFoundError, match=r"no mesh file .*nothing\.obj"):
+    with pytest.raises(DataFileNotFoundError, match=r"mesh file.*nothing\.obj"):
         load_mesh(tmp_path / "nothing.obj", unit="m")
 
 
@@ -130,7 +130,7 @@ def test_a_saved_mesh_comes_back(tmp_path, suffix):
 
 def test_an_unknown_mesh_format_is_refused_before_anything_is_written(tmp_path):
     mesh = load_mesh(_cube_file(tmp_path), unit="mm")
-    with pytest.raises(UsageError, match=r"Unknown mesh format '\.objj'; did you mean '\.obj'"):
+    with pytest.raises(UsageError, match=r"'\.objj'; did you mean '\.obj'"):
         save_mesh(tmp_path / "out.objj", mesh, unit="m")
     assert not (tmp_path / "out.objj").exists()
 

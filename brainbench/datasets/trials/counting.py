@@ -170,8 +170,8 @@ def read_spikes(units: SessionTable, notes: list[str]) -> list[NDArray[np.float6
 
 def recorded_span(spikes: list[NDArray[np.float64]]) -> tuple[float, float] | None:
     """Return the first and last spike (s) of all units, or None without any."""
-    heard = [times for times in spikes if len(times)]
-    return (float(min(times[0] for times in heard)), float(max(times[-1] for times in heard))) if heard else None
+    firing = [times for times in spikes if len(times)]
+    return (float(min(times[0] for times in firing)), float(max(times[-1] for times in firing))) if firing else None
 
 
 def count(

@@ -239,8 +239,8 @@ def _interval(tallies: Sequence[Mapping[int, NDArray[np.float64]]], sizes: Seque
             means += counts[:, 0] / counts[:, 1] / len(tally) / len(tallies)
     low, high = np.quantile(means, [0.025, 0.975])
     if np.ptp(means) == 0 and means[0] in (0.0, 1.0):
-        # Resampling cannot show the doubt that is left when every object is right: the exact bound of n of n does.
-        doubt = 0.025 ** (1 / sum(sizes))
-        low, high = (doubt, 1.0) if means[0] == 1 else (0.0, 1 - doubt)
+        # Resampling shows no spread when every object is right: the exact bound of n of n does.
+        bound = 0.025 ** (1 / sum(sizes))
+        low, high = (bound, 1.0) if means[0] == 1 else (0.0, 1 - bound)
         return Interval(low, high, 0.95, "exact binomial (Clopper and Pearson) over objects, which are all alike")
     return Interval(float(low), float(high), 0.95, f"bootstrap over objects within classes, {RESAMPLES} resamples")

@@ -348,7 +348,7 @@ def test_a_folder_is_judged_as_a_whole_worst_first(tmp_path):
     assert "2 files hold this session" in str(checkup)
     with pytest.raises(DataFileNotFoundError):
         check(tmp_path / "nothing.h5")
-    with pytest.raises(UsageError, match="cannot be read; write TABLE:COLUMN"):
+    with pytest.raises(UsageError, match="write TABLE:COLUMN"):
         check(tmp_path, conditions="stimulus")
 
 

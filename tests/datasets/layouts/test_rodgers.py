@@ -110,7 +110,7 @@ def test_arguments_replace_their_part_of_the_layout_only(tmp_path):
 
 def test_a_layout_that_does_not_fit_names_what_is_missing(tmp_path):
     session = make_session("m", "1", [np.arange(5.0)], {"trials": {"start_time": [0.0, 1.0], "stim": ["a", "b"]}})
-    with pytest.raises(UsageError, match="Unknown column 'stimulus'; did you mean 'stim'"):
+    with pytest.raises(UsageError, match="'stimulus'; did you mean 'stim'"):
         open_recordings(f"rodgers:{write_recordings(tmp_path / 'a.h5', session)}")
 
 
@@ -118,7 +118,7 @@ def test_files_of_different_layouts_are_not_mixed_silently(tmp_path):
     write_rodgers(tmp_path / "a.h5")
     session = make_session("m", "1", [np.arange(5.0)], {"trials": {"start_time": [0.0, 1.0], "stim": ["a", "b"]}})
     write_recordings(tmp_path / "b.h5", session)
-    with pytest.raises(UsageError, match=r"b\.h5:m-1 has another layout than"):
+    with pytest.raises(UsageError, match=r"b\.h5:m-1 has another"):
         open_recordings(tmp_path)
 
 
@@ -170,7 +170,7 @@ def test_a_lost_whisker_is_not_needed_for_the_first_contact_but_is_said(tmp_path
     dataset = open_recordings(write_rodgers(tmp_path / "a.h5", lost=("C2",)))
     np.testing.assert_allclose(dataset["window_start"].values, 10.0 * np.arange(ROWS) + 2)
     assert "no contact table of 'C0', 'C2', 'C3'" in "".join(dataset.attrs["notes"])
-    with pytest.raises(DataError, match=r"first-contact\.\.choice removed 14"):
+    with pytest.raises(DataError, match=r"choice removed 14"):
         # All contacts of C2 are of zero duration, so they are no first contact.
         open_recordings(write_rodgers(tmp_path / "b.h5", lost=("C1",)))
 

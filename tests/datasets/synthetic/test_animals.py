@@ -217,7 +217,7 @@ def test_calibration_is_exact_within_its_monte_carlo_error(wanted, noise):
 
 
 def test_a_ceiling_out_of_reach_says_what_is_reached():
-    with pytest.raises(UsageError, match=r"ceiling of 0\.99 is out of reach: this design has up to 0\.[0-8]"):
+    with pytest.raises(UsageError, match=r"0\.99 .* up to 0\.[0-8]"):
         calibrate(make_geometry(), Design(animals=5, units=5, trials=1, rate=1.0), ceiling=0.99, simulations=5)
 
 
@@ -304,7 +304,7 @@ def test_files_are_valid_for_pynwb(tmp_path):
 
 
 def test_an_unknown_format_suggests_the_nearest(tmp_path):
-    with pytest.raises(UsageError, match="Unknown format 'nbw'; did you mean 'nwb'"):
+    with pytest.raises(UsageError, match="'nbw'; did you mean 'nwb'"):
         write_files(tmp_path, make_geometry(), SMALL, format="nbw")
 
 

@@ -40,11 +40,11 @@ def test_units_that_were_not_recorded_are_missing():
 
 
 def test_a_bin_is_positive():
-    with pytest.raises(UsageError, match="positive number of seconds; received 0"):
+    with pytest.raises(UsageError, match="received 0"):
         count([np.zeros(1)], np.array([[0.0, 1.0]]), np.ones((1, 1), dtype=bool), 0.0)
 
 
 def test_bins_that_would_not_fit_in_memory_are_refused_with_their_number():
     edges = np.tile([0.0, 1.0], (100, 1))
-    with pytest.raises(UsageError, match=r"A bin of 1e-09 s cuts windows of up to 1 s into 1,000,000,000 bins"):
+    with pytest.raises(UsageError, match=r"1,000,000,000 bins"):
         count([np.zeros(1)] * 5, edges, np.ones((100, 5), dtype=bool), 1e-9)

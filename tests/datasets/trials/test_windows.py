@@ -28,7 +28,7 @@ def test_windows_are_read_from_text_and_written_back(source):
 
 @pytest.mark.parametrize("source", ["start", "..stop", "start..", "5"])
 def test_unreadable_windows_show_the_form(source):
-    with pytest.raises(UsageError, match=r"FROM\.\.TO or FROM\.\.\+SECONDS"):
+    with pytest.raises(UsageError, match=r"or FROM\.\.\+SECONDS"):
         Window.parse(source)
 
 
@@ -65,7 +65,7 @@ def test_a_session_without_contact_tables_takes_the_fallback_and_says_so():
     found, notes = edges(window, make_contacts())
     np.testing.assert_allclose(found[0], [4.0, 5.0])
     assert "no contact tables; window choice-1..+1 for its 3 trials" in notes[0]
-    with pytest.raises(DataError, match="no tables contacts_by_whisker_"):
+    with pytest.raises(DataError, match="contacts_by_whisker_"):
         edges(Window("first-contact", stop="choice"), make_contacts())
 
 

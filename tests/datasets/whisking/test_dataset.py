@@ -100,7 +100,7 @@ def test_a_resumed_iteration_gives_the_batches_of_an_unbroken_one(folder, stop):
 
 def test_a_state_of_other_batches_is_refused(folder):
     state = WhiskingDataset(folder, batch_size=5).state_dict()
-    with pytest.raises(UsageError, match=r"seed 0 \(here 1\), batch_size 5 \(here 6\)"):
+    with pytest.raises(UsageError, match=r"seed 0 \(here 1\), batch"):
         WhiskingDataset(folder, batch_size=6, seed=1).load_state_dict(state)
 
 
@@ -165,7 +165,7 @@ def test_unstable_sweeps_are_left_out_unless_asked_for(unstable):
     (x, _), *_ = every
     assert x.shape[0] == 12
     assert torch.isfinite(x).all()
-    with pytest.raises(DataError, match=f"{data.skipped} sweeps of .* have unstable whiskers"):
+    with pytest.raises(DataError, match=f"{data.skipped} sweeps.*unstable"):
         WhiskingDataset(unstable, split="all", unstable="error")
 
 
@@ -178,7 +178,7 @@ def test_verification_finds_one_changed_byte(copy):
     with path.open("r+b") as stream:
         stream.seek(offset + 1000)
         stream.write(b"\x01")
-    with pytest.raises(DataError, match=r"train-00001.h5' do not match the hash"):
+    with pytest.raises(DataError, match=r"train-00001.h5' .*hash"):
         WhiskingDataset(copy, split="all").verify()
 
 
@@ -189,17 +189,17 @@ def test_missing_and_damaged_shards_are_named(copy):
         WhiskingDataset(copy)
     WhiskingDataset(copy, split="test")
     path.unlink()
-    with pytest.raises(DataError, match=r"train-00001.h5' of the manifest is missing; remove it"):
+    with pytest.raises(DataError, match=r"train-00001.h5'.*missing"):
         WhiskingDataset(copy)
     shutil.copy(copy / "test-00000.h5", path)
-    with pytest.raises(DataError, match="does not belong to the manifest"):
+    with pytest.raises(DataError, match="belong to the manifest"):
         WhiskingDataset(copy)
 
 
 def test_folders_without_a_finished_data_set_say_what_to_do(copy, tmp_path):
     manifest = json.loads((copy / "manifest.json").read_text())
     (copy / "manifest.json").write_text(json.dumps({**manifest, "schema": 99}))
-    with pytest.raises(DataError, match="version 99; this brainbench reads 'brainbench-sweeps' version 1"):
+    with pytest.raises(DataError, match=r"version 99; .*version 1"):
         WhiskingDataset(copy)
     (copy / "manifest.json").unlink()
     with pytest.raises(DataError, match="is not finished"):
@@ -226,7 +226,7 @@ def test_arguments_out_of_range_are_named(folder, options, message):
 
 def test_a_class_without_test_objects_leaves_an_empty_split_in_words(tmp_path):
     generate(small_plan(("brick:2",)), tmp_path, workers=1)
-    with pytest.raises(DataError, match=r"'validation' .* has no sweeps; it has 'test', 'train'"):
+    with pytest.raises(DataError, match=r"'validation'.*'test', 'train'"):
         WhiskingDataset(tmp_path, split="validation")
 
 

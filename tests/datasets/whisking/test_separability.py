@@ -83,7 +83,7 @@ def test_few_objects_make_it_unreliable_and_one_makes_it_impossible():
     found = separate(*_made(objects=3, by_class=3.0), count=2, names=NAMES)
     assert found.status == "unreliable"
     assert "only 3 objects" in found.reason
-    with pytest.raises(DataError, match="'a' has 1 object; telling classes apart needs two"):
+    with pytest.raises(DataError, match="'a' has 1 object"):
         separate(*_made(objects=1), count=2, names=NAMES)
 
 
@@ -117,9 +117,9 @@ def test_simulated_sweeps_are_read_and_classes_chosen_by_their_objects(data):
 
 
 def test_classes_that_the_data_set_does_not_have_are_named(data):
-    with pytest.raises(UsageError, match="Unknown class 'bricks'; did you mean 'brick'"):
+    with pytest.raises(UsageError, match="'bricks'; did you mean 'brick'"):
         separability(data, classes=("bricks", "cone"), counts=(2,))
-    with pytest.raises(UsageError, match="has 3 classes; 4 at a time"):
+    with pytest.raises(UsageError, match="3 classes; 4 at a time"):
         separability(data)
-    with pytest.raises(UsageError, match="need 3 different classes"):
+    with pytest.raises(UsageError, match="3 different classes"):
         separability(data, classes=("cone", "brick"), counts=(2, 3))
