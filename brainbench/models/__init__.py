@@ -5,6 +5,30 @@ encoder (often a temporal graph of cells), an attender and a decoder into a :mod
 :mod:`~brainbench.models.activations` are what is compared with brains. Importing this package imports no framework.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
 from brainbench.models import zoo
 
+if TYPE_CHECKING:
+    from brainbench.models.activations import extract
+    from brainbench.models.registry import describe_model, list_models, load_model, register_model
+    from brainbench.models.user_models import load_user_model
+
+__all__ = ["describe_model", "extract", "list_models", "load_model", "load_user_model", "register_model"]
+
 zoo.register()
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "describe_model": ".registry",
+        "extract": ".activations",
+        "list_models": ".registry",
+        "load_model": ".registry",
+        "load_user_model": ".user_models",
+        "register_model": ".registry",
+    },
+)

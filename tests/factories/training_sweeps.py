@@ -1,10 +1,17 @@
-"""A tiny labelled data set: three classes that differ in which whiskers are loaded."""
+"""Random sweeps in SI, and a tiny labelled data set: three classes that differ in which whiskers are loaded."""
 
 import torch
 
 from brainbench.models.training.batches import ArrayData
 
 CLASSES = ("front", "middle", "back")
+SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+"""Force [N] and moment [N·m] of light touch, per channel of five sub-steps."""
+
+
+def random_sweeps(batch, steps):
+    """Return [batch, steps, 30, 5, 7] of normal numbers from the global random state, in SI."""
+    return torch.randn(batch, steps, 30, 5, 7) * SCALE
 
 
 def sweeps(count, seed, steps=8):
@@ -13,7 +20,7 @@ def sweeps(count, seed, steps=8):
     x = 0.2 * torch.randn(count, steps, 30, 5, 7, generator=generator)
     for index, label in enumerate(labels):
         x[index, :, :, label : label + 2] += 2.0
-    return x * torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None], labels
+    return x * SCALE, labels
 
 
 def tiny(**counts):

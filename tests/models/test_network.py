@@ -10,6 +10,7 @@ from brainbench.models.encoders.zhuang import ZhuangEncoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import mlp_decoder
 from brainbench.models.network import EncoderAttenderDecoder
+from tests.factories.training_sweeps import SCALE, random_sweeps
 
 
 def _network(*, gpt=False, **options):
@@ -17,22 +18,17 @@ def _network(*, gpt=False, **options):
     return EncoderAttenderDecoder(encoder, GPTAttender(96, 32, blocks=2) if gpt else None, **options).eval()
 
 
-def _sweep(batch=2, steps=6):
-    scale = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)
-    return torch.randn(batch, steps, 30, *GRID_SHAPE) * scale[:, None, None]
-
-
 def test_the_answer_is_decoded_from_the_last_step_in_physical_units():
-    network, x = _network(), _sweep()
+    network, x = _network(), random_sweeps(2, 6)
     with torch.no_grad():
-        scaled = x / torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
+        scaled = x / SCALE
         expected = network.decoder(network.encoder(scaled)[:, -1])
         torch.testing.assert_close(network(x), expected, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("gpt", [False, True])
 def test_a_stream_gives_the_sweeps_answer_at_every_step(gpt):
-    network, x = _network(gpt=gpt), _sweep()
+    network, x = _network(gpt=gpt), random_sweeps(2, 6)
     with torch.no_grad():
         state = network.init_state(2)
         for t in range(x.shape[1]):
@@ -44,7 +40,7 @@ def test_a_stream_gives_the_sweeps_answer_at_every_step(gpt):
 def test_activations_come_in_the_order_of_the_layers(gpt):
     network = _network(gpt=gpt)
     with torch.no_grad():
-        activations = network.activations(x := _sweep())
+        activations = network.activations(x := random_sweeps(2, 6))
         y = network(x)
     assert tuple(activations) == network.layers
     assert network.layers[0] == "encoder.conv1"
@@ -56,7 +52,7 @@ def test_activations_come_in_the_order_of_the_layers(gpt):
 
 @pytest.mark.parametrize("layers", [["encoder.fc8"], ["decoder"], ["attender.block2"], ["decoder", "encoder.conv1"]])
 def test_a_choice_of_layers_equals_the_whole(layers):
-    network, x = _network(gpt=True), _sweep()
+    network, x = _network(gpt=True), random_sweeps(2, 6)
     with torch.no_grad():
         some, every = network.activations(x, layers), network.activations(x)
     assert set(some) == set(layers)
@@ -66,7 +62,7 @@ def test_a_choice_of_layers_equals_the_whole(layers):
 
 def test_an_unknown_layer_names_the_nearest():
     with pytest.raises(UsageError, match=r"did you mean 'encoder\.conv3'"):
-        _network().activations(_sweep(), ["conv3"])
+        _network().activations(random_sweeps(2, 6), ["conv3"])
 
 
 def test_the_specification_says_what_goes_in():
@@ -85,14 +81,14 @@ def test_the_specification_says_what_goes_in():
 def test_the_answer_is_blind_to_steps_within_the_latency():
     network = _network()
     with torch.no_grad():
-        short = network(_sweep(steps=3))
-        assert torch.equal(short, network(_sweep(steps=3)))
-        assert not torch.equal(network(_sweep(steps=4)), network(_sweep(steps=4)))
+        short = network(random_sweeps(2, 3))
+        assert torch.equal(short, network(random_sweeps(2, 3)))
+        assert not torch.equal(network(random_sweeps(2, 4)), network(random_sweeps(2, 4)))
 
 
 def test_any_decoder_fits():
     network = _network(decoder=mlp_decoder(96, 4))
-    assert network(_sweep()).shape == (2, 4)
+    assert network(random_sweeps(2, 6)).shape == (2, 4)
     assert network.spec.outputs == 4
     with pytest.raises(UsageError, match="received Identity"):
         _network(decoder=torch.nn.Identity())
@@ -109,4 +105,4 @@ def test_a_wrong_stimulus_is_told_what_is_expected_and_received(shape):
 def test_a_wrong_step_is_told_what_is_expected_and_received():
     network = _network()
     with pytest.raises(UsageError, match=r"received \[2, 6, 30, 5, 7\]"):
-        network.step(_sweep(), network.init_state(2))
+        network.step(random_sweeps(2, 6), network.init_state(2))

@@ -5,19 +5,16 @@ from torch import nn
 from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
 from brainbench.models.streaming import StreamingStep
+from tests.factories.training_sweeps import random_sweeps
 
 NAMES = ["zhuang-intersection-ln-small", "zhuang-lstm-small+gpt", "zhuang-feedforward-small", "resnet18-small",
          "resnet18-small+mamba", "s4-small", "s4-small+gpt", "zhuang-small+mamba"]  # fmt: skip
 
 
-def _sweep(batch, steps):
-    return torch.randn(batch, steps, 30, 5, 7) * torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("name", NAMES)
 def test_a_flat_state_streams_the_sweeps_features(name):
-    model, x = load_model(name), _sweep(2, 6)
+    model, x = load_model(name), random_sweeps(2, 6)
     step, expected = StreamingStep(model), model.encode(x)
     h = step.init_state(2)
     for t in range(6):
@@ -29,7 +26,7 @@ def test_a_flat_state_streams_the_sweeps_features(name):
 @torch.no_grad()
 @pytest.mark.parametrize("name", ["zhuang-ugrnn-small+gpt", "s4-small+mamba"])
 def test_zeroing_a_row_resets_it_alone(name):
-    model, x = load_model(name), _sweep(2, 4)
+    model, x = load_model(name), random_sweeps(2, 4)
     step = StreamingStep(model)
     h = step.init_state(2)
     for t in range(3):
@@ -43,7 +40,7 @@ def test_zeroing_a_row_resets_it_alone(name):
 @torch.no_grad()
 def test_a_full_context_gives_nan_until_it_is_reset():
     model = load_model("zhuang-small+gpt")
-    step, x = StreamingStep(model), _sweep(1, 1)[:, 0]
+    step, x = StreamingStep(model), random_sweeps(1, 1)[:, 0]
     h = step.init_state(1)
     for t in range(model.spec.max_steps + 1):
         features, h = step(x, h)

@@ -4,23 +4,19 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
 from brainbench.models.tradeoff import ModelSetting, Reduced, measure, round_weights, settings
+from tests.factories.training_sweeps import random_sweeps
 
-SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
 NAME = "zhuang-ugrnn-ln-small"
 
 
-def _sweeps(count=3, steps=10):
-    return torch.randn(count, steps, 30, 5, 7) * SCALE
-
-
 def test_the_reference_setting_has_no_error():
-    point = measure(NAME, ModelSetting(steps=10), _sweeps())
+    point = measure(NAME, ModelSetting(steps=10), random_sweeps(3, 10))
     assert point.error == pytest.approx(0.0, abs=1e-6)
     assert 0 < point.cost <= point.settings["p99_ms"]
 
 
 def test_lower_precision_costs_a_little_accuracy_and_saves_memory():
-    points = {item.precision: measure(NAME, item, _sweeps()) for item in settings(steps=(10,))}
+    points = {item.precision: measure(NAME, item, random_sweeps(3, 10)) for item in settings(steps=(10,))}
     assert 0 < points["bf16"].error < 0.1
     assert 0 < points["int8"].error < 0.2
     sizes = [points[name].settings["stored_bytes"] for name in ("float32", "bf16", "int8")]
@@ -41,12 +37,12 @@ def test_rounding_to_eight_bits_moves_no_weight_by_more_than_half_a_level():
 
 
 def test_fewer_steps_and_another_unrolling_change_the_answer():
-    assert measure(NAME, ModelSetting(steps=5), _sweeps()).error > 0.01
-    assert measure(NAME, ModelSetting(unroll="full", steps=10), _sweeps()).error > 0.01
+    assert measure(NAME, ModelSetting(steps=5), random_sweeps(3, 10)).error > 0.01
+    assert measure(NAME, ModelSetting(unroll="full", steps=10), random_sweeps(3, 10)).error > 0.01
 
 
 def test_a_reduced_network_is_scored_like_the_network():
-    reduced, x = Reduced(NAME, ModelSetting("bf16", steps=6)), _sweeps()
+    reduced, x = Reduced(NAME, ModelSetting("bf16", steps=6)), random_sweeps(3, 10)
     assert reduced.layers == load_model(NAME).layers
     with torch.no_grad():
         assert reduced.activations(x, ["decoder"])["decoder"].shape == (3, 6, 117)
@@ -60,4 +56,4 @@ def test_wrong_settings_are_refused():
     with pytest.raises(UsageError, match="one unrolling only"):
         Reduced("s4-small", ModelSetting(unroll="full"))
     with pytest.raises(UsageError, match="22 steps cannot"):
-        measure(NAME, ModelSetting(), _sweeps())
+        measure(NAME, ModelSetting(), random_sweeps(3, 10))

@@ -9,18 +9,14 @@ import pytest
 import torch
 
 from brainbench.models.registry import describe_model, list_models, load_model
+from tests.factories.training_sweeps import random_sweeps
 
 SMALL = list_models("*-small*")
 FULL = [name for name in list_models() if name not in SMALL]
 ENCODERS = [name for name in FULL if "+" not in name]
 UNIQUE = [*ENCODERS, "zhuang-intersection-ln+gpt", "zhuang+mamba", "resnet18+gpt", "s4+mamba"]
-SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
 # conv6 first answers at step 5 and reaches the output three steps later.
 LONG_ENOUGH = 10
-
-
-def _sweep(batch, steps):
-    return torch.randn(batch, steps, 30, 5, 7) * SCALE
 
 
 def _keeps_the_contract(model, x):
@@ -44,23 +40,23 @@ def _keeps_the_contract(model, x):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_small_model_keeps_the_contract(name):
-    _keeps_the_contract(load_model(name), _sweep(2, 6))
+    _keeps_the_contract(load_model(name), random_sweeps(2, 6))
 
 
 @pytest.mark.parametrize("name", UNIQUE)
 def test_a_full_model_keeps_the_contract(name):
-    _keeps_the_contract(load_model(name), _sweep(1, 3))
+    _keeps_the_contract(load_model(name), random_sweeps(1, 3))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FULL)
 def test_a_full_model_keeps_the_contract_over_a_whole_sweep(name):
-    _keeps_the_contract(load_model(name), _sweep(2, 22))
+    _keeps_the_contract(load_model(name), random_sweeps(2, 22))
 
 
 def _gradients_arrive(model):
     model.train()
-    model(_sweep(3, LONG_ENOUGH)).square().sum().backward()
+    model(random_sweeps(3, LONG_ENOUGH)).square().sum().backward()
     silent = [name for name, value in model.named_parameters() if value.grad is None or not value.grad.any()]
     assert silent == []
     assert all(torch.isfinite(value.grad).all() for value in model.parameters())
@@ -88,7 +84,7 @@ def _survives_saving(name, folder):
     model = load_model(name, seed=1)
     save_file(model.state_dict(), folder / "model.safetensors")
     loaded = load_model(f"{name}.supervised", seed=2, pretrained=folder / "model.safetensors")
-    x = _sweep(1, 4)
+    x = random_sweeps(1, 4)
     with torch.no_grad():
         assert torch.equal(loaded(x), model(x))
 
@@ -108,7 +104,7 @@ def test_weights_of_a_full_model_survive_saving(name, tmp_path):
 def test_different_stimuli_stay_different_in_every_layer(name):
     # An untrained network is a baseline only if it does not wash its stimuli out.
     with torch.no_grad():
-        activations = load_model(name).activations(_sweep(4, 12))
+        activations = load_model(name).activations(random_sweeps(4, 12))
     for layer, values in activations.items():
         flat = values.flatten(1)
         spread, size = flat.std(0).pow(2).mean().sqrt(), flat.pow(2).mean().sqrt()
@@ -117,7 +113,7 @@ def test_different_stimuli_stay_different_in_every_layer(name):
 
 def _agrees_in_half_precision(name, steps):
     """Under autocast the answers stay within a few per cent: bfloat16 keeps 8 bits."""
-    model, x = load_model(name), _sweep(2, steps)
+    model, x = load_model(name), random_sweeps(2, steps)
     with torch.no_grad():
         exact = model(x)
         with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -139,7 +135,7 @@ def test_half_precision_agrees_at_full_size_over_a_whole_sweep(name):
 
 @pytest.mark.parametrize("name", ["zhuang-intersection-ln-small", "resnet18-small", "s4-small", "zhuang-small+mamba"])
 def test_a_model_can_be_copied_and_keeps_its_answer(name):
-    model, x = load_model(name), _sweep(1, 4)
+    model, x = load_model(name), random_sweeps(1, 4)
     with torch.no_grad():
         assert torch.equal(copy.deepcopy(model)(x), model(x))
 
@@ -148,7 +144,7 @@ def test_classes_decoder_and_unrolling_can_be_chosen():
     model = load_model("zhuang-ugrnn-small", classes=24, decoder="mlp", unroll="full")
     assert model.spec.outputs == 24
     assert model.spec.latency == 0
-    x = _sweep(2, 3)
+    x = random_sweeps(2, 3)
     with torch.no_grad():
         y, state = model(x), model.init_state(2)
         for t in range(3):
@@ -160,7 +156,7 @@ def test_the_all_steps_decoder_streams_and_states_its_length():
     model = load_model("resnet18-small", decoder="all-steps", classes=5)
     assert model.spec.max_steps == 22
     assert model.spec.receptive_field is None
-    x = _sweep(2, 4)
+    x = random_sweeps(2, 4)
     with torch.no_grad():
         activations, state = model.activations(x), model.init_state(2)
         for t in range(4):
@@ -172,7 +168,7 @@ def test_the_all_steps_decoder_streams_and_states_its_length():
 def test_the_feedforward_control_sees_eight_steps_and_three_of_them_late():
     model = load_model("zhuang-feedforward-small")
     assert (model.spec.receptive_field, model.spec.latency) == (8, 3)
-    x = _sweep(1, 12)
+    x = random_sweeps(1, 12)
     x.requires_grad_()
     model(x).sum().backward()
     seen = x.grad.flatten(2).abs().sum(2)[0] > 0

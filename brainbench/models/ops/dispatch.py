@@ -6,6 +6,7 @@ computed by               where                                               in
 deferred gradients        a pass with gradients that :func:`deferring` wraps  :mod:`.convolution`, :mod:`.gates`
 fused kernels             bfloat16 on CUDA with Triton, no gradients          :mod:`.convolution`, :mod:`.gates`
 packed weights            one stimulus on the CPU, after :mod:`.packing`      :class:`.layers.PackedMatrix`
+one matrix product        one stimulus on the CPU, many weights, no gradients  :class:`.layers.Conv2d`
 scan of ``mamba_ssm``     CUDA, where the package is installed                :mod:`brainbench.models.attenders.mamba`
 PyTorch                   everything else                                     :class:`.layers.Conv2d`
 ========================  ==================================================  ==========================================
