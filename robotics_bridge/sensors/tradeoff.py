@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -53,21 +53,14 @@ def measure_tradeoff(path: Path | None = None, *, progress: Progress | None = No
     Returns:
         One row per setting: ``part``, what was set, ``error`` and ``cost``.
     """
-    jobs: list[tuple[str, Any]] = []
-    jobs += [("mesh", ("sdf", n)) for n in RESOLUTIONS]
-    jobs += [("mesh", ("raycast", None)), ("primitive", ("sdf", None))]
-    jobs += [("points", n) for n in POINTS]
-    jobs += [("taxels", n) for n in TAXELS]
+    jobs = [partial(_mesh_point, "mesh", "sdf", n) for n in RESOLUTIONS]
+    jobs += [partial(_mesh_point, "mesh", "raycast", None), partial(_mesh_point, "primitive", "sdf", None)]
+    jobs += [partial(_points_point, n) for n in POINTS] + [partial(_taxels_point, n) for n in TAXELS]
     rows = []
-    for done, (part, setting) in enumerate(jobs):
-        if part in ("mesh", "primitive"):
-            rows.append(_mesh_point(part, *setting))
-        elif part == "points":
-            rows.append(_points_point(setting))
-        else:
-            rows.append(_taxels_point(setting))
+    for done, job in enumerate(jobs, start=1):
+        rows.append(job())
         if progress:
-            progress(done + 1, len(jobs), "settings")
+            progress(done, len(jobs), "settings")
     if path is not None:
         about = {
             "error": "relative RMS of forces against double precision",
