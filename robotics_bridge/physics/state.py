@@ -1,6 +1,7 @@
 """The one state that engines fill and sensors read: batched link poses, velocities and contact pairs.
 
-Letters: B environment, L link, C contact. Metres, seconds, newtons, world axes; quaternions here are (x, y, z, w).
+Letters: B environment, L link, C contact. Metres, seconds, newtons, world axes. Poses are Warp's own transforms,
+whose quaternions are (x, y, z, w): views of them copy nothing.
 """
 
 from __future__ import annotations

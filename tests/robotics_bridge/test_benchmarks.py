@@ -38,7 +38,12 @@ print(device.is_cuda, x.numpy().sum())
 def test_kernels_are_compiled_for_a_gpu_that_is_not_there(tmp_path: Path) -> None:
     script, archive = tmp_path / "program.py", tmp_path / "kernels.tar.xz"
     script.write_text(PROGRAM)
-    command = [sys.executable, str(ROOT / "benchmarks" / "precompile.py"), "--folder", str(tmp_path / "kept")]
+    command = [
+        sys.executable,
+        str(ROOT / "benchmarks" / "whiskers" / "precompile.py"),
+        "--folder",
+        str(tmp_path / "kept"),
+    ]
 
     def run(*more: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run([*command, *more, str(script)], capture_output=True, text=True, check=True, cwd=ROOT)

