@@ -99,7 +99,7 @@ def _run(solid: Geometry, sensor: Sensor, places: NDArray, resolution: int = 64)
     suite = SensorSuite(scene, {"s": sensor}, num_envs=count, resolution=resolution)
     state = HandState.empty(count, 3, count)
     pose = np.zeros((count, 3, 7))
-    pose[..., 6] = 1
+    pose[..., 3] = 1
     pose[:, 2, :3] = places
     state.set_pose(pose)
     state.set_contacts(np.arange(count), [(0, 1)] * count)

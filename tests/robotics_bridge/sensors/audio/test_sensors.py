@@ -209,7 +209,7 @@ def test_sources_add_up_and_the_power_of_distance_is_chosen():
     sensors = {name: ContactAudio(link=name, modes=MODES, samples=K) for name in ("box", "ball")}
     suite, state = SensorSuite(_scene(), sensors, num_envs=1), HandState.empty(1, 3, 4)
     pose = np.zeros((3, 7))
-    pose[:, 6] = 1
+    pose[:, 3] = 1
     pose[1, 0], pose[2, 0] = 1.0, -1.0
     state.set_pose(pose)
     both = Microphone(power=2.0).build(suite)

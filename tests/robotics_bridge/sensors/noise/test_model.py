@@ -373,7 +373,7 @@ def test_noise_in_the_sensors_kernel_and_in_stages_measures_alike():
         state = HandState.empty(3, 2, 3)
         state.set_contacts([0, 1, 2], [[0, 1]] * 3)
         pose = np.zeros((3, 2, 7))
-        pose[..., 6] = 1
+        pose[..., 3] = 1
         pose[:, 1, 2] = [0.018, 0.019, 0.0195]
         state.set_pose(pose)
         for step in range(6):
