@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.sensors.context import Clock, LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.context import UpdateClock, LaunchContext, ReadoutSlice
 from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
 from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage, gaussian_weights, simulate
 
@@ -218,7 +218,7 @@ def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | No
     from brainbench.core.devices import pick_device, warp
 
     wp = warp()
-    clock = Clock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
+    clock = UpdateClock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
     context = LaunchContext(envs, pick_device("cpu"), 0, clock)
     arrays = NoiseArrays([ReadoutSlice("sensor", noise, 0, (probes,), active=active)], 1, context)
     x, out = (wp.zeros((1, envs, probes), dtype=wp.float32, device="cpu") for _ in range(2))
