@@ -12,7 +12,7 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.state import DIVERGED, HandState
-from robotics_bridge.sensors.context import UpdateClock, ReadoutSlice, SuiteContext
+from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
 from robotics_bridge.sensors.sensor import QueryRequirements, Sensor
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
-from robotics_bridge.sensors.context import UpdateClock, LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
 from robotics_bridge.sensors.noise.model import Noise, stream_seed
 

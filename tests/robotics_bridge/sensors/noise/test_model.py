@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.sensors.context import UpdateClock, LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
 from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage, gaussian_weights, simulate
 
