@@ -37,14 +37,9 @@ def test_whole_pixels_leave_a_dilation_that_no_smooth_field_foresees(reference: 
     assert gel.smooth_bound(x, dilate) > 0.5
     assert 0.25 < gel.floor(dilate) < 0.27
     assert 0.11 < gel.floor(sheared) < 0.12
-    assert (
-        gel.relative(gel.MODELS["dilate"](gel.fit(gel.MODELS["dilate"], x, dilate, gel.STARTS["dilate"]), x), dilate)
-        < 0.48
-    )
-    assert (
-        gel.relative(gel.MODELS["shear"](gel.fit(gel.MODELS["shear"], x, sheared, gel.STARTS["shear"]), x), sheared)
-        <= 0.174
-    )
+    for (name, bound), real in zip({"dilate": 0.48, "shear": 0.174}.items(), (dilate, sheared), strict=True):
+        model = gel.MODELS[name]
+        assert gel.relative(model(gel.fit(model, x, real, gel.STARTS[name]), x), real) <= bound
 
 
 def test_spots_are_found_to_a_twentieth_of_a_pixel(gel: ModuleType) -> None:
