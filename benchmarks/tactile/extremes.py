@@ -49,7 +49,7 @@ def read(
     scene = TouchScene(("world", "hand", *(solid.link for solid in solids)), (PAD, *solids))
     suite = SensorSuite(scene, sensors, num_envs=len(at), device=device)
     pose = np.zeros((len(at), len(scene.links), 7))
-    pose[..., 6] = 1
+    pose[..., 3] = 1
     pose[:, 2:, :3] = at
     state = HandState.empty(len(at), len(scene.links), max(at.shape[0] * len(solids), 1), device)
     state.set_pose(pose)

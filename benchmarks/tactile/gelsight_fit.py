@@ -105,7 +105,7 @@ class Pad:
         suite = SensorSuite(self.scene, {"pad": sensor}, num_envs=1)
         state = HandState.empty(1, 3, 1)
         for x, y, depth in way:
-            pose = np.tile([0, 0, 0, 0, 0, 0, 1.0], (3, 1))
+            pose = np.tile([0, 0, 0, 1.0, 0, 0, 0], (3, 1))
             pose[2, :3] = x, y, BALL - depth
             state.set_pose(pose)
             state.set_contacts([0], [(0, 1)])

@@ -96,7 +96,7 @@ def snapshot(state: HandState) -> dict[str, np.ndarray]:
     env = state.contact_env.numpy()[:count]
     order = np.argsort(env, kind="stable")
     kept = {name: getattr(state, f"contact_{name}").numpy()[:count][order] for name in CONTACT}
-    return {"pose": state.pose.numpy(), "velocity": state.velocity.numpy(), "env": env[order], **kept}
+    return {"pose": state.get_pose().cpu().numpy(), "velocity": state.velocity.numpy(), "env": env[order], **kept}
 
 
 def restore(found: State, envs: int, device: str, target: HandState | None = None) -> HandState:

@@ -8,6 +8,7 @@ import numpy as np
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import to_matrices
 from robotics_bridge.hands.hand import Hand, palmar_directions
 
 if TYPE_CHECKING:
@@ -48,23 +49,16 @@ def holding_spec(
     mujoco = mujoco_module()
     if not (radius > 0 and mass > 0):
         raise UsageError(f"A ball has a positive radius (m) and mass (kg); received {radius!r} and {mass!r}.")
-    facing = palmar_directions(hand.model, hand.palm, hand.fingers)
-    if hand.palm not in facing:
-        raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")
-    up = facing[hand.palm]
-    pad = hand.layout("low", "palm").get(hand.palm)
-    surface = pad.position[pad.active].mean(axis=0) if pad is not None else np.zeros(3)
+    up, surface, step = palm_surface(hand)
     # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
-    surface = surface + reach * _towards_fingers(hand, surface, up)
+    surface = surface + reach * step
     spec = hand.mjspec()
     spec.option.timestep = timestep
     if not hand.model.nu:
         _add_servos(spec)
     palm = spec.body(hand.palm)
     turn = _onto_z(up)
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, turn)
-    palm.quat, palm.pos = turn, -matrix.reshape(3, 3) @ surface
+    palm.quat, palm.pos = turn, -to_matrices(turn) @ surface
     ball = spec.worldbody.add_body(name=OBJECT, pos=(0.0, 0.0, radius + 1e-3))
     ball.add_freejoint()
     ball.add_geom(
@@ -111,19 +105,29 @@ def _add_servos(spec: Any) -> None:
             )  # fmt: skip
 
 
-def _towards_fingers(hand: Hand, surface: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the step [3] (m, palm frame) along the palm from a point to the mean root of the fingers."""
+def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return where the palm is: its outward direction [3], the middle of its pad [3] and a step [3] (m, palm frame).
+
+    The step leads along the palm from the pad to the mean root of the fingers.
+
+    Raises:
+        UsageError: the joints do not tell which side the palm is.
+    """
     mujoco = mujoco_module()
+    facing = palmar_directions(hand.model, hand.palm, hand.fingers)
+    if hand.palm not in facing:
+        raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")
+    up = facing[hand.palm]
+    pad = hand.layout("low", "palm").get(hand.palm)
+    surface = pad.position[pad.active].mean(axis=0) if pad is not None else np.zeros(3)
     data = mujoco.MjData(hand.model)
     mujoco.mj_kinematics(hand.model, data)
     palm = hand.model.body(hand.palm).id
-    turn, place = data.xmat[palm].reshape(3, 3), data.xpos[palm]
     roots = np.array([data.xpos[hand.model.body(chain[0]).id] for chain in hand.fingers.values()])
-    local = (roots - place) @ turn
     # The thumb's root lies apart from the others.
-    middle = np.median(local, axis=0)
+    middle = np.median((roots - data.xpos[palm]) @ data.xmat[palm].reshape(3, 3), axis=0)
     step = middle - surface
-    return step - up * (step @ up)
+    return up, surface, step - up * (step @ up)
 
 
 def _onto_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.probes.placement import Probes
 
 if TYPE_CHECKING:
@@ -20,14 +21,12 @@ def link_points(model: Any, body: int) -> NDArray[np.float64]:
     points = []
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for geom in geoms_of(model, body):
-        matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
         local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
         if int(model.geom_type[geom]) == mujoco.mjtGeom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[geom])
             first = int(model.mesh_vertadr[mesh])
             local = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-        points.append(local @ matrix.reshape(3, 3).T + model.geom_pos[geom])
+        points.append(local @ to_matrices(model.geom_quat[geom]).T + model.geom_pos[geom])
     return np.concatenate(points) if points else np.zeros((0, 3))
 
 
@@ -68,10 +67,8 @@ def cast_grid(
         raise UsageError(f"Link {link!r} has no geometry, so no probe can lie on it.")
     up = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
     u, v = _plane(up, corners, along)
-    low, high = (
-        (corners @ np.stack([u, v, up], axis=1)).min(axis=0),
-        (corners @ np.stack([u, v, up], axis=1)).max(axis=0),
-    )
+    seen = corners @ np.stack([u, v, up], axis=1)
+    low, high = seen.min(axis=0), seen.max(axis=0)
     middle, half = (low + high) / 2, (high - low) / 2 * extent
     x = middle[0] + (np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)) * half[0]
     y = middle[1] + (np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)) * half[1]
@@ -107,8 +104,7 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
     data = mujoco.MjData(model)
     best: tuple[float, NDArray] | None = None
     for geom in geoms:
-        matrix, normal = np.zeros(9), np.zeros(3)
-        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+        matrix, normal = to_matrices(model.geom_quat[geom]).ravel(), np.zeros(3)
         kind = int(model.geom_type[geom])
         if kind == mujoco.mjtGeom.mjGEOM_MESH:
             data.geom_xpos[geom], data.geom_xmat[geom] = model.geom_pos[geom], matrix

@@ -5,6 +5,7 @@ Letters: G geometry, L link. Lengths in metres; quaternions here are (w, x, y, z
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -135,11 +136,10 @@ class TouchScene:
     """By geometry number: its shapes where environments differ."""
 
     def __post_init__(self) -> None:
-        for what, names in (("link", self.links), ("geometry", tuple(g.name for g in self.geometries))):
-            repeated = [name for name in names if name and names.count(name) > 1] if len(names) < 512 else []
-            if repeated or (not repeated and len({n for n in names if n}) != len([n for n in names if n])):
-                culprit = repeated[0] if repeated else next(n for n in names if n and names.count(n) > 1)
-                raise UsageError(f"The scene has two of the {what} {culprit!r}; names must differ.")
+        for what, names in (("link", self.links), ("geometry", [g.name for g in self.geometries])):
+            repeated = [name for name, count in Counter(names).items() if name and count > 1]
+            if repeated:
+                raise UsageError(f"The scene has two of the {what} {repeated[0]!r}; names must differ.")
         for geometry in self.geometries:
             if geometry.link not in self._links:
                 raise unknown_name(
@@ -270,12 +270,7 @@ def _mesh(model: Any, index: int) -> Mesh:
 
 
 def _differs(first: Geometry, second: Geometry) -> bool:
-    same = (first.kind, first.size, first.position, first.quaternion) == (
-        second.kind,
-        second.size,
-        second.position,
-        second.quaternion,
-    )
+    same = all(getattr(first, name) == getattr(second, name) for name in ("kind", "size", "position", "quaternion"))
     if same and first.mesh is not None and second.mesh is not None:
         same = first.mesh.content_hash == second.mesh.content_hash
     return not same

@@ -1,6 +1,7 @@
 """The one state that engines fill and sensors read: batched link poses, velocities and contact pairs.
 
-Letters: B environment, L link, C contact. Metres, seconds, newtons, world axes; quaternions here are (x, y, z, w).
+Letters: B environment, L link, C contact. Metres, seconds, newtons, world axes. Poses are Warp's own transforms,
+whose quaternions are (x, y, z, w): views of them copy nothing.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ class HandState:
 
     @property
     def pose_torch(self) -> torch.Tensor:
-        """World poses [B, L, 7] (x, y, z, qx, qy, qz, qw), a view of the same memory."""
+        """World poses [B, L, 7] as Warp stores them (x, y, z, qx, qy, qz, qw), a view of the same memory."""
         return warp().to_torch(self.pose)
 
     @property
@@ -139,8 +140,12 @@ class HandState:
         return warp().to_torch(self.status)
 
     def set_pose(self, pose: ArrayLike | torch.Tensor) -> None:
-        """Write poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qx, qy, qz, qw)."""
-        self._write(self.pose_torch, pose, "poses")
+        """Write world poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qw, qx, qy, qz)."""
+        self._write(self.pose_torch, pose, "poses", order=(0, 1, 2, 4, 5, 6, 3))
+
+    def get_pose(self) -> torch.Tensor:
+        """Return the world poses [B, L, 7] as (x, y, z, qw, qx, qy, qz), a copy."""
+        return self.pose_torch[..., [0, 1, 2, 6, 3, 4, 5]]
 
     def set_velocity(self, velocity: ArrayLike | torch.Tensor) -> None:
         """Write velocities [B, L, 6] (or one [L, 6] for all) as (linear of the origin, angular)."""
@@ -187,12 +192,13 @@ class HandState:
         """Return a state that uses an engine's own arrays for some of the buffers."""
         return replace(self, **buffers)
 
-    def _write(self, view: torch.Tensor, values: Any, what: str) -> None:
+    def _write(self, view: torch.Tensor, values: Any, what: str, order: tuple[int, ...] | None = None) -> None:
         shape = tuple(view.shape)
-        given = tuple(np.shape(values))
+        values = values if hasattr(values, "shape") else np.asarray(values)
+        given = tuple(values.shape)
         if given not in (shape, shape[1:]):
             raise UsageError(f"The {what} of this state have the shape {shape}; received {given}.")
-        _copy(view, values)
+        _copy(view, values if order is None else values[..., list(order)])
 
 
 def _copy(view: torch.Tensor, values: Any) -> None:

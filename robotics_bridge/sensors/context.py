@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class Clock:
+class UpdateClock:
     """Counters of updates and episodes on the device."""
 
     age: Any
@@ -43,7 +43,7 @@ class LaunchContext:
     device: Any
     """Warp device."""
     seed: int
-    clock: Clock
+    clock: UpdateClock
 
     def array(self, values: Any, dtype: Any) -> Any:
         """Copy values to the device as a Warp array."""

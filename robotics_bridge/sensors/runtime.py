@@ -108,7 +108,7 @@ class ReadoutRuntime(Runtime):
             return context.zeros(shape if wanted else (1, 1, 1))
 
         arrays = NoiseArrays(list(self.slices.values()), channels, context)
-        self.part, self.probe, self.knobs = arrays.part, arrays.probe, arrays.params
+        self.part, self.probe = arrays.part, arrays.probe
         self._truth = planes(True)
         self._measured = planes(True) if self.noisy else self._truth
         self._stage = NoiseStage(arrays) if staged else None
@@ -117,7 +117,7 @@ class ReadoutRuntime(Runtime):
         io.truth, io.measured = self._truth, self._measured
         io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
         io.age, io.episode = context.clock.age, context.clock.episode
-        io.env_offset = context.clock.env_offset
+        io.knobs, io.env_offset = arrays.params, context.clock.env_offset
         self.io = io
         self._channels = channels
 

@@ -12,7 +12,7 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.state import DIVERGED, HandState
-from robotics_bridge.sensors.context import Clock, ReadoutSlice, SuiteContext
+from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
 from robotics_bridge.sensors.sensor import QueryRequirements, Sensor
 
@@ -100,7 +100,7 @@ class SensorSuite:
             required |= sensor.requirements(scene)
         with wp.ScopedDevice(self.device):
             age = wp.full(num_envs, -1, dtype=wp.int32, device=self.device)
-            self.clock = Clock(age, wp.zeros(num_envs, dtype=wp.int32, device=self.device), env_offset)
+            self.clock = UpdateClock(age, wp.zeros(num_envs, dtype=wp.int32, device=self.device), env_offset)
             self.solids = Solids(scene, num_envs, self.device, required, resolution=resolution)
             self.pairs = PairTable(self.solids, num_envs, self.device)
             self.context = context = SuiteContext(

@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -53,21 +53,14 @@ def measure_tradeoff(path: Path | None = None, *, progress: Progress | None = No
     Returns:
         One row per setting: ``part``, what was set, ``error`` and ``cost``.
     """
-    jobs: list[tuple[str, Any]] = []
-    jobs += [("mesh", ("sdf", n)) for n in RESOLUTIONS]
-    jobs += [("mesh", ("raycast", None)), ("primitive", ("sdf", None))]
-    jobs += [("points", n) for n in POINTS]
-    jobs += [("taxels", n) for n in TAXELS]
+    jobs = [partial(_mesh_point, "mesh", "sdf", n) for n in RESOLUTIONS]
+    jobs += [partial(_mesh_point, "mesh", "raycast", None), partial(_mesh_point, "primitive", "sdf", None)]
+    jobs += [partial(_points_point, n) for n in POINTS] + [partial(_taxels_point, n) for n in TAXELS]
     rows = []
-    for done, (part, setting) in enumerate(jobs):
-        if part in ("mesh", "primitive"):
-            rows.append(_mesh_point(part, *setting))
-        elif part == "points":
-            rows.append(_points_point(setting))
-        else:
-            rows.append(_taxels_point(setting))
+    for done, job in enumerate(jobs, start=1):
+        rows.append(job())
         if progress:
-            progress(done + 1, len(jobs), "settings")
+            progress(done, len(jobs), "settings")
     if path is not None:
         about = {
             "error": "relative RMS of forces against double precision",
@@ -106,7 +99,7 @@ def _run(solid: Geometry, sensor: Sensor, places: NDArray, resolution: int = 64)
     suite = SensorSuite(scene, {"s": sensor}, num_envs=count, resolution=resolution)
     state = HandState.empty(count, 3, count)
     pose = np.zeros((count, 3, 7))
-    pose[..., 6] = 1
+    pose[..., 3] = 1
     pose[:, 2, :3] = places
     state.set_pose(pose)
     state.set_contacts(np.arange(count), [(0, 1)] * count)

@@ -10,7 +10,7 @@ import numpy as np
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
-from robotics_bridge.hands.hand import Hand, palmar_directions
+from robotics_bridge.hands.hand import Hand
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 
 if TYPE_CHECKING:
@@ -223,16 +223,10 @@ def palm_up(hand: Hand) -> Pose:
     Raises:
         UsageError: the joints do not tell which side the palm is.
     """
-    from robotics_bridge.hands.scenes import _towards_fingers
+    from robotics_bridge.hands.scenes import palm_surface
 
     mujoco = mujoco_module()
-    facing = palmar_directions(hand.model, hand.palm, hand.fingers)
-    if hand.palm not in facing:
-        raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")
-    up = facing[hand.palm]
-    pad = hand.layout("low", "palm").get(hand.palm)
-    surface = pad.position[pad.active].mean(axis=0) if pad is not None else np.zeros(3)
-    step = _towards_fingers(hand, surface, up)
+    up, surface, step = palm_surface(hand)
     forward = step / np.linalg.norm(step)
     # Columns: where the palm's own directions (forward, up × forward, up) go in the world.
     own = np.stack([forward, np.cross(up, forward), up], axis=1)

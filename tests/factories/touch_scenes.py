@@ -19,8 +19,13 @@ def pad_scene(*objects: Geometry, pad: Geometry = PAD) -> TouchScene:
 
 
 def random_pose(rng: np.random.Generator, reach: float = 0.05) -> np.ndarray:
-    """A pose [7] (x, y, z, qx, qy, qz, qw)."""
-    return np.concatenate([rng.uniform(-reach, reach, 3), Rotation.random(rng=rng).as_quat()])
+    """A pose [7] (x, y, z, qw, qx, qy, qz)."""
+    return np.concatenate([rng.uniform(-reach, reach, 3), np.roll(Rotation.random(rng=rng).as_quat(), 1)])
+
+
+def rotation_of(quaternions: np.ndarray) -> Rotation:
+    """The turns of quaternions [..., 4] (w, x, y, z)."""
+    return Rotation.from_quat(np.roll(quaternions, -1, axis=-1))
 
 
 def state_of(
@@ -42,7 +47,7 @@ def state_of(
 def poses_at(links: int, positions: dict[int, Sequence[float]], envs: int = 1) -> np.ndarray:
     """Poses [B, L, 7] with every link upright at the origin, but for those named."""
     poses = np.zeros((envs, links, 7))
-    poses[..., 6] = 1
+    poses[..., 3] = 1
     for link, position in positions.items():
         poses[:, link, :3] = position
     return poses
@@ -50,11 +55,11 @@ def poses_at(links: int, positions: dict[int, Sequence[float]], envs: int = 1) -
 
 def move_all(poses: np.ndarray, velocities: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Move whole environments by one rigid motion [7]."""
-    turn = Rotation.from_quat(motion[3:])
+    turn = rotation_of(motion[3:])
     shape = poses.shape[:-1]
     flat = poses.reshape(-1, 7)
     moved = np.concatenate(
-        [turn.apply(flat[:, :3]) + motion[:3], (turn * Rotation.from_quat(flat[:, 3:])).as_quat()], 1
+        [turn.apply(flat[:, :3]) + motion[:3], np.roll((turn * rotation_of(flat[:, 3:])).as_quat(), 1, axis=1)], 1
     )
     v = velocities.reshape(-1, 6)
     spun = np.concatenate([turn.apply(v[:, :3]), turn.apply(v[:, 3:])], 1)

@@ -22,7 +22,7 @@ def _ball(device: str, sensors: dict[str, Any], *, depth: float = 2e-3, steps: i
     suite = SensorSuite(TouchScene(("pad", "ball"), shapes), sensors, num_envs=1, device=device)
     state = HandState.empty(1, 2, 4, device)
     pose = np.zeros((2, 7))
-    pose[:, 6] = 1
+    pose[:, 3] = 1
     pose[1, 2] = 0.02 - depth
     state.set_pose(pose)
     state.set_contacts(

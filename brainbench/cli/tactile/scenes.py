@@ -152,9 +152,9 @@ def markers(path: Path, *, noisy: bool) -> dict[str, float]:
         for share in np.linspace(0, 1, 21):
             pressed, moved = min(2 * share, 1.0), max(2 * share - 1, 0.0)
             pose = np.zeros((2, 7))
-            pose[:, 6] = 1
+            pose[:, 3] = 1
             pose[1, :3] = moved * shift, 0, 0.006 - 0.0008 * pressed
-            pose[1, 5:] = np.sin(moved * twist / 2), np.cos(moved * twist / 2)
+            pose[1, [3, 6]] = np.cos(moved * twist / 2), np.sin(moved * twist / 2)
             state.set_pose(pose)
             suite.update(state, 0.01)
         fields[name] = suite.read("pad")[0].reshape(-1, 3).numpy().copy()

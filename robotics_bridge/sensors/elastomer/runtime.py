@@ -110,7 +110,7 @@ class ElastomerRuntime(ProbeRuntime):
         self.begin(state, dt)
         solids, pairs = c.solids.struct, c.pairs.struct
         indent = indent_kernel(self.kinds, self._raycast, self._planes, self._in_turn)
-        self.launch(indent, self.probes, solids, pairs, self.io, self.knobs, pads)
+        self.launch(indent, self.probes, solids, pairs, self.io, pads)
         if self._way == "separable":
             self.launch(spread_kernel(self._planes, self._in_turn), self.probes, self.io, pads)
         elif self._way == "fft":
@@ -123,7 +123,7 @@ class ElastomerRuntime(ProbeRuntime):
             c.launch(sum_shear, c.num_envs, self.probes, self.io, pads, pairs, self.points)
         way = ("direct", "separable", "fft").index(self._way)
         kernel = marker_kernel(way, self._layered, self._planes, self.mode, *self.stores, self._in_turn, self.apart)
-        self.launch(kernel, self.probes, self.io, self.knobs, pads, pairs, self.points)
+        self.launch(kernel, self.probes, self.io, pads, pairs, self.points)
         self.finish(dt)
 
     def launch(self, kernel: Any, *inputs: Any) -> None:

@@ -23,25 +23,46 @@ CLEAN, FUSED, STAGED = range(3)
 
 @wp.struct
 class ProbeArrays:
+    """Probes of a group, sensor by sensor, in the frame of their links."""
+
     position: wp.array(dtype=wp.vec3f)
+    """[N] (m)."""
     normal: wp.array(dtype=wp.vec3f)
+    """[N] unit, out of the sensing surface."""
     radius: wp.array(dtype=wp.float32)
+    """[N] sensing radius (m); 0 for fillers."""
     slot: wp.array(dtype=wp.int32)
+    """[N] slot of the pair lists."""
     part: wp.array(dtype=wp.int32)
+    """[N] number of the sensor."""
     probe: wp.array(dtype=wp.int32)
+    """[N] number within the sensor."""
 
 
 @wp.struct
 class ReadoutArrays:
+    """Readings of a group, their noise and the clock of its environments."""
+
     truth: wp.array3d(dtype=wp.float32)
+    """[C, B, N] unit of the sensor."""
     measured: wp.array3d(dtype=wp.float32)
+    """[C, B, N]; the same array as ``truth`` where there is no noise."""
     hysteresis: wp.array3d(dtype=wp.float32)
+    """[C, B, N] memory of the hysteresis, if it is stored."""
     walk: wp.array3d(dtype=wp.float32)
+    """[C, B, N] drift, if it is stored."""
     age: wp.array(dtype=wp.int32)
+    """[B] updates since the reset, 0 at the first."""
     episode: wp.array(dtype=wp.int32)
+    """[B] resets so far."""
     status: wp.array(dtype=wp.int32)
+    """[B] bits of the hand state; 1 is diverged."""
+    knobs: wp.array(dtype=NoiseParams)
+    """[S] noise of each sensor."""
     env_offset: wp.int32
+    """Number of environment 0 in the whole experiment."""
     dt: wp.float32
+    """Time step (s)."""
 
 
 @wp.func

@@ -14,7 +14,7 @@ import numpy as np
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
-from robotics_bridge.sensors.context import Clock, LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
 from robotics_bridge.sensors.noise.model import Noise, stream_seed
 
@@ -206,7 +206,7 @@ def simulate(
         raise UsageError(f"A recorded signal has axes [time, environment, probe, channel]; received {frames.shape}.")
     _steps, envs, probes, channels = frames.shape
     where = pick_device(device)
-    clock = Clock(*(wp.zeros(envs, dtype=int, device=where) for _ in range(2)), env_offset=env_offset)
+    clock = UpdateClock(*(wp.zeros(envs, dtype=int, device=where) for _ in range(2)), env_offset=env_offset)
     slices = [ReadoutSlice(name, replace(noise, radius=0.0), 0, layout or (probes,))]
     arrays = NoiseArrays(slices, channels, LaunchContext(envs, where, seed, clock))
     stage, line = NoiseStage(arrays, gained=False), DelayLine(arrays) if noise.read_delay else None

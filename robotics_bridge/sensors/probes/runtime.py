@@ -34,7 +34,7 @@ class DistanceRuntime(ProbeRuntime):
         """Read the state."""
         self.begin(state, dt)
         c = self.context
-        inputs = [self.probes, c.solids.struct, c.pairs.struct, self.io, self.knobs]
+        inputs = [self.probes, c.solids.struct, c.pairs.struct, self.io]
         self.launch(self._kernel, *inputs, self._limits, self.points)
         self.finish(dt)
 
@@ -64,5 +64,5 @@ class DepthRuntime(ProbeRuntime):
         """Read the state."""
         self.begin(state, dt)
         c = self.context
-        self.launch(self._kernel, self.probes, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._limits)
+        self.launch(self._kernel, self.probes, c.solids.struct, c.pairs.struct, self.io, self._limits)
         self.finish(dt)

@@ -53,7 +53,7 @@ class KinematicRuntime(ProbeRuntime):
         """Read the state."""
         self.begin(state, dt)
         c = self.context
-        inputs = [self.probes, self._rows, c.solids.struct, c.pairs.struct, self.io, self.knobs, self._laws]
+        inputs = [self.probes, self._rows, c.solids.struct, c.pairs.struct, self.io, self._laws]
         c.launch(self._kernel, (c.num_envs, self._rows.shape[0]), *inputs)
         if self._loads is not None:
             self._scale(state)
@@ -100,7 +100,7 @@ class ProximityRuntime(ProbeRuntime):
         self.begin(state, dt)
         kernel, c = proximity_kernel(*self._options, self.gathered), self.context
         dim = c.num_envs if self.gathered else (c.num_envs, self.count)
-        inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self.knobs, self._own, state.arrays]
+        inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self._own, state.arrays]
         c.launch(kernel, dim, *inputs)
         self.finish(dt)
 

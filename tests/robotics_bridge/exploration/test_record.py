@@ -74,9 +74,9 @@ def test_every_procedure_touches_on_both_hands(hand, name) -> None:
 
 
 def test_requests_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(UsageError, match="did you mean 'enclosure'"):
+    with pytest.raises(UsageError, match="'enclosure'"):
         find_procedure("enclosur")
     with pytest.raises(UsageError, match="different labels"):
         record_exploration([_box(), _box()], ["enclosure"])
-    with pytest.raises(UsageError, match="a geometry or a mesh, and not both"):
+    with pytest.raises(UsageError, match="a geometry or a mesh"):
         Explored("nothing")

@@ -216,32 +216,32 @@ def test_quaternions_agree_with_mujoco():
 
 
 def test_unknown_names_and_unusable_files_are_explained(tmp_path):
-    with pytest.raises(UsageError, match=r"did you mean 'xhand1'.*path of a URDF or MJCF"):
+    with pytest.raises(UsageError, match=r"'xhand1'.*URDF or MJCF"):
         hands.load("xhand")
-    with pytest.raises(DataError, match="There is no hand file"):
+    with pytest.raises(DataError, match="no hand file"):
         hands.load(tmp_path / "none.urdf")
     (tmp_path / "broken.xml").write_text("<mujoco><nonsense/></mujoco>")
     with pytest.raises(DataError, match="MuJoCo cannot read"):
         hands.load(tmp_path / "broken.xml")
     (tmp_path / "still.xml").write_text('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>')
-    with pytest.raises(DataError, match="no hand: it has no joints"):
+    with pytest.raises(DataError, match="it has no joints"):
         hands.load(tmp_path / "still.xml")
-    with pytest.raises(UsageError, match="Unknown resolution 'hi'"):
+    with pytest.raises(UsageError, match="resolution 'hi'"):
         hands.load("xhand1").layout("hi")
-    with pytest.raises(UsageError, match="Unknown placement 'tip'; did you mean 'tips'"):
+    with pytest.raises(UsageError, match=r"'tip'; .* 'tips'"):
         hands.load("xhand1").layout("low", "tip")
 
 
 def test_probe_files_of_another_form_or_for_another_hand_are_refused(tmp_path):
     path = tmp_path / "probes.json"
     path.write_text('{"a": 1}')
-    with pytest.raises(DataError, match="is no probe file: a list of links"):
+    with pytest.raises(DataError, match="a list of links"):
         read_probes(path)
     path.write_text('[{"link_name": "a", "probes": [[{"radius": 1}]]}]')
     with pytest.raises(DataError, match="link 1"):
         read_probes(path)
     write_probes(path, hands.load("sharpa").layout("low"))
-    with pytest.raises(UsageError, match="Unknown link 'right_hand_C_MC'"):
+    with pytest.raises(UsageError, match="link 'right_hand_C_MC'"):
         hands.load("xhand1").with_probes(path)
 
 

@@ -62,11 +62,11 @@ def test_a_real_hand_gives_the_same_layout():
 
 
 def test_wrong_names_and_shapes_are_explained():
-    with pytest.raises(UsageError, match="Unknown observation type 'forces'; did you mean 'force'"):
+    with pytest.raises(UsageError, match=r"'forces'; .* 'force'"):
         observe("forces", {}, _layout())
-    with pytest.raises(UsageError, match="Unknown link among the readings 'a'"):
+    with pytest.raises(UsageError, match="among the readings 'a'"):
         observe("depth", {"b": torch.zeros(1, 3)}, _layout())
-    with pytest.raises(UsageError, match="has shape \\(1, 5\\), but the link has 6 probes"):
+    with pytest.raises(UsageError, match=r"\(1, 5\).* 6 probes"):
         observe("depth", {"a": torch.zeros(1, 5), "b": torch.zeros(1, 3)}, _layout())
 
 

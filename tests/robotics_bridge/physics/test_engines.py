@@ -68,11 +68,11 @@ def test_fields_vary_between_environments_and_reset_returns_to_the_start() -> No
 
 def test_unknown_fields_and_wrong_shapes_are_refused() -> None:
     model = mujoco.MjModel.from_xml_string(TWO)
-    with pytest.raises(UsageError, match="did you mean 'body_mass'"):
+    with pytest.raises(UsageError, match="'body_mass'"):
         MujocoEngine(model, 2, fields={"body_mas": np.zeros((2, 3))})
-    with pytest.raises(UsageError, match=r"shape \(2, 3\); received \(3,\)"):
+    with pytest.raises(UsageError, match=r"\(2, 3\); .* \(3,\)"):
         MujocoEngine(model, 2, fields={"body_mass": np.zeros(3)})
-    with pytest.raises(UsageError, match="at least one environment"):
+    with pytest.raises(UsageError, match="one environment"):
         MujocoEngine(model, 0)
     with pytest.raises(UsageError, match="qvel has the shape"):
         MujocoEngine(model, 2).set(qvel=np.zeros(5))
@@ -80,7 +80,7 @@ def test_unknown_fields_and_wrong_shapes_are_refused() -> None:
 
 def test_states_refuse_what_does_not_fit() -> None:
     state = HandState.empty(2, 3, contacts=1)
-    with pytest.raises(UsageError, match="room for 1 contacts; received 2"):
+    with pytest.raises(UsageError, match="1 contacts; received 2"):
         state.set_contacts([0, 1], [[0, 1], [0, 1]])
     with pytest.raises(UsageError, match=r"shape \(2, 3, 7\)"):
         state.set_pose(np.zeros((3, 3, 7)))

@@ -65,10 +65,10 @@ def test_a_reset_forgets_in_its_environment_alone():
 
 
 def test_bands_that_do_not_fit_the_rate_and_unknown_afferents_are_explained():
-    with pytest.raises(UsageError, match="400 Hz needs more than 800 readings per second; received 200"):
+    with pytest.raises(UsageError, match=r"more than 800 .* received 200"):
         AfferentFilter(200.0)
     assert set(AfferentFilter(200.0, ("SA-I", "FA-I")).bands) == {"SA-I", "FA-I"}
-    with pytest.raises(UsageError, match="Unknown afferent 'FA-1'; did you mean 'FA-I'"):
+    with pytest.raises(UsageError, match=r"'FA-1'; .* 'FA-I'"):
         AfferentFilter(2000.0, ("FA-1",))
     with pytest.raises(UsageError, match="lower to a higher"):
         Band(5.0, 5.0)

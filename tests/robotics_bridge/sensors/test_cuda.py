@@ -44,7 +44,7 @@ def test_devices_agree_over_many_updates() -> None:
     for _ in range(6):
         engine.step()
         count = int(engine.state.contact_count.numpy()[0])
-        mirror.set_pose(engine.state.pose.numpy())
+        mirror.set_pose(engine.state.get_pose())
         mirror.set_velocity(engine.state.velocity.numpy())
         mirror.set_contacts(engine.state.contact_env.numpy()[:count], engine.state.contact_geom.numpy()[:count])
         for suite, state in zip(suites, (mirror, engine.state), strict=True):

@@ -266,7 +266,7 @@ def test_mistakes_are_named(make: object, message: str) -> None:
 
 def test_states_and_names_that_do_not_fit_are_refused() -> None:
     suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID)}, envs=2)
-    with pytest.raises(UsageError, match="serves 2 environments with 3 links; the state has 1"):
+    with pytest.raises(UsageError, match=r"2 environments .* has 1"):
         suite.update(state_of(suite.scene, _touching(1)))
     with pytest.raises(UsageError, match="positive time"):
         suite.update(state_of(suite.scene, _touching(2)), dt=0.0)
@@ -276,5 +276,5 @@ def test_states_and_names_that_do_not_fit_are_refused() -> None:
         suite.read_history("depth")
     with pytest.raises(UsageError, match="nearest=True"):
         suite.read_nearest("depth")
-    with pytest.raises(UsageError, match="Environments are 0 to 1"):
+    with pytest.raises(UsageError, match="are 0 to 1"):
         suite.reset([2])

@@ -9,7 +9,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, idle, lost, readout_functions
-from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, episode_draw, radius_noise
+from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.probes.kernels.probe import deepest_function
 from robotics_bridge.sensors.queries.kernels.distance import SolidArrays
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
@@ -129,7 +129,6 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
         solids: SolidArrays,
         pairs: PairArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         pads: ElastomerArrays,
         env: int,
         n: int,
@@ -142,7 +141,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
             best, _normal, _place = deepest(probes, solids, pairs, env, n, 0.0)
             h = wp.max(-best, 0.0)
             if wp.static(planes == 2):
-                error = radius_noise(knobs[part], env + io.env_offset, probes.probe[n], io.age[env], io.episode[env])
+                error = radius_noise(io.knobs[part], env + io.env_offset, probes.probe[n], io.age[env], io.episode[env])
                 noisy = wp.max(error - best, 0.0)
             if h > 0.0 or noisy > 0.0:
                 pads.stamp[env, part] = mark_of(io, env)
@@ -165,15 +164,14 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
         solids: SolidArrays,
         pairs: PairArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         pads: ElastomerArrays,
     ):
         env, n = wp.tid()
         if wp.static(in_turn):
             for m in range(probes.radius.shape[0]):
-                indent_one(probes, solids, pairs, io, knobs, pads, env, m)
+                indent_one(probes, solids, pairs, io, pads, env, m)
         else:
-            indent_one(probes, solids, pairs, io, knobs, pads, env, n)
+            indent_one(probes, solids, pairs, io, pads, env, n)
 
     return indent
 
@@ -294,7 +292,6 @@ def marker_kernel(
     def read_one(
         probes: ProbeArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         pads: ElastomerArrays,
         pairs: PairArrays,
         cloud: CloudArrays,
@@ -420,18 +417,17 @@ def marker_kernel(
             episode = io.episode[env]
             fixed = wp.vec3f(1.0, 0.0, 0.0)
             if wp.static(mode > 0):
-                fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
+                fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
             signal = fixed[0] * (signal + slide)
             all_truth = wp.spatial_vectorf(truth[0], truth[1], truth[2], 0.0, 0.0, 0.0)
             all_signal = wp.spatial_vectorf(signal[0], signal[1], signal[2], 0.0, 0.0, 0.0)
             lag, drift = recall_six(io, env, n, age)
-            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
+            emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
 
     @wp.kernel(module="unique")
     def markers(
         probes: ProbeArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         pads: ElastomerArrays,
         pairs: PairArrays,
         cloud: CloudArrays,
@@ -439,8 +435,8 @@ def marker_kernel(
         env, n = wp.tid()
         if wp.static(in_turn):
             for m in range(probes.radius.shape[0]):
-                read_one(probes, io, knobs, pads, pairs, cloud, env, m)
+                read_one(probes, io, pads, pairs, cloud, env, m)
         else:
-            read_one(probes, io, knobs, pads, pairs, cloud, env, n)
+            read_one(probes, io, pads, pairs, cloud, env, n)
 
     return markers

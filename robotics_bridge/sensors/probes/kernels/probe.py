@@ -80,7 +80,6 @@ def distance_kernel(
         solids: SolidArrays,
         pairs: PairArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         limits: wp.array(dtype=wp.float32),
         points: wp.array3d(dtype=wp.float32),
     ):
@@ -109,8 +108,8 @@ def distance_kernel(
         d = wp.where(place >= 0, wp.min(best, limits[part]), limits[part])
         signal = d
         if wp.static(mode != CLEAN):
-            signal = d + radius_noise(knobs[part], env + io.env_offset, probe, age, episode)
-        emit(io, knobs[part], env, n, probe, 0, age, episode, d, signal)
+            signal = d + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode)
+        emit(io, io.knobs[part], env, n, probe, 0, age, episode, d, signal)
 
     return surface_distance
 
@@ -135,7 +134,6 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
         solids: SolidArrays,
         pairs: PairArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         limits: wp.array(dtype=wp.vec2f),
     ):
         env, n = wp.tid()
@@ -154,15 +152,15 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
         truth = wp.max(radius - best, 0.0)
         signal = truth
         if wp.static(mode != CLEAN):
-            noisy = wp.max(radius + radius_noise(knobs[part], env + io.env_offset, probe, age, episode), 0.0)
-            signal = wp.max(noisy - best, 0.0) * gain(knobs[part], env + io.env_offset, probe, episode)
+            noisy = wp.max(radius + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode), 0.0)
+            signal = wp.max(noisy - best, 0.0) * gain(io.knobs[part], env + io.env_offset, probe, episode)
         if wp.static(binary):
             if wp.static(mode != CLEAN):
-                y = measure(io, knobs[part], env, n, probe, 0, age, episode, signal)
+                y = measure(io, io.knobs[part], env, n, probe, 0, age, episode, signal)
                 io.measured[0, env, n] = latch(io.measured[0, env, n], age, y, limits[part])
             io.truth[0, env, n] = latch(io.truth[0, env, n], age, truth, limits[part])
         else:
-            emit(io, knobs[part], env, n, probe, 0, age, episode, truth, signal)
+            emit(io, io.knobs[part], env, n, probe, 0, age, episode, truth, signal)
 
     return contact_depth
 
@@ -245,7 +243,6 @@ def kinematic_kernel(
         solids: SolidArrays,
         pairs: PairArrays,
         io: ReadoutArrays,
-        all_knobs: wp.array(dtype=NoiseParams),
         laws: wp.array(dtype=KinematicParams),
     ):
         env, at_row = wp.tid()
@@ -271,7 +268,7 @@ def kinematic_kernel(
         age = int(0)
         episode = int(0)
         if wp.static(mode != CLEAN):
-            knobs = all_knobs[part]
+            knobs = io.knobs[part]
             age = io.age[env]
             episode = io.episode[env]
         held = int(-1)

@@ -9,7 +9,7 @@ from typing import Any
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, idle, lost, readout_functions
-from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, episode_draw, radius_noise
+from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
 
 wp = warp()
@@ -110,7 +110,6 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         pairs: PairArrays,
         cloud: CloudArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         own: ProximityArrays,
         state: StateArrays,
         env: int,
@@ -132,7 +131,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             episode = io.episode[env]
             noisy = radius
             if wp.static(mode != CLEAN):
-                noisy = wp.max(radius + radius_noise(knobs[part], env + io.env_offset, probe, age, episode), 0.0)
+                noisy = wp.max(radius + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode), 0.0)
             reach = wp.max(radius, noisy)
             turning = wp.vec3f(0.0)
             mass = wp.vec2f(0.0)
@@ -202,10 +201,10 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             signal = truth
             fixed = wp.vec3f(1.0, 0.0, 0.0)
             if wp.static(mode != CLEAN):
-                fixed = episode_draw(knobs[part], env + io.env_offset, probe, episode)
+                fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
                 signal = fixed[0] * wrench(own.laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
             lag, drift = recall_six(io, env, n, age)
-            emit_six(io, knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
+            emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
 
     @wp.kernel(module="unique")
     def proximity(
@@ -213,12 +212,11 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         pairs: PairArrays,
         cloud: CloudArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         own: ProximityArrays,
         state: StateArrays,
     ):
         env, n = wp.tid()
-        feel(probes, pairs, cloud, io, knobs, own, state, env, n)
+        feel(probes, pairs, cloud, io, own, state, env, n)
 
     @wp.kernel(module="unique")
     def proximity_gathered(
@@ -226,7 +224,6 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         pairs: PairArrays,
         cloud: CloudArrays,
         io: ReadoutArrays,
-        knobs: wp.array(dtype=NoiseParams),
         own: ProximityArrays,
         state: StateArrays,
     ):
@@ -256,6 +253,6 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                 own.near[env, found] = -1
                 found += 1
             for m in range(cell[0], cell[1]):
-                feel(probes, pairs, cloud, io, knobs, own, state, env, own.members[m])
+                feel(probes, pairs, cloud, io, own, state, env, own.members[m])
 
     return proximity_gathered if gathered else proximity

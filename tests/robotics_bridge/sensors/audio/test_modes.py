@@ -108,13 +108,13 @@ def test_decays_follow_rayleigh_and_results_are_cached(tmp_path, monkeypatch):
 
 
 def test_modes_and_solids_outside_their_range_are_refused():
-    with pytest.raises(UsageError, match="as many frequencies as decays"):
+    with pytest.raises(UsageError, match="as many frequencies"):
         Modes((1.0,), (), ())
     with pytest.raises(UsageError, match="positive frequency"):
         Modes((0.0,), (1.0,), (1.0,))
-    with pytest.raises(UsageError, match="Unknown solid 'bx'; did you mean 'box'"):
+    with pytest.raises(UsageError, match=r"'bx'; .* 'box'"):
         ElasticSolid("bx", (1, 1, 1))
-    with pytest.raises(UsageError, match="needs 3 positive sizes"):
+    with pytest.raises(UsageError, match="3 positive sizes"):
         ElasticSolid("box", (1, 1))
     with pytest.raises(UsageError, match="needs its mesh"):
         ElasticSolid("mesh")
@@ -133,5 +133,5 @@ def test_hand_made_modes_are_those_of_a_bar_and_decay_as_the_material_does():
     assert max(wood.frequency) <= 20_000
     assert all(w > g for w, g in zip(wood.decay, glass.decay, strict=True))
     assert len(preset_modes("steel", 15_000.0, 16).frequency) == 1
-    with pytest.raises(UsageError, match="between 20 and 20000 Hz"):
+    with pytest.raises(UsageError, match="20 and 20000 Hz"):
         preset_modes("wood", 5.0)

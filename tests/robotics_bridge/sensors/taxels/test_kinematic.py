@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import dblquad
-from scipy.spatial.transform import Rotation
 
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import KinematicTaxel, Noise, Probes, SensorSuite
-from tests.factories.touch_scenes import pad_scene, poses_at, random_pose, state_of
+from tests.factories.touch_scenes import pad_scene, poses_at, random_pose, rotation_of, state_of
 
 Convention = Literal["physical", "thesis"]
 GRID = Probes.grid(5, 6, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.004)
@@ -24,7 +23,7 @@ def _by_the_equations(
     pose: np.ndarray, velocity: np.ndarray, radius: float, convention: Convention, taxel: KinematicTaxel
 ) -> np.ndarray:
     """Equations 4.1–4.9 for a pressed ball of one radius, channel by channel [N, 6]."""
-    hand, ball = (Rotation.from_quat(pose[link, 3:]) for link in (1, 2))
+    hand, ball = (rotation_of(pose[link, 3:]) for link in (1, 2))
     q = hand.apply(np.array(GRID.position)) + pose[1, :3]
     away = q - pose[2, :3]
     depth = np.maximum(GRID.radius - (np.linalg.norm(away, axis=1) - radius), 0)
@@ -53,7 +52,7 @@ def test_forces_and_torques_are_those_of_the_equations(convention: Convention, s
     scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(radius,)))
     poses = np.stack([np.stack([random_pose(rng) for _ in range(3)])])
     at = np.array([*rng.uniform(-0.01, 0.01, 2), 0.005 + radius - rng.uniform(-0.002, 0.004)])
-    poses[0, 2, :3] = Rotation.from_quat(poses[0, 1, 3:]).apply(at) + poses[0, 1, :3]
+    poses[0, 2, :3] = rotation_of(poses[0, 1, 3:]).apply(at) + poses[0, 1, :3]
     velocity = rng.normal(0, 0.3, (1, 3, 6))
     taxel = KinematicTaxel(link="hand", probes=GRID, convention=convention)
     suite = SensorSuite(scene, {"taxel": taxel}, num_envs=1)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import Noise, Probes, ProximityTaxel, SensorSuite
 from robotics_bridge.sensors.queries.surface_points import surface_points
-from tests.factories.touch_scenes import pad_scene, poses_at, random_pose, state_of
+from tests.factories.touch_scenes import pad_scene, poses_at, random_pose, rotation_of, state_of
 
 GRID = Probes.grid(4, 4, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.008)
 OBJECTS = (
@@ -19,13 +18,13 @@ OBJECTS = (
 
 
 def _brute_force(points: list[np.ndarray], pose: np.ndarray, velocity: np.ndarray, convention: str) -> np.ndarray:
-    hand = Rotation.from_quat(pose[1, 3:])
+    hand = rotation_of(pose[1, 3:])
     q, a = hand.apply(np.array(GRID.position)) + pose[1, :3], hand.apply(np.array(GRID.normal))
     v_q = velocity[1, :3] + np.cross(velocity[1, 3:], q - pose[1, :3])
     total = sum(len(p) for p in points)
     f, tau = np.zeros((16, 3)), np.zeros((16, 3))
     for link, cloud in zip((2, 3), points, strict=True):
-        p = Rotation.from_quat(pose[link, 3:]).apply(cloud + OBJECTS[link - 2].position) + pose[link, :3]
+        p = rotation_of(pose[link, 3:]).apply(cloud + OBJECTS[link - 2].position) + pose[link, :3]
         v = velocity[link, :3] + np.cross(velocity[link, 3:], p - pose[link, :3])
         away = p[None] - q[:, None]
         overlap = np.maximum(0.008 - np.linalg.norm(away, axis=2), 0) * 100 / total
@@ -43,7 +42,7 @@ def test_wrenches_are_the_sums_over_all_points(convention: str) -> None:
     rng = np.random.default_rng(2)
     scene = pad_scene(*OBJECTS)
     pose = np.stack([random_pose(rng) for _ in scene.links])
-    hand = Rotation.from_quat(pose[1, 3:])
+    hand = rotation_of(pose[1, 3:])
     pose[2, :3] = hand.apply([0, 0, 0.012]) + pose[1, :3]
     pose[3, :3] = hand.apply([0.008, 0.006, 0.013]) + pose[1, :3]
     velocity = rng.normal(0, 0.5, (4, 6))

@@ -320,13 +320,13 @@ def test_wrong_settings_are_explained(knobs, message):
 
 def test_a_grid_needs_finite_geometry_or_corners():
     scene = TouchScene(("world",), (Geometry(name="floor", link="world", kind="plane"),))
-    with pytest.raises(UsageError, match="no geometry of finite size"):
+    with pytest.raises(UsageError, match="of finite size"):
         SensorSuite(scene, {"grid": TemperatureGrid(link="world")}, num_envs=1)
     with pytest.raises(UsageError, match="positive"):
         ThermalMaterial(-1, 1, 1)
     assert MATERIALS["steel"].effusivity == pytest.approx(math.sqrt(15 * 7900 * 480))
     suite, _state = _make()
-    with pytest.raises(UsageError, match="Unknown temperature grid 'gird'; did you mean 'grid'"):
+    with pytest.raises(UsageError, match=r"'gird'; .* 'grid'"):
         link_temperature(suite, "gird")
 
 
