@@ -91,7 +91,7 @@ class Report:
     seconds: float
     """Time of the session."""
     latency: dict[str, Any]
-    """Of reading, deciding and sending, in ms."""
+    """Latency of reading, deciding and sending (ms)."""
     processor: dict[str, Any]
     """The same in processor time of the loop's thread, which does not count waiting for a busy machine."""
     rate: float

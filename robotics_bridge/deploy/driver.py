@@ -1,5 +1,4 @@
-"""The interface of a robot hand: what it must offer to run a policy, and what it tells. Radians, seconds; pressure in
-the maker's unit."""
+"""The interface of a robot hand that runs a policy. Radians, seconds; pressure in the maker's unit."""
 
 from __future__ import annotations
 
@@ -18,9 +17,9 @@ class HandReading:
     sequence: int
     """Number of the report, counted by the hand."""
     time: float
-    """When it was measured, by the hand's clock [s]."""
+    """Time of measurement, by the hand's clock [s]."""
     arrived: float
-    """When it came, by the controller's clock [s]."""
+    """Time of arrival, by the controller's clock [s]."""
     position: NDArray[np.float64]
     """Joint positions [J] (rad), in the driver's order."""
     velocity: NDArray[np.float64]

@@ -59,7 +59,7 @@ class Episode:
     """Frames of one episode; every array has a row per frame T."""
 
     task: str
-    """What was done, in words."""
+    """Task that was done, in words."""
     state: list[NDArray[np.floating]] = field(default_factory=list)
     """[T, J] joint positions (rad)."""
     velocity: list[NDArray[np.floating]] = field(default_factory=list)

@@ -34,7 +34,7 @@ class SafetyLimits:
     pressure: float = 30.0
     """Largest reading of a finger tip, in the maker's unit."""
     margin: float = 0.15
-    """How far beyond its limits a joint may be measured (rad)."""
+    """Distance beyond its limits at which a joint may be measured (rad)."""
     timeout: float = 0.1
     """Oldest report to act upon (s)."""
     start_timeout: float = 3.0

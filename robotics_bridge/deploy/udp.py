@@ -52,7 +52,7 @@ class Message:
     sequence: int
     """Number of the message; goes on from 0 after 2³²."""
     time: float
-    """Of the sender's clock (s)."""
+    """Time of the sender's clock (s)."""
     values: NDArray[np.float64]
     """Positions (rad), velocities (rad/s) and pressures of a state, targets (rad) of a command, one after another."""
 

@@ -7,7 +7,6 @@ joint's motion); below the deadband it counts as none. Letters: B environment, J
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +37,7 @@ class Actuators:
     ) -> None:
         import torch
 
-        self._simulation, self._changes, self._substeps, self._seed = simulation, changes, substeps, seed & 0x3FFFFFFF
+        self._simulation, self._changes, self._substeps = simulation, changes, substeps
         device, first = simulation.device, simulation.model
         ids = [first.joint(name).id for name in model.joints]
         self.qpos_columns = torch.as_tensor(np.array(first.jnt_qposadr[ids]), device=device).long()
@@ -60,7 +59,9 @@ class Actuators:
         """[B, J] positions that the actuators seek (rad)."""
         self.power = zeros()
         """[B, J] mean |torque · speed| over the last control step (W)."""
-        self._tick = torch.zeros(1, dtype=torch.int32, device=device)
+        self._noise_state = torch.zeros(2, dtype=torch.int32, device=device)
+        """[2] launches so far, and the seed of the torque noise."""
+        self.seed(seed)
         self._noise = self.nominal["effort"] * (changes.torque_noise if changes else 0.0)
         wp = warp()
         from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
@@ -75,8 +76,8 @@ class Actuators:
         for name, numbers in columns.items():
             column = wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=simulation.warp_device)
             setattr(self._arrays, name, column)
-        shared = (simulation.qpos, simulation.qvel, self.target, self._tick, simulation.ctrl, self.power)
-        self._qpos, self._qvel, self._target, self._ticks, self._ctrl, self._power = map(wp.from_torch, shared)
+        shared = (simulation.qpos, simulation.qvel, self.target, self._noise_state, simulation.ctrl, self.power)
+        self._qpos, self._qvel, self._target, self._random, self._ctrl, self._power = map(wp.from_torch, shared)
 
     def reset(self, mask: torch.Tensor, draw: Any) -> None:
         """Draw imperfections anew in some environments [B] bool.
@@ -107,28 +108,18 @@ class Actuators:
 
     def seed(self, seed: int) -> None:
         """Begin the torque noise anew."""
-        self._seed = seed & 0x3FFFFFFF
-        self._tick.zero_()
+        self._noise_state[0].fill_(0)
+        self._noise_state[1].fill_(seed & 0x3FFFFFFF)
 
     def launch(self, substep: int) -> None:
         """Write the torques of one physics step to the simulation's ``ctrl``."""
         wp, device = warp(), self._simulation.warp_device
-        inputs = [self._arrays, self._qpos, self._qvel, self._target, self._seed, self._ticks]
+        inputs = [self._arrays, self._qpos, self._qvel, self._target, self._random]
         inputs += [int(substep == 0), 1.0 / self._substeps, self._ctrl, self._power]
         wp.launch(self._actuate, dim=self.target.shape, inputs=inputs, device=device)
-        wp.launch(self._count, dim=1, inputs=[self._ticks], device=device)
+        wp.launch(self._count, dim=1, inputs=[self._random], device=device)
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return all memory."""
-        import torch
-
-        return {name: value.clone() for name, value in self._memory().items()} | {"seed": torch.tensor(self._seed)}
-
-    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned."""
-        for name, value in self._memory().items():
-            value.copy_(values[name])
-        self._seed = int(values["seed"])
-
-    def _memory(self) -> dict[str, torch.Tensor]:
-        return {**self.values, "target": self.target, "power": self.power, "tick": self._tick}
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that the next launch depends on, by name."""
+        own = {"target": self.target, "power": self.power}
+        return {**self.values, **own, "tick": self._noise_state[:1], "seed": self._noise_state[1]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from brainbench.core.devices import warp
 
@@ -21,43 +21,47 @@ FORMER_NAMES = {
 """Names of tensors and parts in states that were saved before version 0.1."""
 
 
+_LATER = ("goals.turned_held",)
+"""Tensors that states lack which were saved before they were counted."""
+
+
 def save_state(state: EnvState) -> dict[str, torch.Tensor]:
     """Return copies of all memory of an environment batch, but for that of noisy or slow tactile sensors."""
-    own = {name: value.clone() for name, value in state.episode.tensors().items()}
+    own = {name: value.clone() for name, value in _memory(state).items()}
     own["generator"] = state.generator.get_state()
-    for part, source in _parts(state).items():
-        own |= {f"{part}.{name}": value for name, value in source.state_dict().items()}
-    own |= {f"touch.{name}": value.clone() for name, value in _touch(state).items()}
+    own |= {f"simulation.{name}": value for name, value in state.simulation.state_dict().items()}
     return own | {f"observations.{name}": value.clone() for name, value in state.observations.items()}
 
 
 def load_state(state: EnvState, values: Mapping[str, torch.Tensor]) -> None:
     """Put an environment batch where :func:`save_state` found one."""
-    found: dict[str, dict[str, torch.Tensor]] = {"": {}}
+    found = {}
     for key, value in values.items():
         part, dot, name = key.partition(".")
-        part = FORMER_NAMES.get(part, part)
-        found.setdefault(part if dot else "", {})[name if dot else part] = value
-    for name, value in state.episode.tensors().items():
-        value.copy_(found[""][name])
-    state.generator.set_state(found[""]["generator"].cpu())
-    for part, source in _parts(state).items():
-        source.load_state_dict(found[part])
-    for name, value in _touch(state).items():
-        value.copy_(found["touch"][name])
+        found[f"{FORMER_NAMES.get(part, part)}{dot}{name}"] = value
+
+    def under(part: str) -> dict[str, torch.Tensor]:
+        return {name.removeprefix(part): value for name, value in found.items() if name.startswith(part)}
+
+    for name, value in _memory(state).items():
+        value.copy_(found.get(name, value) if name in _LATER else found[name])
+    state.generator.set_state(found["generator"].cpu())
+    state.simulation.load_state_dict(under("simulation."))
+    if state.task_state is not None:
+        state.task_state.restored()
     state.started = True
-    state.observations = {name: value.to(state.device) for name, value in found["observations"].items()}
+    state.observations = {name: value.to(state.device) for name, value in under("observations.").items()}
 
 
-def _parts(state: EnvState) -> dict[str, Any]:
-    parts: dict[str, Any] = {
-        "simulation": state.simulation, "actuators": state.actuators, "goals": state.goals, "contacts": state.contacts,
-    }  # fmt: skip
-    return parts if state.task_state is None else {**parts, "task_state": state.task_state}
-
-
-def _touch(state: EnvState) -> dict[str, torch.Tensor]:
-    if state.touch is None:
-        return {}
-    clock, wp = state.touch.suite.clock, warp()
-    return {"reading": state.touch.reading, "age": wp.to_torch(clock.age), "episode": wp.to_torch(clock.episode)}
+def _memory(state: EnvState) -> dict[str, torch.Tensor]:
+    """Return the tensors themselves of all parts but the physics."""
+    parts = {"actuators": state.actuators, "goals": state.goals, "contacts": state.contacts}
+    if state.task_state is not None:
+        parts["task_state"] = state.task_state
+    found = state.episode.tensors()
+    found |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
+    if state.touch is not None:
+        clock, wp = state.touch.suite.clock, warp()
+        found |= {"touch.age": wp.to_torch(clock.age), "touch.episode": wp.to_torch(clock.episode)}
+        found["touch.reading"] = state.touch.reading
+    return found

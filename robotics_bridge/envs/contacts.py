@@ -5,7 +5,6 @@ Letters: B environment, F finger tip, K object.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -83,14 +82,9 @@ class Contacts:
         self.forces.masked_fill_(mask[:, None, None], 0.0)
         self._suite.update(self._simulation.state, self._dt)
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return copies of what was read last."""
-        return {"forces": self.forces.clone(), "distances": self.planes.clone()}
-
-    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned."""
-        self.forces.copy_(values["forces"])
-        self.planes.copy_(values["distances"])
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves of what was read last, by name."""
+        return {"forces": self.forces, "distances": self.planes}
 
     def on_object(self, rows: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the size [B] of the force on the objects ``target`` [B] (N); ``rows`` numbers the environments."""

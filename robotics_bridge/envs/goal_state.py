@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing
@@ -135,19 +134,8 @@ class GoalState:
         else:
             self.left.copy_(torch.where(mask, draw(1, *deadline)[:, 0], self.left))
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return all memory."""
-        own = {name: value.clone() for name, value in self._memory().items()}
-        return {**own, "step": self._step[0].clone()}
-
-    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned."""
-        for name, value in self._memory().items():
-            # States of before this was counted lack it.
-            value.copy_(values[name] if name != "turned_held" else values.get(name, value))
-        self._step.copy_(values["step"])
-
-    def _memory(self) -> dict[str, torch.Tensor]:
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that later steps depend on, by name."""
         names = ("quat", "previous", "angle", "angle_before", "left", "reached", "missed", "count", "rate", "off_axis")
         own = {name: getattr(self, name) for name in (*names, "turned", "turned_held")}
-        return {**own, "ring": self._ring, **self.curriculum()}
+        return {**own, "ring": self._ring, "step": self._step[0], **self.curriculum()}

@@ -40,7 +40,7 @@ class GraspSampling:
     max_penetration: float = 0.003
     """[m]."""
     max_displacement: float = 0.01
-    """Of the object while it is held [m]."""
+    """Displacement of the object while it is held [m]."""
     shift: float = 0.01
     """Half range of the object's x and y [m]."""
     hold: float = 0.5

@@ -30,19 +30,19 @@ class EnvOptions:
     observe: str = "none"
     """Tactile observation type (table 4.3); ``none`` builds no tactile sensor."""
     placement: str = "hand"
-    """Of the taxels: ``hand``, ``fingers``, ``tips`` or ``palm``."""
+    """Place of the taxels: ``hand``, ``fingers``, ``tips`` or ``palm``."""
     resolution: str = "med"
-    """Of the taxels: ``low``, ``med`` or ``high``."""
+    """Number of taxels: ``low``, ``med`` or ``high``."""
     noisy: bool = False
     """Tactile readings with the published imperfections."""
     seed: int = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     link_pose: bool = False
     """Also observe the poses of the tactile links in the palm's frame."""
     keep_final: bool = False
     """Return the last observations of episodes that ended as ``info["final_observations"]``."""
     threads: int | None = None
-    """Of C MuJoCo; None takes all processors."""
+    """Threads of C MuJoCo; None takes all processors."""
     knobs: Mapping[str, Any] = field(default_factory=dict)
     """Further settings of the tactile sensors, e.g. ``{"points": 500}``."""
     graphs: bool | None = None

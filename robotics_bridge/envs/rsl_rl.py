@@ -32,7 +32,7 @@ class RslRlEnv:
         self.num_envs, self.num_actions, self.device = env.num_envs, env.num_actions, env.device
         self.max_episode_length = env.max_episode_length
         self.cfg: dict[str, Any] = {"task": env.task.name, "hand": env.hand.name, "observe": env.options.observe}
-        """What rsl_rl's logger keeps."""
+        """Facts that rsl_rl's logger keeps."""
 
     @property
     def episode_length_buf(self) -> torch.Tensor:

@@ -55,7 +55,7 @@ class Simulation:
         """Number [B] of the shape that each environment has."""
         nominal = {name: np.stack([getattr(m, name) for m in models])[order] for name in FIELDS}
         self.uses_warp = engine == "warp"
-        """Whether MuJoCo Warp simulates; C MuJoCo otherwise."""
+        """True for MuJoCo Warp, False for C MuJoCo."""
         if self.uses_warp:
             self.engine: Any = MujocoWarpEngine(list(models), num_envs, device=device, fields=nominal)
             self.qpos, self.qvel, self.ctrl = self.engine.qpos, self.engine.qvel, self.engine.ctrl

@@ -129,9 +129,9 @@ class EnvState:
         )
         self.contacts = Contacts(self.simulation, self.model, step_dt=self.step_dt, seed=options.seed)
         self.observations: dict[str, torch.Tensor] = {}
-        """Of the last step or reset, by group."""
+        """Observations of the last step or reset, by group."""
         self.started = False
-        """Whether an episode began: friction and mass of the objects are drawn for the first one in any case."""
+        """True once an episode began; friction and mass of the objects are drawn for the first one in any case."""
         self.task_state: TaskState | None = None if task.task_state is None else task.task_state(self)
         """The part of the task with a state of its own."""
 

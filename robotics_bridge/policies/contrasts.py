@@ -26,7 +26,7 @@ class Contrast:
     interval: Interval
     """95 %, not corrected for the number of contrasts."""
     p: float
-    """Of no difference, two-sided, not corrected for the number of contrasts."""
+    """p of no difference, two-sided, not corrected for the number of contrasts."""
 
 
 def pooled_spread(groups: Sequence[Sequence[float]]) -> tuple[float, int]:

@@ -34,9 +34,9 @@ class PolicyEvaluation:
     task: str
     seeds: tuple[int, ...]
     success: tuple[bool, ...]
-    """Of each episode."""
+    """Success of each episode."""
     metric: tuple[float, ...]
-    """Of each episode: goals reached, rotation (rad) or seconds of contact."""
+    """Success metric of each episode: goals reached, rotation (rad) or seconds of contact."""
     returns: tuple[float, ...]
     """Undiscounted reward of each episode."""
     lengths: tuple[int, ...]
@@ -52,7 +52,7 @@ class PolicyEvaluation:
     seconds: tuple[float, ...] = ()
     """Duration of each episode: until the object was dropped, or the longest there is."""
     dropped: tuple[bool, ...] = ()
-    """Whether an ending of the task (not time, divergence or the last goal) ended the episode."""
+    """True where an ending of the task (not time, divergence or the last goal) ended the episode."""
 
     @property
     def success_rate(self) -> float:

@@ -49,7 +49,7 @@ class StudentResult:
     """Students that differ in their training seed only."""
 
     config: DistillConfig
-    """Of the first of them."""
+    """Configuration of the first of them."""
     seeds: tuple[int, ...]
     """Training seeds."""
     success: tuple[float, ...]
@@ -59,13 +59,13 @@ class StudentResult:
     metric: float
     """Mean of the task's own metric."""
     interval: Interval | None
-    """Of the mean success."""
+    """Interval of the mean success."""
     note: str
-    """What the interval does not cover; empty if nothing."""
+    """Note on what the interval does not cover; empty if nothing."""
     gain: float | None = None
     """Success beyond that of ``none``, over training seeds in common."""
     difference: Interval | None = None
-    """Of the gain; with one training seed in common it covers chance in evaluation alone."""
+    """Interval of the gain; with one training seed in common it covers chance in evaluation alone."""
     graded: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Quantity of :data:`GRADED` → mean over all episodes and half width of its 95 % interval: t over training seeds,
     with one training seed normal over episodes."""

@@ -99,7 +99,7 @@ class PolicyCore(nn.Module):
         self.features: int = sum(int(part.features) for part in self.embedders)  # type: ignore[arg-type]
         self.features += tactile.features if tactile is not None else 0
         self.precision: torch.dtype | None = None
-        """Of the tactile encoder while :meth:`unroll` runs (mixed); None for that of its weights."""
+        """Precision of the tactile encoder while :meth:`unroll` runs (mixed); None for that of its weights."""
 
     @property
     def kept_size(self) -> int:
@@ -216,7 +216,7 @@ class TactilePolicy(MLPModel):
             "obs_normalization": obs_normalization,
             "distribution_cfg": copy.deepcopy(distribution_cfg),
         }
-        """How to build it again."""
+        """Arguments that build it again."""
         self._state: torch.Tensor | None = None
 
     @property

@@ -51,7 +51,7 @@ class ObjectShape:
     extent: tuple[float, float, float]
     """Edges of the box around it, along the body's axes [m]."""
     bottom: float
-    """How far below the body's origin it reaches when upright [m]."""
+    """Depth below the body's origin to which it reaches when upright [m]."""
 
     def scaled(self, factor: float) -> ObjectShape:
         """Return the shape with all lengths multiplied."""

@@ -39,7 +39,7 @@ class TaskModel:
     models: Sequence[Any]
     """``mujoco.MjModel`` per shape; they differ in numbers only."""
     shapes: tuple[ObjectShape, ...]
-    """Of the objects, one per model."""
+    """Shapes of the objects, one per model."""
     objects: tuple[str, ...]
     """Names of the free bodies."""
     joints: tuple[str, ...]

@@ -27,7 +27,7 @@ class TeacherSettings:
     """Control steps of every environment in an iteration."""
     iterations: int = 6000
     learning_rate: float = 1e-3
-    """Of the first iteration."""
+    """Learning rate of the first iteration."""
     epochs: int = 5
     """Passes over the steps of an iteration."""
     minibatches: int = 4
@@ -55,15 +55,15 @@ class TeacherSettings:
     initial_std: float = 1.0
     """Standard deviation of the first actions."""
     std_type: str = "log"
-    """How the policy's standard deviation is kept (text above table 4.4; the released settings say ``log``)."""
+    """Form of the policy's standard deviation (text above table 4.4; the released settings say ``log``)."""
     std_range: tuple[float, float] = (1e-6, 1e6)
     """Bounds of the standard deviation of actions."""
     rnd_weight: float = 100.0
-    """Of the curiosity reward, per second; 0 trains without it."""
+    """Weight of the curiosity reward, per second; 0 trains without it."""
     rnd_outputs: int = 8
     """Numbers of the random network that the curious one predicts (Burda et al. 2018)."""
     rnd_learning_rate: float = 1e-3
-    """Of the predicting network."""
+    """Learning rate of the predicting network."""
 
     def __post_init__(self) -> None:
         if self.schedule not in SCHEDULES:
@@ -159,7 +159,7 @@ class AuxiliaryDecoder:
     target: str
     """Name of the group."""
     weight: float = 1.0
-    """Of its mean squared error in the loss."""
+    """Weight of its mean squared error in the loss."""
     scale: float = 1.0
     """Factor on the target."""
     hidden: tuple[int, ...] = field(default=(128, 64))

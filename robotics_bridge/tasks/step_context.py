@@ -74,4 +74,4 @@ class StepContext:
     endings: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Name → [B] bool: conditions of the task that end the episode in this step."""
     extras: dict[str, Any] = field(default_factory=dict)
-    """What the task's own state adds."""
+    """Additions of the task's own state, by name."""

@@ -97,10 +97,10 @@ class Placement:
     """Start of the object: its lowest point at a height, with random position and yaw."""
 
     height: float = 0.5
-    """Of the object's lowest point [m]."""
+    """Height of the object's lowest point [m]."""
     x: Range = (0.0, 0.0)
     y: Range = (0.0, 0.0)
-    """Of its origin [m]."""
+    """Coordinates of its origin [m]."""
     yaw: Range = (0.0, 0.0)
     """About the vertical [rad]."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -114,11 +114,11 @@ class Solver:
     """Exactness of the physics (as in the released settings)."""
 
     timestep: float = 0.005
-    """Of physics [s]."""
+    """Time step of physics [s]."""
     decimation: int = 5
     """Physics steps in a control step."""
     iterations: int = 50
-    """Of the constraint solver, at most."""
+    """Iterations of the constraint solver, at most."""
     line_search: int = 50
     """Iterations of its line search, at most."""
     tolerance: float = 1e-5
@@ -167,9 +167,9 @@ class Task:
     copies: int = 1
     """Objects in the scene; more than one are equal but for what ``task_state`` makes of them."""
     density: float = 200.0
-    """Of objects [kg/m³]; the value that the published engine takes by default."""
+    """Density of objects [kg/m³]; the value that the published engine takes by default."""
     friction: float = 1.0
-    """Of objects, before randomisation."""
+    """Friction of objects, before randomisation."""
     placement: Placement = Placement()
     hand_poses: Mapping[str, Pose] = field(default_factory=dict)
     """Hand → pose of its palm; of other hands, the palm is turned up below the object."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
@@ -71,10 +70,10 @@ class TaskState(Protocol):
         """Return an observation group [B, ...] that the task adds."""
         ...
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return all memory."""
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that the future depends on, by name."""
         ...
 
-    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned."""
+    def restored(self) -> None:
+        """Take note that other values were written to :meth:`memory`."""
         ...

@@ -5,9 +5,8 @@ Letters: B environment, F finger link with a grid, K ball.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -32,24 +31,24 @@ class ThermalSettings:
     """
 
     conductivity: float = 150.0
-    """Of the fingers [W/(m·K)]."""
+    """Conductivity of the fingers [W/(m·K)]."""
     emissivity: float = 0.5
     heat: float = 500.0
     """Made inside the fingers, per area of a layer of cells [W/m²] (4.36)."""
     ambient: float = 22.0
-    """Of the room, the hand and all balls but one at the start [°C]."""
+    """Temperature of the room, the hand and all balls but one at the start [°C]."""
     hot: float = 45.0
-    """Of the target ball [°C]."""
+    """Temperature of the target ball [°C]."""
     margin: float = 0.12
     """The latch fires at a progress of 1 − margin (42.2 °C)."""
     cells: tuple[int, int, int] = (4, 4, 4)
-    """Of the grid on each finger link; not published."""
+    """Cells of the grid on each finger link; not published."""
     density: float = 2700.0
-    """Of the fingers [kg/m³]; not published (aluminium)."""
+    """Density of the fingers [kg/m³]; not published (aluminium)."""
     specific_heat: float = 900.0
     """[J/(kg·K)]; not published (aluminium)."""
     ball: str | ThermalMaterial = "aluminium"
-    """Of the balls; not published."""
+    """Material of the balls; not published."""
     conduction: Literal["physical", "thesis"] = "thesis"
     """Contact law: the published heuristic (4.38, 4.39), or with the resistance of ball and cells."""
     convection: float = 10.0
@@ -210,15 +209,13 @@ class Thermometers:
         flags = torch.stack((self.latched.float(), self.touching.float()), dim=1)
         return torch.cat((progress(self.temperature(), t).nan_to_num().float(), flags), dim=1)
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return latch and metric; the temperatures themselves begin anew."""
-        own: dict[str, Any] = {name: getattr(self, name) for name in _MEMORY}
-        return {name: value.clone() for name, value in own.items()}
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves of latch and metric; the temperatures begin anew."""
+        own = {"latched": self.latched, "latch_time": self.latch_time, "contact": self.contact}
+        return {**own, "touching": self.touching, "age": self.age}
 
-    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned."""
-        for name in _MEMORY:
-            getattr(self, name).copy_(values[name])
+    def restored(self) -> None:
+        """Make the target ball hot that a loaded state has."""
         self._apply(self.latched | True)
 
     def _apply(self, mask: torch.Tensor) -> None:
@@ -229,6 +226,3 @@ class Thermometers:
         value = self.thermal.ambient + (self.thermal.hot - self.thermal.ambient) * hot
         known = self._heat[:, self._balls]
         self._heat[:, self._balls] = torch.where(mask.unsqueeze(1), value.to(known.dtype), known)
-
-
-_MEMORY = ("latched", "latch_time", "contact", "touching", "age")

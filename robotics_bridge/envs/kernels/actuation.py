@@ -36,8 +36,7 @@ def actuate(
     qpos: wp.array2d(dtype=wp.float32),
     qvel: wp.array2d(dtype=wp.float32),
     target: wp.array2d(dtype=wp.float32),
-    seed: int,
-    tick: wp.array(dtype=wp.int32),
+    random: wp.array(dtype=wp.int32),  # [2] launches so far, seed
     first: int,
     share: float,
     ctrl: wp.array2d(dtype=wp.float32),
@@ -60,7 +59,7 @@ def actuate(
         torque += wp.sign(error) * d.kick[env, joint]
     torque *= d.strength[env, joint]
     if d.noise[joint] > 0.0:
-        state = wp.rand_init(seed + tick[0], env * d.position.shape[0] + joint)
+        state = wp.rand_init(random[1] + random[0], env * d.position.shape[0] + joint)
         torque += d.noise[joint] * wp.randf(state, -1.0, 1.0)
     torque = wp.clamp(torque, -d.effort[joint], d.effort[joint])
     ctrl[env, d.channel[joint]] = torque
@@ -72,5 +71,5 @@ def actuate(
 
 
 @wp.kernel(module="unique")
-def count_launch(tick: wp.array(dtype=wp.int32)):
-    tick[0] = tick[0] + 1
+def count_launch(random: wp.array(dtype=wp.int32)):
+    random[0] = random[0] + 1

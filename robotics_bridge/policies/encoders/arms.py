@@ -50,17 +50,17 @@ class EncoderConfig:
     features: int = 32
     """F: size of the embedding that the head gets."""
     time: Time = "native"
-    """Of a network: the clock (:mod:`~robotics_bridge.policies.encoders.timing`)."""
+    """Clock of a network (:mod:`~robotics_bridge.policies.encoders.timing`)."""
     learning: Learning = "frozen"
-    """Of a network: ``frozen`` or ``finetuned``."""
+    """Learning of a network: ``frozen`` or ``finetuned``."""
     seed: int = 0
-    """Of an untrained network."""
+    """Seed of an untrained network."""
     pretrained: str | None = None
-    """Of a network with a tag: its weights."""
+    """Weights of a network with a tag."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of a network: what its builder takes, such as ``{"unroll": "full"}``."""
+    """Options of the builder of a network, such as ``{"unroll": "full"}``."""
     calibration: HandCalibration = field(default_factory=HandCalibration)
-    """What a newton is to a network."""
+    """Force and moment that are one unit to a network."""
 
     @classmethod
     def of(cls, value: Mapping[str, Any] | EncoderConfig) -> EncoderConfig:

@@ -1,5 +1,4 @@
-"""Calibration: what a newton on the skin of a hand is to an encoder that was made for whiskers of a few
-micronewtons."""
+"""Calibration of a hand's newtons for an encoder that was made for whiskers of a few micronewtons."""
 
 from __future__ import annotations
 

@@ -36,9 +36,9 @@ class DistillConfig:
     observe: str = "force_torque"
     """Tactile observation type (table 4.3), ``agg_bool``, or ``none``."""
     placement: str = "hand"
-    """Where taxels sit: ``tips``, ``fingers``, ``palm`` or ``hand``."""
+    """Place of the taxels: ``tips``, ``fingers``, ``palm`` or ``hand``."""
     resolution: str = "med"
-    """How many taxels there are: ``low``, ``med`` or ``high``."""
+    """Number of taxels: ``low``, ``med`` or ``high``."""
     noisy: bool = False
     """Taxels with the published noise (table 4.12)."""
     encoder: str = AUTO

@@ -19,13 +19,13 @@ class Rollout:
     groups: dict[str, torch.Tensor]
     """Observation groups [T, B, …] that the student or its decoders read."""
     features: torch.Tensor | None
-    """What a frozen encoder gave [T, B, F], in place of the readings."""
+    """Features [T, B, F] that a frozen encoder gave, in place of the readings."""
     teacher: torch.Tensor
     """Actions [T, B, A] of the teacher."""
     student: torch.Tensor
     """Actions [T, B, A] of the student at the time."""
     ended: torch.Tensor
-    """Whether an episode ended after the step [T, B]."""
+    """Steps [T, B] after which an episode ended."""
     memory: torch.Tensor
     """The student's memory [B, H] before the first step."""
 

@@ -52,7 +52,7 @@ class StudentSweep:
     extra_types: tuple[str, ...]
     """Types beyond the published ones."""
     resolutions: tuple[str, ...]
-    """Of the taxels, in the subset ``all`` and in that of one type."""
+    """Resolutions of the taxels, in the subset ``all`` and in that of one type."""
     noisy: tuple[bool, ...]
     """Without noise, with it, or both; in the same subsets."""
     seeds: tuple[int, ...]
@@ -60,7 +60,7 @@ class StudentSweep:
     pinned_resolution: str
     """The one resolution of the subsets ``types`` and ``encoders``."""
     pinned_noisy: bool
-    """Whether taxels have noise in these."""
+    """Noise of the taxels in these."""
     encoder_types: tuple[str, ...]
     """Observation types of the subset ``encoders``."""
     arms: tuple[Mapping[str, Any], ...]

@@ -44,7 +44,7 @@ class TeacherResult:
     steps: int
     """Control steps of all environments since the run began."""
     seconds: float
-    """Of this call."""
+    """Time of this call (s)."""
     history: tuple[Mapping[str, float], ...]
     """Lines of ``log.jsonl`` written by this call."""
 
@@ -252,7 +252,7 @@ class TeacherRun:
     minutes: float | None = None
     """Stop after this time and save."""
     seed: int = 0
-    """Of weights and actions."""
+    """Seed of weights and actions."""
     save_every: int = 50
     """Iterations between checkpoints."""
     keep_env: bool = True

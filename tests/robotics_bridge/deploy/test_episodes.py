@@ -92,11 +92,11 @@ def test_episodes_that_do_not_fit_are_refused(tmp_path) -> None:
     (tmp_path / "full" / "x").write_text("")
     with pytest.raises(UsageError, match="is not empty"):
         write_lerobot(tmp_path / "full", [_episode(2)], fps=40, **settings)
-    with pytest.raises(UsageError, match=r"whole number of frames per second; received 33\.3"):
+    with pytest.raises(UsageError, match=r"whole number.* 33\.3"):
         write_lerobot(tmp_path / "a", [_episode(2)], fps=33.3, **settings)
-    with pytest.raises(UsageError, match=r"observation.state of episode 0 has the shape \(0,\)"):
+    with pytest.raises(UsageError, match=r"observation.state .*\(0,\)"):
         write_lerobot(tmp_path / "b", [Episode("nothing")], fps=40, **settings)
     spoiled = _episode(2)
     spoiled.wrench[1][0] = np.nan
-    with pytest.raises(DataError, match=r"observation.wrench of episode 0 holds values that are no numbers"):
+    with pytest.raises(DataError, match=r"observation.wrench .* no numbers"):
         write_lerobot(tmp_path / "c", [spoiled], fps=40, **settings)

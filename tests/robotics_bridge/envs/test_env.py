@@ -172,7 +172,7 @@ def test_an_action_beyond_the_limit_counts_as_the_limit_and_moves_the_same_joint
     assert free.observations["proprio"][:, -5:].unique().tolist() == [-1e9]
     assert torch.equal(far.simulation.qpos, near.simulation.qpos)
     assert torch.equal(far.simulation.qpos, free.simulation.qpos)
-    with pytest.raises(UsageError, match="action_limit of task 'in_palm_rotate' is positive; received 0"):
+    with pytest.raises(UsageError, match=r"action_limit .* received 0"):
         _calm(action_limit=0.0)
 
 

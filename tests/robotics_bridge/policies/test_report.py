@@ -123,7 +123,7 @@ def test_students_that_learned_too_little_are_left_out_by_name(tmp_path) -> None
     assert kept.left_out == (LeftOut(2, 18, "fewer than 98"),)
     assert "only 2 training seeds" in kept.note
     assert rows([kept])[0][COLUMNS.index("iterations")] == "98 to 110"
-    with pytest.raises(DataError, match="None of the students learned 500 iterations; the longest that any did is 110"):
+    with pytest.raises(DataError, match=r"500 iterations.* 110"):
         read_results([tmp_path], at_least=500)
 
 

@@ -47,7 +47,7 @@ def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path
 def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -> None:
     assert teacher_path("in_palm_rotate.careful") == FOLDER / "in_palm_rotate.careful"
     assert teacher_path(tmp_path) == tmp_path
-    with pytest.raises(UsageError, match=r"did you mean 'in_palm_rotate.careful'.*folder of a training run"):
+    with pytest.raises(UsageError, match=r"'in_palm_rotate\.careful'.*folder"):
         teacher_path("in_palm_rotate.carefull")
     assert student_path("in_palm_rotate.force-torque-hand").parent == FOLDER
     with pytest.raises(UsageError, match=r"did you mean 'in_palm_rotate.force-torque-hand'"):

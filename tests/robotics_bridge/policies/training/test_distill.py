@@ -156,15 +156,15 @@ def test_tables_4_4_fills_what_is_left_open_and_logs_say_what_was_learned(tmp_pa
 
 def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
     _run(tmp_path, iterations=2)
-    with pytest.raises(UsageError, match="another student \\(its learning_rate differs\\)"):
+    with pytest.raises(UsageError, match="its learning_rate differs"):
         _run(tmp_path, iterations=2, learning_rate=1e-2)
     with pytest.raises(UsageError, match="did you mean 'mse'"):
         _config(loss="ms")
-    with pytest.raises(UsageError, match="share lies between 0 and 1; received 2"):
+    with pytest.raises(UsageError, match=r"share .* received 2"):
         _config(teacher_share=2)
     with pytest.raises(UsageError, match="did you mean 'placement'"):
         DistillConfig.of({"task": "x", "placment": "tips"})
-    with pytest.raises(UsageError, match="num_envs is a whole number of at least 1; received 0"):
+    with pytest.raises(UsageError, match=r"num_envs .* at least 1"):
         _config(num_envs=0)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(DataError, match="holds no student"):
