@@ -151,12 +151,7 @@ def explain(
         traces: one per job of the plan.
         fidelity: links and time step.
     """
-    from brainbench.stimuli.whiskers.chain import build_chain
-
-    chains = {
-        whisker: build_chain(whisker, fidelity.link_count(whisker.arc_length))
-        for whisker in {job.whisker for job in plan.jobs}
-    }
+    chains = {whisker: fidelity.chain(whisker) for whisker in {job.whisker for job in plan.jobs}}
     pairs = pairs_in_full = steps_in_full = 0
     kinds: set[str] = set()
     counted: set[int] = set()
@@ -168,8 +163,7 @@ def explain(
             job = plan.jobs[index]
             chain = chains[job.whisker]
             pairs_in_full += chain.links * parts
-            step = fidelity.step(float(chain.frequencies()[0]) / (2 * math.pi))
-            steps_in_full += math.ceil((job.times[-1] - job.start) / step - 1e-6) + 1
+            steps_in_full += math.ceil((job.times[-1] - job.start) / fidelity.step_of(chain) - 1e-6) + 1
             if index not in counted and traces[index].steps:
                 pairs += reach.links(chain) * (reach.parts + reach.triangles)
             counted.add(index)
