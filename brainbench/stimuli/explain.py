@@ -1,4 +1,4 @@
-"""What a simulation did and what it could leave out: whisker runs, time steps, contact pairs and seconds.
+"""Work that a simulation did and work that it could leave out: whisker runs, time steps, contact pairs and seconds.
 
 A *run* is one whisker in one stimulus. Runs that cannot differ are simulated once and shared; runs that
 cannot feel anything are not simulated. A contact *pair* is one link of a whisker against one convex part of
@@ -63,7 +63,7 @@ class Explanation:
     out_of_reach: Mapping[str, tuple[str, ...]]
     """Stimulus → whiskers that its objects cannot touch, whatever these whiskers do."""
     bodies: str = "convex parts"
-    """What the contact pairs count of an object: ``convex parts``, ``triangles`` or both."""
+    """Bodies that the contact pairs count: ``convex parts``, ``triangles`` or both."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Elapsed time of each part [s]: ``plan``, ``simulate``, ``assemble``, and ``processor``, the processor time of
     ``simulate`` on all threads together; or ``read`` alone. Empty when this process did not make the set."""

@@ -1,4 +1,4 @@
-"""How finely a whisker is simulated: presets, and the cheapest setting for a wanted error.
+"""Accuracy of a whisker simulation: presets, and the cheapest setting for a wanted error.
 
 Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this module is written by
 ``brainbench tradeoff whisker`` (:mod:`brainbench.stimuli.tradeoff`) and states how.

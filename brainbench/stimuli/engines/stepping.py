@@ -110,7 +110,7 @@ class SteppedJob:
 
     @cached_property
     def reach(self) -> Reach:
-        """What the whisker could ever touch, in convex parts."""
+        """Obstacles that the whisker could ever touch, in convex parts."""
         return reachable(self.job.whisker, self.pose[0], self.job.obstacles, self.times)
 
     @property

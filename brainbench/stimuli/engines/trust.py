@@ -74,7 +74,7 @@ class Verdict:
     retryable: NDArray[np.bool_]
     """True where finer steps may give a result that can be trusted."""
     reasons: NDArray[np.object_]
-    """What is wrong, in words; empty for a reliable whisker."""
+    """Fault of each whisker in words; empty for a reliable one."""
 
     @property
     def unstable(self) -> NDArray[np.bool_]:
