@@ -1,4 +1,4 @@
-"""What a simulation did and what it could leave out: whisker runs, time steps, contact pairs and seconds.
+"""Work that a simulation did and work that it could leave out: whisker runs, time steps, contact pairs and seconds.
 
 A *run* is one whisker in one stimulus. Runs that cannot differ are simulated once and shared; runs that
 cannot feel anything are not simulated. A contact *pair* is one link of a whisker against one convex part of
@@ -63,7 +63,7 @@ class Explanation:
     out_of_reach: Mapping[str, tuple[str, ...]]
     """Stimulus → whiskers that its objects cannot touch, whatever these whiskers do."""
     bodies: str = "convex parts"
-    """What the contact pairs count of an object: ``convex parts``, ``triangles`` or both."""
+    """Bodies that the contact pairs count: ``convex parts``, ``triangles`` or both."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Elapsed time of each part [s]: ``plan``, ``simulate``, ``assemble``, and ``processor``, the processor time of
     ``simulate`` on all threads together; or ``read`` alone. Empty when this process did not make the set."""
@@ -151,12 +151,7 @@ def explain(
         traces: one per job of the plan.
         fidelity: links and time step.
     """
-    from brainbench.stimuli.whiskers.chain import build_chain
-
-    chains = {
-        whisker: build_chain(whisker, fidelity.link_count(whisker.arc_length))
-        for whisker in {job.whisker for job in plan.jobs}
-    }
+    chains = {whisker: fidelity.chain(whisker) for whisker in {job.whisker for job in plan.jobs}}
     pairs = pairs_in_full = steps_in_full = 0
     kinds: set[str] = set()
     counted: set[int] = set()
@@ -168,8 +163,7 @@ def explain(
             job = plan.jobs[index]
             chain = chains[job.whisker]
             pairs_in_full += chain.links * parts
-            step = fidelity.step(float(chain.frequencies()[0]) / (2 * math.pi))
-            steps_in_full += math.ceil((job.times[-1] - job.start) / step - 1e-6) + 1
+            steps_in_full += math.ceil((job.times[-1] - job.start) / fidelity.step_of(chain) - 1e-6) + 1
             if index not in counted and traces[index].steps:
                 pairs += reach.links(chain) * (reach.parts + reach.triangles)
             counted.add(index)

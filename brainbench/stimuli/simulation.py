@@ -72,8 +72,7 @@ def simulate(
         UsageError: the scenes do not fit together, or a name is unknown.
     """
     chosen = _checked(scenes)
-    fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
-    fidelity = Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
+    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend) if isinstance(backend, str) else backend
     path = cache_path(chosen, fidelity, engine) if cache and isinstance(backend, str) else None
     if path is not None and path.exists():
@@ -107,7 +106,7 @@ def prepare(
     such call: it takes the same arguments, and waits for the rest.
     """
     chosen = list(scenes)
-    fidelity = Fidelity.parse(fidelity or "balanced") if not isinstance(fidelity, Fidelity) else fidelity
+    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend)
     if not cache_path(chosen, fidelity, engine).exists():
         _begin(engine, chosen, fidelity, progress)

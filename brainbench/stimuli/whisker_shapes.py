@@ -71,8 +71,7 @@ def record(
     from brainbench.stimuli.simulation import cache_path
 
     times = np.atleast_1d(np.asarray(times, dtype=float))
-    fidelity = Fidelity.preset("balanced") if fidelity is None else fidelity
-    fidelity = Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
+    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend) if isinstance(backend, str) else backend
     jobs = [replace(job, times=times) for job in scene.jobs()]
     path = None

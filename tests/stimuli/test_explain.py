@@ -8,9 +8,9 @@ import xarray as xr
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import simulation
 from brainbench.stimuli.engines import reach as _reach
+from brainbench.stimuli.engines import stepping
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan, reach_of
-from brainbench.stimuli.engines.mujoco import engine
 from brainbench.stimuli.engines.mujoco.model import build_model
 from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.explain import Explanation
@@ -40,7 +40,7 @@ def _scene(label, *objects, **changes):
 @pytest.fixture
 def in_full(monkeypatch):
     """Make the engine simulate every whisker with every object, whether it can be reached or not."""
-    monkeypatch.setattr(engine, "reachable", lambda whisker, base, obstacles, times: Reach(obstacles, 0.0))
+    monkeypatch.setattr(stepping, "reachable", lambda whisker, base, obstacles, times: Reach(obstacles, 0.0))
 
 
 def test_runs_are_counted_as_simulated_shared_or_silent():
@@ -56,7 +56,7 @@ def test_runs_are_counted_as_simulated_shared_or_silent():
 def test_whiskers_without_motion_or_object_are_silent_and_a_full_simulation_feels_nothing_either(in_full, monkeypatch):
     scene = _scene("far", FAR, NEAR, whisking=Still(), array=ARRAY.select("C1,D6"))
     full = simulate(scene, fidelity=FAST, backend="mujoco", cache=False)
-    monkeypatch.setattr(engine, "reachable", _reach.reachable)
+    monkeypatch.setattr(stepping, "reachable", _reach.reachable)
     pruned = simulate(scene, fidelity=FAST, backend="mujoco", cache=False)
     told = Explanation.of(pruned)
     assert told.silent == 1
@@ -77,7 +77,7 @@ def test_whiskers_that_the_rodgers_solid_cannot_touch_feel_the_same_in_a_full_si
         label, scene.array.select(",".join(out)), scene.objects, scene.whisking, scene.head, Frames(0, 2e-3, 30)
     )
     full = simulate(short, fidelity=FAST, backend="mujoco", cache=False)
-    monkeypatch.setattr(engine, "reachable", _reach.reachable)
+    monkeypatch.setattr(stepping, "reachable", _reach.reachable)
     pruned = simulate(short, fidelity=FAST, backend="mujoco", cache=False)
     assert not full["contact"].any()
     scale = np.abs(pruned["wrench"].values).max(axis=(0, 1, 2))

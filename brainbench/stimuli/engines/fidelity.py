@@ -1,4 +1,4 @@
-"""How finely a whisker is simulated: presets, and the cheapest setting for a wanted error.
+"""Accuracy of a whisker simulation: presets, and the cheapest setting for a wanted error.
 
 Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this module is written by
 ``brainbench tradeoff whisker`` (:mod:`brainbench.stimuli.tradeoff`) and states how.
@@ -10,11 +10,15 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import resources
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.whiskers.chain import Chain
+    from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,11 @@ class Fidelity:
         return cls(**_PRESETS[name])
 
     @classmethod
+    def of(cls, value: Fidelity | str | None) -> Fidelity:
+        """Return a fidelity as it is, one from its text (:meth:`parse`), or ``balanced`` for None."""
+        return value if isinstance(value, Fidelity) else cls.parse(value or "balanced")
+
+    @classmethod
     def parse(cls, text: str) -> Fidelity:
         """Return a preset with some values replaced, as ``balanced`` or ``fast,links=12,solver=quasistatic``.
 
@@ -102,14 +111,28 @@ class Fidelity:
             raise UsageError(f"error must be positive (0.05 = 5 %); received {error!r}.")
         return cls(**cheapest(measured(backend), error).settings)
 
+    def chain(self, whisker: Whisker) -> Chain:
+        """Return the chain of links that stands for a whisker.
+
+        Raises:
+            UsageError: it would take more links than can be simulated sensibly.
+        """
+        from brainbench.stimuli.whiskers.chain import build_chain
+
+        return build_chain(whisker, self.link_count(whisker.arc_length))
+
+    def step_of(self, chain: Chain) -> float:
+        """Return the time step [s] of a chain."""
+        return self.step(float(chain.frequencies()[0]) / (2 * math.pi))
+
     def step(self, frequency: float) -> float:
-        """Time step [s] of a whisker whose first mode has this frequency [Hz]."""
+        """Return the time step [s] of a whisker whose first mode has this frequency [Hz]."""
         if self.steps_per_period is None or self.solver == "quasistatic":
             return self.time_step
         return min(self.time_step, 1 / (self.steps_per_period * frequency))
 
     def link_count(self, arc_length: float) -> int:
-        """Links of a whisker of this arc length [m].
+        """Return the number of links of a whisker of this arc length [m].
 
         Raises:
             UsageError: it would take more links than can be simulated sensibly.
@@ -150,7 +173,7 @@ _PRESETS = {
 
 
 def list_presets() -> tuple[str, ...]:
-    """Names that :meth:`Fidelity.preset` knows, cheapest first."""
+    """Return the names that :meth:`Fidelity.preset` knows, cheapest first."""
     return tuple(_PRESETS)
 
 

@@ -1,4 +1,4 @@
-"""What a list of scenes costs: which whisker runs are distinct, and what of each scene they could ever touch."""
+"""Distinct jobs of a list of scenes, and the objects that each whisker could ever touch."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class JobSchedule:
     reaches: tuple[tuple[Reach, ...], ...]
     """[scene][whisker] what of its scene the whisker could ever touch."""
     surfaces: bool = False
-    """Whether the engine touches exact surfaces where there are some, instead of convex parts."""
+    """True for an engine that touches exact surfaces where there are some, instead of convex parts."""
 
 
 def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> JobSchedule:

@@ -1,4 +1,4 @@
-"""What every physics engine takes and gives: one whisker on a prescribed follicle among obstacles.
+"""Input and output of every physics engine: one whisker on a prescribed follicle among obstacles.
 
 Whiskers never touch one another, so the unit of simulation is one whisker. Letters: n output frame.
 """
@@ -152,11 +152,11 @@ class WhiskerEngine(ABC):
     solvers: ClassVar[tuple[str, ...]] = ("dynamic",)
     """Values of :attr:`Fidelity.solver` it knows."""
     surfaces: ClassVar[bool] = False
-    """Whether it collides the exact surface of obstacles that have one; others collide convex parts."""
+    """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
     retries: ClassVar[bool] = False
-    """Whether it simulates whiskers that cannot be trusted again with finer steps."""
+    """True when it simulates whiskers that cannot be trusted again with finer steps."""
     batches: ClassVar[bool] = False
-    """Whether :meth:`run_sweeps` simulates many passive sweeps at once, without a scene for each."""
+    """True when :meth:`run_sweeps` simulates many passive sweeps at once, without a scene for each."""
 
     def prepare(  # noqa: B027 — engines that have nothing to prepare keep this one
         self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Reach:
-    """What of a scene lies within reach of one whisker."""
+    """Obstacles within reach of one whisker."""
 
     obstacles: tuple[Obstacle, ...]
     """The obstacles with only what is touched of them: their reachable parts, or their surface."""
@@ -27,7 +27,7 @@ class Reach:
     """Least distance of anything touched from the base (m); points at a smaller arc length cannot touch."""
 
     def __bool__(self) -> bool:
-        """Whether anything is within reach."""
+        """Return True when anything is within reach."""
         return bool(self.obstacles)
 
     @property

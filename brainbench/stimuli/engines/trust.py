@@ -74,7 +74,7 @@ class Verdict:
     retryable: NDArray[np.bool_]
     """True where finer steps may give a result that can be trusted."""
     reasons: NDArray[np.object_]
-    """What is wrong, in words; empty for a reliable whisker."""
+    """Fault of each whisker in words; empty for a reliable one."""
 
     @property
     def unstable(self) -> NDArray[np.bool_]:
@@ -279,7 +279,7 @@ def warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:
     worst, wanted = 0.0, 0.0
     for whisker in {job.whisker for job in jobs}:
         chain = build_chain(whisker, 8)
-        ratio = chain.achieved_damping_ratio(fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi)))
+        ratio = chain.achieved_damping_ratio(fidelity.step_of(chain))
         if ratio > 2 * whisker.damping_ratio and ratio > worst:
             worst, wanted = ratio, whisker.damping_ratio
     if worst:

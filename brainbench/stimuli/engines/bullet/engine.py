@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import functools
 import math
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -34,17 +33,15 @@ from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld, engine
 from brainbench.stimuli.engines.mujoco.drive import drive_scalars
 from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
-from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
     check_jobs,
-    passed_unseen,
     strongest_force,
     too_strong,
 )
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import rotation_matrix
-from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,7 +51,6 @@ if TYPE_CHECKING:
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.engines.protocol import Job, Progress
     from brainbench.stimuli.engines.reach import Reach
-    from brainbench.stimuli.whiskers.chain import Chain
 
 SEARCH = 0.02
 """Distance (mm), beside the way that the whisker may move in the step, within which contacts are sought."""
@@ -88,50 +84,34 @@ class BulletEngine(WhiskerEngine):
         check_jobs(self, jobs, fidelity, workers)
         traces = []
         for job in jobs:
-            traces.append(_simulate(job, fidelity, record_shape))
+            traces.append(_simulate(SteppedJob(job, fidelity, record_shape)))
             if progress is not None:
                 progress(len(traces), len(jobs))
         return traces
 
 
-def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
-    started = time.thread_time()
-    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
-    step = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi))
-    # Frame f lies at the (fractional) step where; linear interpolation between the two steps around it.
-    where = (job.times - job.start) / step
-    where = np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
-    before, after = np.floor(where).astype(int), np.ceil(where).astype(int)
-    times = job.start + step * np.arange(after[-1] + 2)
-    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
-    reach = reachable(job.whisker, position, job.obstacles, times)
-    missed, why = passed_unseen(job, reach, position, euler, times)
-    nearest = np.where(where - before < 0.5, before, after)
-    with BulletWorld(chain, reach.obstacles, reach.nearest, np.asarray(job.gravity, dtype=float)) as world:
-        run = _Run(job, chain, reach, world, times, frozenset(nearest.tolist()) if record_shape else frozenset())
-        computed = run.steps if run.moves or reach.obstacles else 0
-        run.integrate(computed)
-    failed = run.failed if computed else run.steps
-    if missed < failed:
-        failed, run.reason = missed, why
-    good = after < failed
-    before, after, nearest = (np.where(good, index, 0) for index in (before, after, nearest))
-    share = np.where(good, where - before, 0.0)[:, None]
-    wrench = (1 - share) * run.wrench[before] + share * run.wrench[after]
-    return Trace(
-        wrench=np.where(good[:, None], wrench, np.nan),
-        contact=np.isfinite(run.arc[nearest]) & good,
-        contact_arc=np.where(good, run.arc[nearest], np.nan),
+def _simulate(stepped: SteppedJob) -> Trace:
+    job = stepped.job
+    world = BulletWorld(stepped.chain, stepped.reach.obstacles, stepped.reach.nearest, np.asarray(job.gravity, float))
+    if stepped.is_silent:
+        return stepped.silent_trace()
+    shown = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []
+    with world:
+        run = _Run(stepped, world, frozenset(shown))
+        run.integrate()
+    failed, reason = stepped.end(run.failed, run.reason)
+    frames = stepped.frames(failed)
+    wrench = (1 - frames.share) * run.wrench[frames.before] + frames.share * run.wrench[frames.after]
+    nearest = frames.nearest
+    return stepped.trace(
+        frames,
+        wrench,
+        np.isfinite(run.arc[nearest]),
+        run.arc[nearest],
+        np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI if stepped.record_shape else np.zeros(0),
         penetration=run.penetration / MILLI,
-        status="unstable" if run.reason else "ok",
-        reason=run.reason,
-        steps=min(failed, computed),
-        seconds=time.thread_time() - started,
-        link_positions=np.where(
-            good[:, None, None], np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI, np.nan
-        )
-        if record_shape
-        else None,
+        reason=reason,
+        steps=min(failed, run.steps),
     )
 
 
@@ -156,15 +136,14 @@ class _Rows:
 class _Run:
     """State and results of one whisker; mm, ms, mg inside."""
 
-    def __init__(
-        self, job: Job, chain: Chain, reach: Reach, world: BulletWorld, times: NDArray, shapes_at: frozenset[int]
-    ) -> None:
+    def __init__(self, stepped: SteppedJob, world: BulletWorld, shapes_at: frozenset[int]) -> None:
+        job, chain, reach, times = stepped.job, stepped.chain, stepped.reach, stepped.times
         self.chain, self.world, self.times, self.loads = chain, world, times, job.loads
         self.step = float(times[1] - times[0]) * MILLI
         self.steps = len(times) - 1
         self.stiffness = np.repeat(chain.stiffness, 2) * MICRO
         self.damping = np.repeat(chain.damping(self.step / MILLI), 2) * MICRO * MILLI
-        self._prescribe(job, reach)
+        self._prescribe(*stepped.pose, reach)
         self.friction = np.array(
             [job.whisker.friction if item.friction is None else item.friction for item in reach.obstacles]
         )
@@ -177,8 +156,7 @@ class _Run:
         self._shapes_at = shapes_at
         self._beyond = (chain.whisker.arc_length - np.repeat(chain.nodes[:-1], 2)) * MILLI
 
-    def _prescribe(self, job: Job, reach: Reach) -> None:
-        position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(self.times))
+    def _prescribe(self, position: NDArray, euler: NDArray, reach: Reach) -> None:
         path = np.concatenate([position * MILLI, euler + np.array([-np.pi / 2, 0.0, np.pi / 2])], axis=1)
         self.path, self.drive = path, drive_scalars(path, self.step)
         self.frames = base_rotation(euler)
@@ -187,14 +165,10 @@ class _Run:
         self.poses = [(np.asarray(where, dtype=float) * MILLI, np.asarray(turn, dtype=float)) for where, turn in poses]
         self.turns = [rotation_matrix(turn) for _, turn in self.poses]
         self.travels = [item.motion is not None for item in reach.obstacles]
-        self.moves = bool(np.ptp(path, axis=0).max() > 0 or job.loads or np.any(job.gravity))
 
-    def integrate(self, steps: int) -> None:
-        """Compute ``steps`` steps, fewer when the state stops making sense; then ``reason`` says why."""
-        if not steps:
-            self.world.place([*self.path[0], *self.hinges])
-            self.shapes = dict.fromkeys([0, *self._shapes_at], self.world.shape())
-        for n in range(steps):
+    def integrate(self) -> None:
+        """Compute all steps, fewer when the state stops making sense; then ``reason`` says why."""
+        for n in range(self.steps):
             if n in self._shapes_at or not n:
                 self.world.place([*self.path[n], *self.hinges])
                 self.shapes[n] = self.world.shape()

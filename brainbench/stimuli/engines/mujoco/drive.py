@@ -44,8 +44,11 @@ def drive_free(position: NDArray[np.float64], quaternion: NDArray[np.float64], s
     MuJoCo integrates a quaternion by the constant body-frame rotation of each step, so the rotation
     vector from sample to sample is the velocity that reproduces them.
     """
+    from scipy.spatial.transform import Rotation
+
     linear = np.diff(position, axis=0) / step
-    angular = _rotation_vector(_multiply(_conjugate(quaternion[:-1]), quaternion[1:])) / step
+    turns = Rotation.from_quat(np.roll(quaternion, -1, axis=-1))
+    angular = (turns[:-1].inv() * turns[1:]).as_rotvec() / step
     return _drive(np.concatenate([position, quaternion], axis=1)[:-1], np.concatenate([linear, angular], axis=1), step)
 
 
@@ -56,22 +59,3 @@ def _drive(position: NDArray, after: NDArray, step: float) -> PrescribedMotion:
     # The acceleration at the start is unknown before the first sample: continue the next one.
     acceleration[0] = acceleration[1] if len(after) > 1 else 0.0
     return PrescribedMotion(position, after - step * acceleration, acceleration)
-
-
-def _conjugate(q: NDArray) -> NDArray[np.float64]:
-    return q * np.array([1.0, -1.0, -1.0, -1.0])
-
-
-def _multiply(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """Hamilton product of quaternions [n, 4]."""
-    scalar = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], axis=1, keepdims=True)
-    vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
-    return np.concatenate([scalar, vector], axis=1)
-
-
-def _rotation_vector(q: NDArray) -> NDArray[np.float64]:
-    """Rotation vectors [n, 3] of unit quaternions [n, 4], the short way round."""
-    q = np.where(q[:, :1] < 0, -q, q)
-    sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
-    angle = 2 * np.arctan2(sine, q[:, :1])
-    return np.where(sine > 1e-12, q[:, 1:] * angle / np.maximum(sine, 1e-300), 2 * q[:, 1:])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -21,16 +20,14 @@ from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE
 from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
 from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
-from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
     check_jobs,
-    passed_unseen,
     strongest_force,
     too_strong,
 )
 from brainbench.stimuli.engines.units import MICRO, MILLI
-from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -67,7 +64,7 @@ class MujocoWhiskerEngine(WhiskerEngine):
         check_jobs(self, jobs, fidelity, workers)
 
         def run(group: Sequence[int]) -> dict[int, Trace]:
-            return {index: _simulate(jobs[index], fidelity, record_shape) for index in group}
+            return {index: _simulate(SteppedJob(jobs[index], fidelity, record_shape)) for index in group}
 
         groups = [[index] for index in range(len(jobs))]
         with _quiet():
@@ -86,59 +83,36 @@ def _quiet() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _simulate(job: Job, fidelity: Fidelity, record_shape: bool) -> Trace:
-    started = time.thread_time()
-    chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
-    step = fidelity.step(float(chain.frequencies()[0]) / (2 * np.pi))
-    # Frame f lies at the (fractional) step where; linear interpolation between the two steps around it.
-    where = (job.times - job.start) / step
-    where = np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
-    before = np.floor(where).astype(int)
-    after = np.ceil(where).astype(int)
-    times = job.start + step * np.arange(after[-1] + 2)
-    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
-    reach = reachable(job.whisker, position, job.obstacles, times)
-    built = build_model(job, chain, reach, step, times)
-    still = not built.drives and not job.loads and not np.any(job.gravity)
-    if still and not reach.obstacles:
-        rest = _shape(built, chain, np.zeros((1, 2 * chain.links)), np.array([0])) / MILLI
-        return Trace(
-            wrench=np.zeros((len(where), 6)),
-            contact=np.zeros(len(where), dtype=bool),
-            contact_arc=np.full(len(where), np.nan),
-            seconds=time.thread_time() - started,
-            link_positions=np.repeat(rest, len(where), axis=0) if record_shape else None,
-        )
-    sensors, hinges, failed, reason = _integrate(built, job, chain.links, times)
-    missed, why = passed_unseen(job, reach, position, euler, times)
-    if missed < failed:
-        failed, reason = missed, why
-    good = after < failed
-    before, after = np.where(good, before, 0), np.where(good, after, 0)
-    share = np.where(good, where - before, 0.0)[:, None]
-    wrench = (1 - share) * _wrench(built, sensors, before) + share * _wrench(built, sensors, after)
-    nearest = np.where(share[:, 0] < 0.5, before, after)
+def _simulate(run: SteppedJob) -> Trace:
+    if run.is_silent:
+        return run.silent_trace()
+    job, chain = run.job, run.chain
+    built = build_model(job, chain, run.reach, run.step, run.times)
+    sensors, hinges, failed, reason = _integrate(built, job, chain.links, run.times)
+    failed, reason = run.end(failed, reason)
+    frames = run.frames(failed)
+    share, nearest = frames.share, frames.nearest
+    wrench = (1 - share) * _wrench(built, sensors, frames.before) + share * _wrench(built, sensors, frames.after)
     shape = _shape(built, chain, hinges[nearest], nearest)
     contact, arc = _contacts(sensors[nearest, 6:], shape, chain)
-    if record_shape:
+    if run.record_shape:
         # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
-        ends = (_shape(built, chain, hinges[steps], steps) for steps in (before, after))
-        shape = sum(weight[..., None] * end for weight, end in zip((1 - share, share), ends, strict=True))
-    return Trace(
-        wrench=np.where(good[:, None], wrench, np.nan),
-        contact=contact & good,
-        contact_arc=np.where(good, arc, np.nan),
+        first, second = (_shape(built, chain, hinges[steps], steps) for steps in (frames.before, frames.after))
+        shape = (1 - share)[..., None] * first + share[..., None] * second
+    return run.trace(
+        frames,
+        wrench,
+        contact,
+        arc,
+        shape / MILLI,
         penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
-        status="unstable" if reason else "ok",
         reason=reason,
         steps=min(failed, len(sensors)),
-        seconds=time.thread_time() - started,
-        link_positions=np.where(good[:, None, None], shape / MILLI, np.nan) if record_shape else None,
     )
 
 
 def _wrench(built: WhiskerModel, sensors: NDArray, steps: NDArray) -> NDArray[np.float64]:
-    """Force and moment [n, 6] (N, N·m, world) of the whisker on its base before ``steps`` [n]."""
+    """Return force and moment [n, 6] (N, N·m, world) of the whisker on its base before ``steps`` [n]."""
     local = sensors[steps, :6] * np.repeat([1 / MILLI, 1 / MICRO], 3)
     # MuJoCo's sensor reads the action of the base on the whisker, in the frame of the base.
     return -np.einsum("nij,nkj->nki", built.rotation[steps], local.reshape(-1, 2, 3)).reshape(-1, 6)
@@ -200,7 +174,7 @@ def _integrate(
 
 
 def _control(built: WhiskerModel, job: Job, times: NDArray, first: int) -> NDArray[np.float64]:
-    """Inputs of every step [count, …]: generalised forces that drive the prescribed joints, then the loads."""
+    """Return the inputs of every step [count, …]: generalised forces on the prescribed joints, then the loads."""
     forces = np.zeros((len(times), built.model.nv))
     column = 0
     for drive in built.drives:
@@ -216,7 +190,7 @@ def _control(built: WhiskerModel, job: Job, times: NDArray, first: int) -> NDArr
 
 
 def _shape(built: WhiskerModel, chain: Chain, hinges: NDArray, steps: NDArray) -> NDArray[np.float64]:
-    """Joint and tip positions [n, N + 1, 3] (mm, world) from the hinge angles [n, 2N] before ``steps`` [n]."""
+    """Return joint and tip positions [n, N + 1, 3] (mm, world) from the hinge angles [n, 2N] before ``steps`` [n]."""
     frame = built.rotation[steps]
     points = [built.base[steps]]
     for i in range(chain.links):
@@ -227,7 +201,7 @@ def _shape(built: WhiskerModel, chain: Chain, hinges: NDArray, steps: NDArray) -
 
 
 def _rotation_zyz(rest: float, y: NDArray, z: NDArray) -> NDArray[np.float64]:
-    """Rotations [n, 3, 3] Rz(rest) · Ry(y) · Rz(z)."""
+    """Return rotations [n, 3, 3] Rz(rest) · Ry(y) · Rz(z)."""
     cr, sr = np.cos(rest), np.sin(rest)
     cy, sy, cz, sz = np.cos(y), np.sin(y), np.cos(z), np.sin(z)
     zero = np.zeros_like(y)
@@ -236,7 +210,7 @@ def _rotation_zyz(rest: float, y: NDArray, z: NDArray) -> NDArray[np.float64]:
 
 
 def _contacts(slots: NDArray, shape: NDArray, chain: Chain) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Whether there is contact [n], and the force-weighted mean arc length (m) of the contact points [n]."""
+    """Return whether there is contact [n], and the force-weighted mean arc length (m) of the contact points [n]."""
     slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
     force = np.linalg.norm(slots[..., 1:4], axis=-1)
     total = force.sum(axis=1)
@@ -248,7 +222,7 @@ def _contacts(slots: NDArray, shape: NDArray, chain: Chain) -> tuple[NDArray[np.
 
 
 def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.float64]:
-    """Arc lengths [n, k] (m) of the points of the chain [n, N + 1, 3] that are nearest to ``points`` [n, k, 3]."""
+    """Return the arc lengths [n, k] (m) of the points of chains [n, N + 1, 3] nearest to ``points`` [n, k, 3]."""
     along = np.diff(joints, axis=1)[:, None]
     offset = points[:, :, None] - joints[:, None, :-1]
     share = np.clip(np.sum(offset * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
@@ -259,7 +233,7 @@ def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.
 
 
 def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Chain) -> float:
-    """Deepest overlap (m) of whisker and obstacle over all steps.
+    """Return the deepest overlap (m) of whisker and obstacle over all steps.
 
     MuJoCo reports the distance from the core of a link, so the link's margin is added back.
     """

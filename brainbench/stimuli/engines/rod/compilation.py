@@ -54,5 +54,5 @@ def load_kernels(
 
 
 def _kept(module: Any, block: int | None) -> bool:
-    """Whether Warp has compiled a module before."""
+    """Return True when Warp has compiled a module before."""
     return Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()

@@ -12,16 +12,16 @@ import numpy as np
 
 from brainbench.core.devices import pick_device, usable_processors
 from brainbench.stimuli.engines.job_pool import run_groups
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
 from brainbench.stimuli.engines.rod.limits import WIDEST
 from brainbench.stimuli.engines.rod.packing import KNOT, PackedJobs, PackedMotions, capacity_for, follicle_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
+from brainbench.stimuli.engines.stepping import is_silent, silent_trace
 from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
 from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -155,11 +155,10 @@ def _simulate(
         started = time.thread_time()
         position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
         reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
-        moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
-        if reach or moves or job.loads or np.any(job.gravity):
-            tasks.append(_Task(index, job, reach, seen, position, euler))
+        if is_silent(job, reach, position, euler):
+            traces[index] = silent_trace(job, fidelity, record_shape, time.thread_time() - started)
         else:
-            traces[index] = _silent(job, fidelity, record_shape, started)
+            tasks.append(_Task(index, job, reach, seen, position, euler))
     if not tasks:
         return traces
     seconds = np.zeros(len(tasks))
@@ -190,7 +189,7 @@ def _launch(
     for task in tasks:
         job, obstacles = task.job, task.reach.obstacles
         if job.whisker not in chains:
-            chains[job.whisker] = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
+            chains[job.whisker] = fidelity.chain(job.whisker)
         alike = tuple((id(item.motion), item.friction, *map(id, (item.surface, *item.parts))) for item in obstacles)
         if alike not in scenes:
             scenes[alike] = shapes.add_scene(obstacles, motions, start, stop)
@@ -222,25 +221,6 @@ def _launch(
         record_shape=record_shape,
     )
     return result, time.thread_time() - started
-
-
-def _silent(job: Job, fidelity: Fidelity, record_shape: bool, started: float) -> Trace:
-    """Return the trace of a whisker that feels nothing."""
-    count = len(job.times)
-    shape = None
-    if record_shape:
-        chain = build_chain(job.whisker, fidelity.link_count(job.whisker.arc_length))
-        position, euler = job.follicle.pose(job.times[:1])
-        rest = np.pad(chain.points, ((0, 0), (0, 1))) @ base_rotation(euler)[0].T + position[0]
-        shape = np.repeat(rest[None], count, axis=0)
-    return Trace(
-        wrench=np.zeros((count, 6)),
-        contact=np.zeros(count, dtype=bool),
-        contact_arc=np.full(count, np.nan),
-        seconds=time.thread_time() - started,
-        link_positions=shape,
-        contact_wrench=np.zeros((count, 6)) if record_shape else None,
-    )
 
 
 def _too_fast(task: _Task, shortest: float) -> tuple[float, float]:

@@ -106,7 +106,7 @@ class WhiskerSolver:
             device: a Warp device.
             needs: what there is to touch; see :mod:`brainbench.stimuli.engines.rod.limits`.
             block: threads of a block on a GPU; Warp's choice when None.
-            sliced: whether whiskers pause for looks at meshes and for contact forces (:class:`.scheduling.Slices`).
+            sliced: True when whiskers pause for distances and contact forces (:class:`.scheduling.Slices`).
             options: further ones of :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
         """
         self.chains, self.device, self.sliced = list(chains), device, sliced
@@ -119,7 +119,7 @@ class WhiskerSolver:
         packed = PackedChains(self.capacity, self.chains, self.quasistatic)
         self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed.arrays(), device)
         self.block = {} if block is None else {"block_dim": block}
-        self.steps = np.array([fidelity.step(float(c.frequencies()[0]) / (2 * np.pi)) * MILLI for c in self.chains])
+        self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
         """[whisker] longest time step (ms)."""
         self.shortest = self.steps / FINEST / MILLI
         """[whisker] shortest time step (s)."""

@@ -24,7 +24,7 @@ as when a whisker slips off; what one step of 1 ms leaves of a slow mode is this
 REST = 1e-6
 """Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
 FAR = 3.0
-"""How far (mm) a distance query looks; a link further away is looked at again when it may have come nearer."""
+"""Farthest distance (mm) that a query finds; a link further away is asked for again when it may have come nearer."""
 TRAVEL = 0.25
 """Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
 FINEST = 16

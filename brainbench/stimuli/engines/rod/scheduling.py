@@ -1,4 +1,4 @@
-"""Whiskers in slices: on a GPU a whisker pauses where it must look at a mesh, and all looks are made together.
+"""Whiskers in slices: on a GPU a whisker pauses where it needs distances from a mesh, which are found for all at once.
 
 Where one thread walks through a tree of triangles, or solves for the forces of eight contacts, 31 neighbours wait. Here
 every whisker takes steps until it needs to know what is near, or what its contacts do; further kernels answer all of
@@ -25,17 +25,16 @@ from brainbench.stimuli.engines.rod.limits import (
 BUDGET = 4
 """Steps of a whisker in one slice."""
 FEW = 2**14
-"""Whiskers below which it is one step: each kernel of a slice then takes as long as its slowest thread, and whiskers in
-contact, which need two slices a step, would wait for others' four."""
-ROUNDS = 8
-"""Slices (an even number) between two looks of the host at what is left to do."""
-
-LOOKING = 2**19
-"""Most threads that look at once: a few times as many as a GPU runs side by side."""
+"""Whiskers below which a slice is one step: a kernel then takes as long as its slowest thread, and whiskers in contact,
+which need two slices a step, would wait for others' four."""
+SLICES_PER_CHECK = 8
+"""Slices (an even number) after which the host counts the whiskers that are left."""
+MOST_THREADS = 2**19
+"""Most threads that find distances at once: a few times as many as a GPU runs side by side."""
 
 
 class Slices:
-    """What is kept of each whisker between its slices."""
+    """Whiskers of one launch that take turns with the kernels that work for them."""
 
     def __init__(
         self,
@@ -49,10 +48,10 @@ class Slices:
         wp = warp()
         self.kernels, self.device, self.lanes, self.capacity = kernels, device, lanes, capacity
         self.recorded = device.is_cuda if recorded is None else recorded
-        # Looks and contact forces of a slice need not wait for each other.
+        # Distances and contact forces of a slice need not wait for each other.
         self.streams = [wp.Stream(device) if self.recorded else None for _ in kernels.solve_contacts]
-        self.looks = max(4 * lanes, capacity)
-        queues, links, queries = (3, lanes), (capacity, lanes), self.looks
+        self.queries = max(4 * lanes, capacity)
+        queues, links = (3, lanes), (capacity, lanes)
         on = self.struct = allocate(
             kernels.structs.PausedWhiskers,
             device,
@@ -61,7 +60,7 @@ class Slices:
             **dict.fromkeys(("query_count", "next_query_count"), 1),
             **dict.fromkeys(("state", "query_time", "query_margin"), lanes),
             link=links,
-            **dict.fromkeys(("query", "answer"), queries),
+            **dict.fromkeys(("query", "answer"), self.queries),
         )
         on.budget = budget or (1 if lanes < FEW else BUDGET)
         queue = np.zeros(queues, dtype=np.int32)
@@ -77,11 +76,11 @@ class Slices:
             inputs: arguments of the kernel ``run`` but for the last.
             block: threads of a block.
         """
-        wp, rounds, left = warp(), 0, self.lanes
+        wp, slices, left = warp(), 0, self.lanes
         graph, fits = None, 0
         while left:
             # What is left is counted rarely; whiskers end meanwhile, but none are added.
-            if not self.recorded or rounds == 0:
+            if not self.recorded or slices == 0:
                 self._several(inputs, left, block)
             else:
                 if 2 * left <= fits or graph is None:
@@ -89,13 +88,14 @@ class Slices:
                         self._several(inputs, left, block)
                     graph, fits = capture.graph, left
                 wp.capture_launch(graph)
-            rounds += ROUNDS
+            slices += SLICES_PER_CHECK
             left = int(self.struct.queue_size.numpy().sum())
-        return rounds
+        return slices
 
     def _several(self, inputs: list[Any], left: int, block: int) -> None:
+        """Launch some slices for at most ``left`` whiskers."""
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
-        for _ in range(ROUNDS):
+        for _ in range(SLICES_PER_CHECK):
             wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, block_dim=block)
             on.queue, on.next_queue = on.next_queue, on.queue
             wp.launch(kernels.swap_queues, 1, [on], device=device)
@@ -105,10 +105,10 @@ class Slices:
                 if stream is not None:
                     stream.wait_stream(device.stream)
                 wp.launch(kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=CONTACT_BOUNDS[0])
-            looks = min(self.looks, self.capacity * left) * kernels.distance_group
-            looks = min(-(-looks // WARP) * WARP, LOOKING)
+            many = min(self.queries, self.capacity * left) * kernels.distance_group
+            many = min(-(-many // WARP) * WARP, MOST_THREADS)
             wp.launch(
-                kernels.measure_distances, looks, [*inputs[:4], on, looks], device=device, block_dim=DISTANCE_BOUNDS[0]
+                kernels.measure_distances, many, [*inputs[:4], on, many], device=device, block_dim=DISTANCE_BOUNDS[0]
             )
             for stream in self.streams:
                 if stream is not None:

@@ -61,7 +61,7 @@ class PackedShapes:
     """Shapes of all scenes, and the surfaces among them."""
 
     columns: list[dict[str, Any]] = field(default_factory=list)
-    """What the kernel's ``ShapeArrays`` hold of each shape, some shapes at a time, [shape, …]."""
+    """Columns of the kernel's ``ShapeArrays``, some shapes at a time, [shape, …]."""
     first: list[int] = field(default_factory=lambda: [0])
     surfaces: list[PackedSurface] = field(default_factory=list)
     triangles: int = 0
@@ -134,7 +134,7 @@ class PackedShapes:
 
     @property
     def needs(self) -> int:
-        """What the kernel must be able to touch."""
+        """Kinds of shapes that the kernel must be able to touch."""
         return MESHES if self.surfaces else PRIMITIVES if self.columns else NOTHING
 
     def arrays(self) -> dict[str, NDArray]:

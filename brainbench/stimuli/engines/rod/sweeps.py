@@ -27,7 +27,6 @@ from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable
 from brainbench.stimuli.engines.trust import run_with_retries
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.placement import euler_matrix
-from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,7 +69,7 @@ class SweepLauncher:
         self.seconds: dict[str, float] = {}
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
-        chains = [build_chain(m.whisker, fidelity.link_count(m.whisker.arc_length)) for m in mounts]
+        chains = [fidelity.chain(mount.whisker) for mount in mounts]
         self.solver = WhiskerSolver(chains, fidelity, self.device, against, block=BLOCK, sliced=sliced, bounds=bounds)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)

@@ -12,6 +12,7 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.whiskers.chain import build_chain
 from tests.factories.whiskers import C2
@@ -51,13 +52,12 @@ def test_the_follicle_follows_its_trajectory_to_a_millionth_against_a_post():
     assert trace.contact.any()
     assert trace.link_positions is not None
     # The recorded shape uses the prescribed base; the engine's own base is checked through its state.
-    from brainbench.stimuli.engines.mujoco import engine
     from brainbench.stimuli.engines.mujoco import model as _mujoco_model
 
     job = Job(C2, follicle, (_post(0.010, 0.002),), times)
     steps = np.arange(0.0, 1002.0) * 1e-4
     chain = build_chain(C2, 8)
-    reach = engine.reachable(C2, follicle.pose(steps)[0], job.obstacles, steps)
+    reach = reachable(C2, follicle.pose(steps)[0], job.obstacles, steps)
     built = _mujoco_model.build_model(job, chain, reach, 1e-4, steps)
     followed = _follow(built, len(steps) - 1)
     wanted = built.drives[-1].position

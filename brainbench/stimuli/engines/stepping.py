@@ -1,0 +1,161 @@
+"""Jobs that need no simulation, and jobs in equal time steps. Letters: n frame, s step."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.stimuli.engines.reach import Reach, reachable
+from brainbench.stimuli.engines.trust import passed_unseen
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from brainbench.stimuli.engines.fidelity import Fidelity
+    from brainbench.stimuli.engines.protocol import Job
+    from brainbench.stimuli.whiskers.chain import Chain
+
+
+def is_silent(job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64]) -> bool:
+    """Return True for a whisker that can feel nothing: nothing in reach, a still base, no gravity and no loads.
+
+    Args:
+        job: the whisker.
+        reach: what it could ever touch.
+        position: base point [n, 3] over the whole job.
+        euler: angles of the base [n, 3].
+    """
+    moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
+    return not (reach or moves or job.loads or np.any(job.gravity))
+
+
+def silent_trace(job: Job, fidelity: Fidelity, record_shape: bool, seconds: float) -> Trace:
+    """Return the trace of a whisker that feels nothing: exactly zero, without simulation."""
+    count, shape = len(job.times), None
+    if record_shape:
+        position, euler = job.follicle.pose(job.times[:1])
+        rest = np.pad(fidelity.chain(job.whisker).points, ((0, 0), (0, 1))) @ base_rotation(euler)[0].T + position[0]
+        shape = np.repeat(rest[None], count, axis=0)
+    return Trace(
+        wrench=np.zeros((count, 6)),
+        contact=np.zeros(count, dtype=bool),
+        contact_arc=np.full(count, np.nan),
+        seconds=seconds,
+        link_positions=shape,
+        contact_wrench=np.zeros((count, 6)) if record_shape else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSteps:
+    """Steps around each frame; values in between are interpolated linearly."""
+
+    good: NDArray[np.bool_]
+    """[n] True where both steps can be trusted; the others take step 0."""
+    before: NDArray[np.int_]
+    """[n]"""
+    after: NDArray[np.int_]
+    """[n]"""
+    share: NDArray[np.float64]
+    """[n, 1] weight of ``after``."""
+
+    @property
+    def nearest(self) -> NDArray[np.int_]:
+        """[n] nearer of the two steps."""
+        return np.where(self.share[:, 0] < 0.5, self.before, self.after)
+
+
+@dataclass(frozen=True, eq=False)
+class SteppedJob:
+    """A job cut into equal time steps."""
+
+    job: Job
+    fidelity: Fidelity
+    record_shape: bool
+    started: float = field(default_factory=time.thread_time)
+    """Processor time at which the work on it began [s]."""
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The whisker as a chain of links."""
+        return self.fidelity.chain(self.job.whisker)
+
+    @cached_property
+    def step(self) -> float:
+        """Time step [s]."""
+        return self.fidelity.step_of(self.chain)
+
+    @cached_property
+    def where(self) -> NDArray[np.float64]:
+        """[n] frames in steps; whole where they fall on one."""
+        where = (self.job.times - self.job.start) / self.step
+        return np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
+
+    @cached_property
+    def times(self) -> NDArray[np.float64]:
+        """[s + 1] beginnings of the steps, and the end of the last (s)."""
+        count = int(np.ceil(self.where[-1])) + 2
+        return np.asarray(self.job.start + self.step * np.arange(count), dtype=np.float64)
+
+    @cached_property
+    def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Base points [s + 1, 3] (m) and angles [s + 1, 3] (rad)."""
+        position, euler = self.job.follicle.pose(self.times)
+        return np.asarray(position, dtype=float), np.asarray(euler, dtype=float)
+
+    @cached_property
+    def reach(self) -> Reach:
+        """Obstacles that the whisker could ever touch, in convex parts."""
+        return reachable(self.job.whisker, self.pose[0], self.job.obstacles, self.times)
+
+    @property
+    def is_silent(self) -> bool:
+        """True when the whisker feels nothing."""
+        return is_silent(self.job, self.reach, *self.pose)
+
+    def silent_trace(self) -> Trace:
+        """Return the trace of a whisker that feels nothing."""
+        return silent_trace(self.job, self.fidelity, self.record_shape, time.thread_time() - self.started)
+
+    def end(self, failed: int, reason: str) -> tuple[int, str]:
+        """Return the first step that cannot be trusted and why, given what the integration found."""
+        missed, why = passed_unseen(self.job, self.reach, *self.pose, self.times)
+        return (missed, why) if missed < failed else (failed, reason)
+
+    def frames(self, failed: int) -> FrameSteps:
+        """Return the steps around each frame when those from ``failed`` on cannot be trusted."""
+        before, after = np.floor(self.where).astype(int), np.ceil(self.where).astype(int)
+        good = after < failed
+        before, after = np.where(good, before, 0), np.where(good, after, 0)
+        return FrameSteps(good, before, after, np.where(good, self.where - before, 0.0)[:, None])
+
+    def trace(
+        self,
+        frames: FrameSteps,
+        wrench: NDArray[np.float64],
+        contact: NDArray[np.bool_],
+        arc: NDArray[np.float64],
+        shape: NDArray[np.float64],
+        *,
+        penetration: float,
+        reason: str,
+        steps: int,
+    ) -> Trace:
+        """Return the trace of values at the frames, NaN where they cannot be trusted; ``shape`` in m."""
+        good = frames.good
+        return Trace(
+            wrench=np.where(good[:, None], wrench, np.nan),
+            contact=contact & good,
+            contact_arc=np.where(good, arc, np.nan),
+            penetration=penetration,
+            status="unstable" if reason else "ok",
+            reason=reason,
+            steps=steps,
+            seconds=time.thread_time() - self.started,
+            link_positions=np.where(good[:, None, None], shape, np.nan) if self.record_shape else None,
+        )
