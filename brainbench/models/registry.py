@@ -127,27 +127,94 @@ def list_models(pattern: str = "*") -> list[str]:
     return [name for name in _known() if fnmatchcase(name, pattern)]
 
 
-def find_record(name: str) -> ModelRecord:
-    """Return a copy of an architecture's record; a tag in the name is checked and left out.
+@dataclass(frozen=True)
+class LocatedModel:
+    """What a name stands for: the registered architecture, and where its weights are if it is a trained one."""
+
+    name: str
+    record: ModelRecord
+    architecture: Architecture
+    """Parts of the name."""
+    trained: Mapping[str, Any] | None = None
+    """Configuration of the trained weights; None without a folder of them."""
+    weights: Path | None = None
+    """Safetensors file; None for untrained weights, and where there are none yet."""
+
+    def build(self, seed: int = 0, **options: Any) -> nn.Module:
+        """Build the model with its weights, in evaluation mode; untrained weights follow from the seed alone.
+
+        Raises:
+            UsageError: an option is unknown, or nobody trained weights for this name yet.
+            DataError: the weights are unreadable or do not fit.
+        """
+        from brainbench.models.ops.seeding import seeded
+
+        if self.weights is None and self.architecture.tag is not None:
+            raise UsageError(
+                f"There are no weights for {self.name!r} yet; train them with: brainbench train "
+                f"{self.architecture.untrained} --objective {self.architecture.tag}; or load the untrained model "
+                f"{self.architecture.untrained!r}."
+            )
+        with seeded(seed):
+            model = self._make(options)
+        if self.weights is not None:
+            load_weights(model, self.weights, what=self.name)
+        return model.eval()
+
+    def outline(self) -> nn.Module:
+        """Build the model without allocating its weights, to count them."""
+        import torch
+
+        from brainbench.models.ops.seeding import seeded
+
+        with seeded(0):
+            try:
+                with torch.device("meta"):
+                    return self._make({})
+            except (RuntimeError, NotImplementedError):  # a model that computes with values while it is built
+                return self._make({})
+
+    def _make(self, options: Mapping[str, Any]) -> nn.Module:
+        options = {**(self.trained["options"] if self.trained else {}), **options}
+        accepted = inspect.signature(self.record.build).parameters
+        for option in options:
+            if option not in accepted and not any(item.kind is item.VAR_KEYWORD for item in accepted.values()):
+                raise unknown_name(f"option of the model {self.record.name!r}", option, accepted)
+        return check_module(self.record.build(**options), self.record.name)
+
+
+def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) -> LocatedModel:
+    """Find what a name stands for, without building anything.
+
+    Args:
+        name: ``architecture`` (untrained), ``architecture.tag`` (trained with that objective), or a folder of
+            trained weights as ``local-dir:PATH`` or ``hf-hub:OWNER/NAME[@REVISION]``.
+        pretrained: Folder of a checkpoint, or safetensors file, with the weights of a tagged name.
 
     Raises:
-        UsageError: no such model or tag; the message names the nearest.
+        UsageError: no such model or tag, or weights given for a name that takes none.
+        DataError: the folder of weights is missing or damaged.
+        MissingDependencyError: a hub was named and its client is not installed.
     """
-    return replace(_known()[resolve_name(name).untrained])
-
-
-def resolve_name(name: str) -> Architecture:
-    """Return the parts of a name that exists.
-
-    Raises:
-        UsageError: no such model or tag; the message names the nearest.
-    """
-    parts, known = Architecture.parse(name), _known()
+    is_path = name.startswith(PREFIXES)
+    if is_path and pretrained is not None:
+        raise UsageError(f"{name!r} already names trained weights; pretrained is for registry names with a tag.")
+    given = Path(pretrained) if pretrained is not None and Path(pretrained).is_dir() else None
+    folder = find_folder(name) if is_path else given or (shipped().get(name) if pretrained is None else None)
+    trained = None if folder is None else read_config(folder)
+    parts, known = Architecture.parse(trained["architecture"] if is_path and trained else name), _known()
     if parts.untrained not in known:
         raise unknown_name("model", parts.untrained, known, hint="See them all with: brainbench models")
     if parts.tag is not None and parts.tag not in OBJECTIVES:
         raise unknown_name(f"weights tag of {parts.untrained!r}", parts.tag, OBJECTIVES)
-    return parts
+    if parts.tag is None and pretrained is not None:
+        raise UsageError(
+            f"Without a tag {name!r} is the untrained model; name the objective its weights were trained with, "
+            f"for example {name}.{OBJECTIVES[0]!s}, to load {os.fspath(pretrained)!r}."
+        )
+    weights = folder / WEIGHTS if folder is not None else None if pretrained is None else Path(pretrained)
+    # A look-up returns a copy: nobody changes the registry by what it gave.
+    return LocatedModel(name, replace(known[parts.untrained]), parts, trained, weights)
 
 
 def load_model(
@@ -168,38 +235,7 @@ def load_model(
         DataError: the weights are missing, unreadable or do not fit.
         MissingDependencyError: a hub was named and its client is not installed.
     """
-    folder = None
-    if name.startswith(PREFIXES):
-        if pretrained is not None:
-            raise UsageError(f"{name!r} already names trained weights; pretrained is for registry names with a tag.")
-        folder = find_folder(name)
-        parts = resolve_name(read_config(folder)["architecture"])
-    else:
-        parts = resolve_name(name)
-        if parts.tag is None and pretrained is not None:
-            raise UsageError(
-                f"Without a tag {name!r} is the untrained model; name the objective its weights were trained with, "
-                f"for example {name}.{OBJECTIVES[0]!s}, to load {os.fspath(pretrained)!r}."
-            )
-        if pretrained is not None and Path(pretrained).is_dir():
-            folder = Path(pretrained)
-        elif parts.tag is not None and pretrained is None:
-            folder = shipped().get(name)
-            if folder is None:
-                raise UsageError(
-                    f"There are no weights for {name!r} yet; train them with: brainbench train {parts.untrained} "
-                    f"--objective {parts.tag}; or load the untrained model {parts.untrained!r}."
-                )
-    if folder is not None:
-        config = read_config(folder)
-        options, pretrained = {**config["options"], **options}, folder / WEIGHTS
-    from brainbench.models.ops.seeding import seeded
-
-    with seeded(seed):
-        model = _build(parts.untrained, options)
-    if pretrained is not None:
-        load_weights(model, pretrained, what=name)
-    return model.eval()
+    return locate_model(name, pretrained).build(seed, **options)
 
 
 def describe_model(name: str) -> ModelDescription:
@@ -208,23 +244,11 @@ def describe_model(name: str) -> ModelDescription:
     Raises:
         UsageError: there is no such model.
     """
-    import torch
-
-    from brainbench.models.ops.seeding import seeded
-
-    folder = find_folder(name) if name.startswith(PREFIXES) else shipped().get(name)
-    trained = read_config(folder) if folder is not None else None
-    record = find_record(trained["architecture"] if trained is not None else name)
-    options = trained["options"] if trained is not None else {}
-    with seeded(0):
-        try:
-            with torch.device("meta"):
-                model = _build(record.name, options)
-        except (RuntimeError, NotImplementedError):  # a model that computes with values while it is built
-            model = _build(record.name, options)
+    found = locate_model(name)
+    record, model = found.record, found.outline()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
     return ModelDescription(
-        record.name if trained is None else name,
+        record.name if found.trained is None else name,
         record.family,
         record.description,
         record.citation,
@@ -233,17 +257,8 @@ def describe_model(name: str) -> ModelDescription:
         parameters=sum(parameter.numel() for parameter in model.parameters()),
         multiply_adds=count() if count is not None else None,
         layers=tuple(getattr(model, "layers", ())),
-        trained=trained,
+        trained=found.trained,
     )
-
-
-def _build(architecture: str, options: Mapping[str, Any]) -> nn.Module:
-    build = _known()[architecture].build
-    accepted = inspect.signature(build).parameters
-    for option in options:
-        if option not in accepted and not any(item.kind is item.VAR_KEYWORD for item in accepted.values()):
-            raise unknown_name(f"option of the model {architecture!r}", option, accepted)
-    return check_module(build(**options), architecture)
 
 
 def _known() -> dict[str, ModelRecord]:

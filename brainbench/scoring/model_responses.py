@@ -117,7 +117,7 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     import torch
 
     from brainbench.models.diagram import graph_of
-    from brainbench.models.registry import describe_model, load_model
+    from brainbench.models.registry import locate_model
     from brainbench.models.training.checkpoints import PREFIXES
     from brainbench.models.user_models import load_user_model
 
@@ -131,18 +131,20 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     elif (":" in model and not model.startswith(PREFIXES)) or model.endswith(".py"):
         module, card = load_user_model(model, seed=seed), ModelCard(model, family="user module", seed=seed)
     else:
-        known = describe_model(model)
+        found = locate_model(model)
+        module = found.build(seed)
+        count = getattr(module, "multiply_adds", None)
         card = ModelCard(
             model,
-            family=known.family,
-            encoder=known.architecture.memory_encoder,
-            attender=known.architecture.attender or "none",
+            family=found.record.family,
+            encoder=found.architecture.memory_encoder,
+            attender=found.architecture.attender or "none",
             objective="untrained",
-            multiply_adds=known.multiply_adds,
+            multiply_adds=count() if count is not None else None,
             seed=seed,
-            citation=known.citation or None,
+            citation=found.record.citation or None,
         )
-        module, card = load_model(model, seed=seed), replace(card, **_trained(known.trained))
+        card = replace(card, **_trained(found.trained))
     lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
     if lazy:
         raise UsageError(

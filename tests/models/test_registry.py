@@ -11,7 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.models import registry
-from brainbench.models.registry import describe_model, find_record, list_models, load_model, register_model
+from brainbench.models.registry import describe_model, list_models, load_model, locate_model, register_model
 
 SMALL = "zhuang-ugrnn-small"
 
@@ -186,9 +186,9 @@ def test_a_name_outside_the_grammar_is_refused(name):
 
 
 def test_a_record_cannot_be_changed_from_outside():
-    record = find_record("zhuang")
-    assert record is not find_record("zhuang")
-    assert record == find_record("zhuang")
+    record = locate_model("zhuang").record
+    assert record is not locate_model("zhuang").record
+    assert record == locate_model("zhuang").record
     with pytest.raises(AttributeError):
         record.family = "mine"
 
