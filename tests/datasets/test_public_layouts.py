@@ -179,14 +179,15 @@ def test_a_registered_layout_is_found_by_name_and_by_layout(registry, tmp_path):
         register_layout(my_layout("c"))
 
 
-def test_a_layout_in_a_file_of_its_own_works_on_the_command_line(registry, tmp_path):
+@pytest.mark.parametrize("constant", ["LAYOUT", "RECIPE"])
+def test_a_layout_in_a_file_of_its_own_works_on_the_command_line(registry, tmp_path, constant):
     """The example of docs/recordings.md."""
     import re
     from pathlib import Path
 
     page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```py\n(.*?)```", page, flags=re.DOTALL)
-    (tmp_path / "my_lab.py").write_text(example)
+    (tmp_path / "my_lab.py").write_text(example.replace("LAYOUT =", f"{constant} ="))
     columns = {"texture": np.resize(np.array(["rough", "smooth", "none"]), 12)}
     path = write_recordings(tmp_path / "a.h5", make_simple_session(columns=columns))
     dataset = open_recordings(f"{tmp_path / 'my_lab.py'}:{path}")
