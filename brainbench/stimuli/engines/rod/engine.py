@@ -119,11 +119,9 @@ class RodEngine(WhiskerEngine):
         self, scenes: SweepScenes, indices: Sequence[int], fidelity: Fidelity, *, workers: int | None = None
     ) -> SweepBatch:
         """Simulate sweeps; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`."""
-        from brainbench.stimuli.engines.rod.sweeps import simulate_sweeps
+        from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
-        return simulate_sweeps(
-            scenes, indices, fidelity=fidelity, device=self.device, workers=workers, retry=self.retry
-        )
+        return SweepLauncher(scenes, fidelity, self.device).run(indices, self.retry, workers or 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from operator import itemgetter
@@ -123,11 +123,6 @@ class SweepLauncher:
         self.seconds = {"objects": placed, **result.seconds}
         return result
 
-    @property
-    def limit(self) -> int:
-        """Most sweeps of one object that are launched together on this device."""
-        return 4096 if self.device.is_cuda else 4
-
     def batch(self, result: LaunchResult) -> SweepBatch:
         """Return a result as frames in the form of data generation."""
         frames = self.grid.frames
@@ -170,6 +165,27 @@ class SweepLauncher:
             return self.launch([(name, [sweep for _, sweep in some]) for name, some in groups], which[rows], finer)
 
         return self.batch(run_with_retries(launch, retry))
+
+    def run(self, indices: Sequence[int], retry: int, workers: int) -> SweepBatch:
+        """Simulate sweeps of the grid; on a processor ``workers`` threads each take one object at a time.
+
+        Args:
+            indices: which; neighbours share their object.
+            retry: as for :meth:`trusted`.
+            workers: threads on a processor.
+        """
+        limit = 4096 if self.device.is_cuda else 4
+        groups: list[tuple[str, list[Any]]] = []
+        for index in indices:
+            which, within = divmod(index, self.grid.count)
+            name = self.scenes.objects[which]
+            if not groups or groups[-1][0] != name or len(groups[-1][1]) >= limit:
+                groups.append((name, []))
+            groups[-1][1].append(self.grid.sweeps(name)[within])
+        if self.device.is_cuda:
+            return self.trusted(groups, retry)
+        with ThreadPoolExecutor(max_workers=workers) as pool:
+            return join_batches(list(pool.map(lambda group: self.trusted([group], retry), groups)))
 
     def _prepare(self, names: Sequence[str]) -> dict[str, tuple[float, PackedSurface]]:
         """Return the diagonal (m) and the surface (mm) of objects.
@@ -240,43 +256,3 @@ class SweepLauncher:
         if rotation not in self._turns:
             self._turns[rotation] = euler_matrix((0.0, 0.0, rotation))
         return self._turns[rotation]
-
-
-def simulate_sweeps(
-    scenes: SweepScenes,
-    indices: Sequence[int],
-    *,
-    fidelity: Fidelity,
-    device: str = "cpu",
-    workers: int | None = None,
-    retry: int = 1,
-) -> SweepBatch:
-    """Simulate sweeps; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`.
-
-    On the CPU one thread takes one object at a time; ``workers`` of them run side by side.
-    """
-    launcher = SweepLauncher(scenes, fidelity, device)
-    groups = list(_by_object(scenes, indices, launcher.limit))
-
-    def run(group: tuple[str, list[Any]]) -> SweepBatch:
-        return launcher.trusted([group], retry)
-
-    if launcher.device.is_cuda:
-        return launcher.trusted(groups, retry)
-    with ThreadPoolExecutor(max_workers=workers or 1) as pool:
-        return join_batches(list(pool.map(run, groups)))
-
-
-def _by_object(scenes: SweepScenes, indices: Sequence[int], limit: int) -> Iterator[tuple[str, list[Any]]]:
-    """Yield (object name, sweeps) of neighbouring indices, at most ``limit`` sweeps together."""
-    last, sweeps = "", []
-    for index in indices:
-        which, within = divmod(index, scenes.grid.count)
-        name = scenes.objects[which]
-        if sweeps and (name != last or len(sweeps) >= limit):
-            yield last, sweeps
-            sweeps = []
-        last = name
-        sweeps.append(scenes.grid.sweeps(name)[within])
-    if sweeps:
-        yield last, sweeps
