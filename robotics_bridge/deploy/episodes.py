@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_STATS = ("min", "max", "mean", "std", "count")
 _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 
 

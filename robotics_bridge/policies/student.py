@@ -21,7 +21,7 @@ from rsl_rl.utils import unpad_trajectories
 from torch import nn
 
 from brainbench.core.errors import UsageError, unknown_name
-from robotics_bridge.policies.encoders.arms import EncoderConfig, TactileEncoder
+from robotics_bridge.policies.encoders.arms import EncoderConfig, TactileEncoder, perceptron
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -52,9 +52,7 @@ class GroupEncoder(nn.Module):
         self.cell: nn.LSTMCell | None = None
         self.net: nn.Module = nn.Identity()
         if kind == "mlp":
-            sizes = (size, *_WIDTHS)
-            layers = [part for a, b in zip(sizes, _WIDTHS, strict=False) for part in (nn.Linear(a, b), nn.ELU())]
-            self.net = nn.Sequential(*layers, nn.Linear(_WIDTHS[-1], _EMBEDDING))
+            self.net = perceptron(size, _WIDTHS, _EMBEDDING)
         elif kind == "lstm":
             self.cell, self.net = nn.LSTMCell(size, _LSTM), nn.Linear(_LSTM, _EMBEDDING)
             self.state_size = 2 * _LSTM

@@ -7,7 +7,7 @@ sizes are those of the thesis (section 4.3.4). Letters: B batch, S sub-step, N i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -101,6 +101,13 @@ class EncoderConfig:
                 "tactile encoder", self.arm, (*ARMS, *list_models()), hint="See networks with: brainbench models list"
             )
         return _Network(self)
+
+
+def perceptron(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """Return a multilayer perceptron with ELU between its layers."""
+    sizes = (inputs, *hidden)
+    layers = [part for a, b in zip(sizes, hidden, strict=False) for part in (nn.Linear(a, b), nn.ELU())]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
 
 class TactileEncoder(nn.Module):
@@ -213,10 +220,7 @@ class _Flat(_Learned):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__(config)
         slots, items, channels = self.shape
-        self.net = nn.Sequential(
-            nn.Linear(slots * items * channels, _HIDDEN), nn.ELU(), nn.Linear(_HIDDEN, _HIDDEN), nn.ELU(),
-            nn.Linear(_HIDDEN, self.features),
-        )  # fmt: skip
+        self.net = perceptron(slots * items * channels, (_HIDDEN, _HIDDEN), self.features)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return self.net(self.scale(taxels).flatten(1)), h_in

@@ -27,6 +27,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, provenance, read_json, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
+from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.shipped import student_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
@@ -136,7 +137,9 @@ class _Run:
         self.student = build_student(config, env.observation_shapes, self.groups, env.num_actions).to(self.device)
         self.decoders = env.task.decoders
         heads = {
-            head.target: _head(self.student.core.features, head.hidden, math.prod(env.observation_shapes[head.target]))
+            head.target: perceptron(
+                self.student.core.features, head.hidden, math.prod(env.observation_shapes[head.target])
+            )
             for head in self.decoders
         }
         self.learner = _Learner(self.student, nn.ModuleDict(heads)).to(self.device)
@@ -444,9 +447,3 @@ class StudentPolicy:
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Forget all environments, or those in a mask [B]."""
         self.student.reset(mask)
-
-
-def _head(features: int, hidden: tuple[int, ...], outputs: int) -> nn.Module:
-    sizes = (features, *hidden)
-    layers = [part for a, b in zip(sizes, hidden, strict=False) for part in (nn.Linear(a, b), nn.ELU())]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))

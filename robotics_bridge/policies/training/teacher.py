@@ -54,13 +54,10 @@ class Policy:
 
     Args:
         actor: Model class of rsl_rl, put into evaluation mode.
-        num_envs: B, environments it acts in.
-        device: Of the actions.
     """
 
-    def __init__(self, actor: torch.nn.Module, num_envs: int, device: Any) -> None:
+    def __init__(self, actor: torch.nn.Module) -> None:
         self.actor = actor.eval()
-        self._num_envs, self._device = num_envs, device
 
     def act(self, observations: Mapping[str, torch.Tensor] | TensorDict) -> torch.Tensor:
         """Return the mean actions [B, A]."""
@@ -166,7 +163,7 @@ class Trainer:
 
     def policy(self) -> Policy:
         """Return the present actor."""
-        return Policy(self.algorithm.get_policy(), self.env.num_envs, self.env.device)
+        return Policy(self.algorithm.get_policy())
 
     @property
     def _curriculum(self) -> dict[str, torch.Tensor]:
@@ -426,7 +423,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
             f"The policy of {str(path)!r} was trained on {facts['task']!r} with hand {facts['hand']!r} and does not "
             f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
         ) from error
-    return Policy(trainer.algorithm.get_policy().to(env.device), env.num_envs, env.device)
+    return Policy(trainer.algorithm.get_policy().to(env.device))
 
 
 def _named(curriculum: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
