@@ -126,7 +126,7 @@ def test_threads_that_start_side_by_side_on_a_fresh_machine_make_kernels_once(tm
     code = (
         "import sys; sys.setswitchinterval(1e-6)\n"
         "from brainbench.stimuli.engines.rod import RodEngine\n"
-        "from tests.stimuli.engines import test_rod as t\n"
+        "from tests.stimuli.engines.rod import test_engine as t\n"
         "job = t.Job(t.C2, t.StillFollicle(), (), t.np.array([2e-3]), gravity=(0.0, 0.0, -9.81))\n"
         "RodEngine().run([job] * 6, t.COARSE, workers=6)\n"
     )
