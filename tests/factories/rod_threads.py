@@ -145,6 +145,7 @@ def _language() -> ModuleType:
     made = {
         "float32": np.float64, "float64": np.float64, "int32": int, "uint64": int,
         "types": SimpleNamespace(vector=vector, matrix=lambda shape, _kind: lambda *_: Memory(np.zeros(shape))),
+        "kernel": lambda **_: lambda same: same,
         "static": lambda value: value, "func": lambda function=None, **_: function or (lambda same: same),
         "ref": Reference, "struct": zeroed, "func_native": native,
         **dict.fromkeys(["array", "array2d", "array3d", "array4d"], lambda **_: None),

@@ -8,6 +8,7 @@ import pytest
 
 from brainbench.core.devices import to_struct
 from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
+from brainbench.stimuli.engines.rod.scheduling import allocate
 from tests.factories.rod_chain import CAPACITY, DenseChain, in_double
 from tests.factories.rod_threads import Records, thread_warp
 
@@ -42,8 +43,6 @@ def _problem(count, friction, seed, links=8):
 def _factorised(problem):
     """What ``write_problem`` leaves of these candidates: fields of ``ContactProblems`` for one job."""
     kernels = in_double("contact_problem")
-    from brainbench.stimuli.engines.rod.scheduling import allocate
-
     passes = in_double("articulated_body")
     real, vec2, vec3 = wp.float64, passes.vec2, passes.vec3
     ChainArrays, JobArrays, ContactProblems = passes.ChainArrays, passes.JobArrays, kernels.ContactProblems

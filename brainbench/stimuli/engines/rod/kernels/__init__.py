@@ -3,7 +3,8 @@
 ``step`` runs whiskers from reading to reading. In each step ``articulated_body`` finds the motion of the chain and its
 accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances`` and ``mesh_bvh``) where it may
 touch something, ``contact_problem``, ``delassus`` and ``contact_solver`` the contact forces. ``sleeping`` skips
-whiskers at rest; on a GPU ``scheduling`` pauses whiskers while ``distance_queue`` and ``contact_queue`` work for them.
+whiskers at rest; on a GPU ``scheduling`` pauses whiskers while kernels of ``narrow_phase`` and ``contact_solver`` find
+the distances and forces that they wait for.
 
 The modules are ordinary Warp code for the types and sizes in ``parameters``. :func:`specialize` loads them once for
 each precision and size, like a template.
@@ -89,10 +90,10 @@ def build_kernels(
         run,
         structs,
         specialize("scheduling", **whole).swap_queues,
-        specialize("distance_queue", group_size=group, **common).measure_distances,
+        specialize("narrow_phase", group_size=group, **common).measure_distances,
         group,
         tuple(
-            (specialize("contact_queue", max_contacts=held, group_size=size, queue=rank, **common).solve_queue, size)
+            (specialize("contact_solver", max_contacts=held, group_size=size, queue=rank, **common).solve_queue, size)
             for rank, (held, size) in enumerate(sizes)
         ),
     )

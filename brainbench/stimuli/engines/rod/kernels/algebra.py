@@ -1,4 +1,4 @@
-"""Vectors, quaternions (w, x, y, z) and symmetric matrices of the solver's precision."""
+"""Vectors, quaternions (w, x, y, z), symmetric matrices and spatial vectors of the solver's precision."""
 
 from typing import Any
 
@@ -99,3 +99,37 @@ def minimum(a: real, b: real) -> real: ...
 
 @wp.func_native(chosen("max", ">"))
 def maximum(a: real, b: real) -> real: ...
+
+
+def reader(*kinds: tuple[Any, Any]) -> Any:
+    """Return ``row(memory, index)`` for references to memory of each of these (type, type of its elements)."""
+    for memory, element in dict.fromkeys(kinds):
+
+        @wp.func_native("return wp::extract(memory, index);")
+        def row(memory: wp.ref[memory], index: int) -> element: ...
+
+    return row
+
+
+@wp.struct
+class Twist:
+    """Angular velocity, and velocity of the point of the body that is at the base point."""
+
+    angular: vec3
+    linear: vec3
+
+
+@wp.struct
+class SpatialAcceleration:
+    """Angular acceleration, and rate of the linear part of a twist."""
+
+    angular: vec3
+    linear: vec3
+
+
+@wp.struct
+class Wrench:
+    """Moment about the base point, and force."""
+
+    moment: vec3
+    force: vec3

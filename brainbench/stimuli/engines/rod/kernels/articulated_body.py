@@ -12,7 +12,21 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import BENT, FOLD, LARGEST_BEND, LOST, STOP
 
-from .algebra import cosine, first_axis, mat33, rotate, sine, symmetric_outer, symmetric_times, vec2, vec3, vec6
+from .algebra import (
+    SpatialAcceleration,
+    Twist,
+    Wrench,
+    cosine,
+    first_axis,
+    mat33,
+    rotate,
+    sine,
+    symmetric_outer,
+    symmetric_times,
+    vec2,
+    vec3,
+    vec6,
+)
 from .motion import BodyMotion
 from .parameters import real
 from .state import (
@@ -21,12 +35,9 @@ from .state import (
     ContactCandidates,
     JobArrays,
     ProximityState,
-    SpatialAcceleration,
     StepOptions,
-    Twist,
     WhiskerJob,
     WhiskerState,
-    Wrench,
     row,
 )
 
@@ -52,6 +63,7 @@ def forward_kinematics(
     fastest = speed
     for i in range(job.links):
         link = chains.build[i, job.whisker]
+        # Bend at rest about z, then the hinge about y, then the one about z.
         turned = x * link.bend_cosine + y * link.bend_sine
         y = y * link.bend_cosine - x * link.bend_sine
         angle = row(chain.angle, i)
@@ -131,6 +143,7 @@ def articulated_inertia(
         )
         ib = ib + mat33(zero, -mc[2], mc[1], mc[2], zero, -mc[0], -mc[1], mc[0], zero)
         ic = ic + vec6(m, m, m, zero, zero, zero)
+        # Bias force v × Iv, less what loads give.
         momentum = vv * m + wp.cross(vw, mc)
         spin = wp.cross(com, momentum) + vw * inertia.transverse + xa * (thin * wp.dot(xa, vw))
         pw = pw + wp.cross(vw, spin) + wp.cross(vv, momentum)
@@ -146,11 +159,13 @@ def articulated_inertia(
         s1 = wp.cross(s2, xa) * cosine(angle[1]) + xa * sine(angle[1])
         m1 = wp.cross(at, s1)
         m2 = wp.cross(at, s2)
+        # U = IᴬS of both axes.
         u1w = symmetric_times(ia, s1) + ib * m1
         u1v = s1 * ib + symmetric_times(ic, m1)
         u2w = symmetric_times(ia, s2) + ib * m2
         u2v = s2 * ib + symmetric_times(ic, m2)
         k = inertia.stiffness
+        # Springs and dampers at the end of the step: τ = −k (q + lag q̇), D gains h k lag.
         lag = h + step_damping
         soft = h * k * lag
         rate = row(chain.rate, i)
@@ -265,11 +280,13 @@ def joint_accelerations(
         rate = row(chain.rate, i)
         jw = s1 * rate[0] + s2 * rate[1]
         jv = m1 * rate[0] + m2 * rate[1]
+        # Velocity product c of the joint.
         both = rate[0] * rate[1]
         aw = aw + wp.cross(vw, jw) + wp.cross(s1, s2) * both
         av = av + wp.cross(vw, jv) + wp.cross(vv, jw) + (wp.cross(s1, m2) + wp.cross(m1, s2)) * both
         vw = vw + jw
         vv = vv + jv
+        # q̈ = D⁻¹u − (UD⁻¹)ᵀa′ with a′ = a + c.
         f = row(chain.acceleration, i)
         a1 = f[0] - wp.dot(row(chain.gain1_w, i), aw) - wp.dot(row(chain.gain1_v, i), av)
         a2 = f[1] - wp.dot(row(chain.gain2_w, i), aw) - wp.dot(row(chain.gain2_v, i), av)

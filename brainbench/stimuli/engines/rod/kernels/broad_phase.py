@@ -136,6 +136,7 @@ def candidate_slot(
     if slot < count:
         if row(candidates.predicted_gap, slot) <= ahead:
             slot = int(-1)
+    # No room: in place of the one that closes last.
     elif count >= wp.static(most_candidates):
         slot = int(0)
         for j in range(1, wp.static(most_candidates)):
@@ -176,11 +177,13 @@ def find_candidates(
         joint = row(chain.node, i)
         link = row(chain.node, i + 1) - joint
         e2 = row(chain.axis2, i)
+        # Twist of the link: what its joint adds to that of the link before.
         spun = first_axis(e2, link, row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
         angular = angular + spun
         linear = linear + wp.cross(joint, spun)
         taper = chains.taper[i, job.whisker]
         if row(proximity.clearance, i) <= margin + taper.start_radius:
+            # One shape after the other, each at two places: between the ends, and at the far end.
             closest = real(1e20)
             for s in range(job.first_shape, job.end_shape):
                 body = pose_at(motions, shapes.track[s], now)
@@ -210,6 +213,7 @@ def find_candidates(
                         normal = rotate(body.turn, rotate(turn_s, way))
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         point = joint + link * share - normal * radius
+                        # The object's velocity in the middle of the step.
                         half = pose_at(motions, shapes.track[s], now + real(0.5) * h)
                         object_velocity = half.velocity + wp.cross(half.spin, point + origin - half.place)
                         approach = wp.dot(normal, linear + wp.cross(angular, point) - object_velocity)

@@ -4,7 +4,7 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import GROUPS
 
-from .algebra import first_axis, vec3
+from .algebra import Wrench, first_axis, vec3
 from .parameters import capacity, cuda, real
 from .state import (
     ChainArrays,
@@ -15,7 +15,6 @@ from .state import (
     ProximityState,
     WhiskerJob,
     WhiskerState,
-    Wrench,
     most_candidates,
     row,
 )

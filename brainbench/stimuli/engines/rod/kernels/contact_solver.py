@@ -13,24 +13,26 @@ the source is the same. Forces in mN, compliance in mm/ms per mN.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CLOSED, CONTACT_ROUNDS, SWEEPS
+from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, SWEEPS, WARP
 
-from .algebra import vec2, vec3, vec6
+from .algebra import vec3, vec6
 from .delassus import (
     DelassusRows,
     NormalMatrix,
     PerContact1,
     SolverState,
     ThreadContacts,
+    apply_forces,
     build_delassus,
     own_contacts,
     row,
     row_size,
     select_contacts,
+    store_forces,
     stride,
 )
-from .parameters import capacity, group_size, max_contacts, real
-from .state import ContactProblems, PerLink2, most_candidates
+from .parameters import group_size, max_contacts, module_options, queue, real
+from .state import ContactProblems, PausedWhiskers, PerLink2
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 
 
@@ -49,6 +51,7 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
     c11 = own6[3]
     c12 = own6[4]
     c22 = own6[5]
+    # Without force the contact opens, or it presses.
     fn = zero
     f1 = zero
     f2 = zero
@@ -138,6 +141,7 @@ def gauss_seidel_sweep(
             q0 = row(own.force, 3 * k + 2)
             block = row(own.self_compliance, k)
             missed = row(own.rate, 3 * k)
+            # Rates that the other contacts' forces leave.
             bn = missed - block[0] * n0 - block[1] * p0 - block[2] * q0
             b1 = row(own.rate, 3 * k + 1) - block[1] * n0 - block[3] * p0 - block[4] * q0
             b2 = row(own.rate, 3 * k + 2) - block[2] * n0 - block[4] * p0 - block[5] * q0
@@ -155,6 +159,7 @@ def gauss_seidel_sweep(
             gap_error = wp.max(gap_error, solver.step * (wp.abs(missed) + slipped))
             force_change += wp.abs(d0) + wp.abs(d1) + wp.abs(d2)
             force_sum += found[0]
+        # Every contact learns what this change does to its rates.
         d0 = broadcast(d0, c)
         d1 = broadcast(d1, c)
         d2 = broadcast(d2, c)
@@ -198,6 +203,7 @@ def solve_normal_forces(
         load[k] = real(0.0)
         if mine_in == 1:
             load[k] = row(asked, k)
+    # Rows of contacts that do not press are those of the identity, so nothing is pivoted.
     for p in range(count):
         at = wp.static(stride * max_contacts) * p
         pivot = broadcast(row(work, at + p), p)
@@ -254,6 +260,7 @@ def share_normal_forces(
                 ratio1[k] = row(own.friction, k) * f1 / size
                 ratio2[k] = row(own.friction, k) * f2 / size
     pressing = group_or(pressing)
+    # G of the normal forces, friction of sliding contacts in it; that of sticking ones stays as it is.
     for e in range(count):
         slide1 = broadcast(ratio1[wp.static(stride) * e], e)
         slide2 = broadcast(ratio2[wp.static(stride) * e], e)
@@ -268,6 +275,7 @@ def share_normal_forces(
                 row(matrix, r) + row(matrix, r + 1) * slide1 + row(matrix, r + 2) * slide2
             )
             asked[k] = asked[k] - row(matrix, r + 1) * stick1 - row(matrix, r + 2) * stick2
+    # Active set: which contacts press, one change at a time.
     agreed = 1 - guessing
     for _ in range(tries):
         if warp_max(1 - agreed) == 1:
@@ -296,6 +304,7 @@ def share_normal_forces(
                     agreed = 1
                 else:
                     pressing = pressing ^ (1 << flip)
+    # Take the forces only if all are sound, and keep friction within its cone.
     diverged = zero
     for k in range(each):
         if part + k < contacts and not (wp.abs(load[k]) < real(1e6)):
@@ -321,17 +330,6 @@ def share_normal_forces(
                 own.force[3 * k + 1] = f1
                 own.force[3 * k + 2] = f2
     return changed
-
-
-@wp.func(inline=True)
-def contact_force(own: wp.ref[ThreadContacts], k: int) -> vec3:
-    """Return the force of a contact in world axes."""
-    force_k = row(own.axis, 3 * k) * row(own.force, 3 * k)
-    return (
-        force_k
-        + row(own.axis, 3 * k + 1) * row(own.force, 3 * k + 1)
-        + row(own.axis, 3 * k + 2) * row(own.force, 3 * k + 2)
-    )
 
 
 @wp.func(inline=True)
@@ -363,131 +361,6 @@ def iterate_forces(
                 guessing = 1
             if warp_max(guessing) == 1:
                 refresh = share_normal_forces(solver, own, matrix, normals, work, guessing, guess_tries)
-
-
-@wp.func(inline=True)
-def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts]):
-    """Write what the contacts do together, and their forces for the next step."""
-    zero = real(0.0)
-    force = vec3(zero, zero, zero)
-    moment = vec3(zero, zero, zero)
-    normal_sum = zero
-    arc_sum = zero
-    for k in range(solver.own_count):
-        if solver.thread + k < solver.contacts and solver.live == 1:
-            force_k = contact_force(own, k)
-            arc = row(own.arc, k)
-            problems.held[solver.job, solver.thread + k].arc = arc
-            problems.held[solver.job, solver.thread + k].force = force_k
-            force = force + force_k
-            moment = moment + wp.cross(row(own.point, k), force_k)
-            fn = row(own.force, 3 * k)
-            if fn > zero:
-                normal_sum += fn
-                arc_sum += fn * arc
-    normal_sum = group_sum(normal_sum)
-    arc_sum = group_sum(arc_sum)
-    force = vec3(group_sum(force[0]), group_sum(force[1]), group_sum(force[2]))
-    moment = vec3(group_sum(moment[0]), group_sum(moment[1]), group_sum(moment[2]))
-    if solver.thread == 0 and solver.live == 1:
-        problems.solution[solver.job].normal_sum = normal_sum
-        problems.solution[solver.job].arc_sum = arc_sum
-        problems.solution[solver.job].contact_force = force
-        problems.solution[solver.job].contact_moment = moment
-
-
-@wp.func(inline=True)
-def apply_forces(
-    problems: ContactProblems,
-    solver: wp.ref[SolverState],
-    own: wp.ref[ThreadContacts],
-    joint_change: wp.ref[PerLink2],
-    last: int,
-    active: int,
-) -> int:
-    """Carry the forces up the chain, then the change of acceleration down.
-
-    ``last`` says that there will be no further round. Returned is whether the forces press the whisker onto candidates
-    that do not take part, with room for them: then another round is needed.
-    """
-    zero = real(0.0)
-    none = vec3(zero, zero, zero)
-    first_joint = solver.job * wp.static(capacity)
-    first_candidate = solver.job * wp.static(most_candidates)
-    tw = none
-    tv = none
-    for back in range(solver.last_link + 1):
-        i = solver.last_link - back
-        for k in range(solver.own_count):
-            if solver.thread + k < solver.contacts and row(own.link, k) == i:
-                force_k = contact_force(own, k)
-                tv = tv + force_k
-                tw = tw + wp.cross(row(own.point, k), force_k)
-        u1 = zero
-        u2 = zero
-        if i < solver.links:
-            joint = problems.joint[first_joint + i]
-            u1 = wp.dot(joint.axis1, tw) + wp.dot(joint.moment1, tv)
-            u2 = wp.dot(joint.axis2, tw) + wp.dot(joint.moment2, tv)
-            tw = tw - joint.gain1_w * u1 - joint.gain2_w * u2
-            tv = tv - joint.gain1_v * u1 - joint.gain2_v * u2
-        u1 = group_sum(u1)
-        u2 = group_sum(u2)
-        if i < solver.links:
-            inv = problems.joint[first_joint + i].inverse_inertia
-            joint_change[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
-    tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
-    tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
-    more = int(0)
-    if active == 1:
-        aw = none
-        av = none
-        for i in range(solver.links):
-            extra = vec2(zero, zero)
-            if i <= solver.last_link:
-                extra = row(joint_change, i)
-            joint = problems.joint[first_joint + i]
-            a1 = extra[0] - wp.dot(joint.gain1_w, aw) - wp.dot(joint.gain1_v, av)
-            a2 = extra[1] - wp.dot(joint.gain2_w, aw) - wp.dot(joint.gain2_v, av)
-            aw = aw + joint.axis1 * a1 + joint.axis2 * a2
-            av = av + joint.moment1 * a1 + joint.moment2 * a2
-            if solver.thread == 0:
-                problems.added_acceleration[solver.job, i] = vec2(a1, a2)
-            if solver.contacts < solver.candidates:
-                for j in range(solver.candidates):
-                    if problems.candidate_link[first_candidate + j] == i and (solver.selected >> j) % 2 == 0:
-                        candidate = problems.candidate[first_candidate + j]
-                        moved = candidate.free_velocity + (av + wp.cross(aw, candidate.point)) * solver.step
-                        predicted = candidate.gap + solver.step * wp.dot(candidate.normal, moved)
-                        problems.predicted_gap[first_candidate + j] = predicted
-                        if predicted < real(-wp.static(CLOSED)):
-                            more = int(1)
-        crowded = int(0)
-        if more == 1 and (solver.contacts == wp.static(max_contacts) or last == 1):
-            more = int(0)
-            crowded = int(1)
-        if more == 0 and solver.thread == 0:
-            unsolved = int(0)
-            miss = zero
-            if (
-                solver.converged == 0
-                and solver.gap_error > real(1e-2)
-                and solver.force_change > real(1e-2) * solver.force_sum
-            ):
-                unsolved = int(1)
-                miss = solver.force_change * solver.force_change
-            index = solver.job
-            problems.solution[index].contacts = solver.contacts
-            problems.solution[index].crowded = crowded
-            problems.solution[index].unsolved = unsolved
-            problems.solution[index].base_moment = problems.given[index].base_moment - tw
-            problems.solution[index].base_force = problems.given[index].base_force - tv
-            problems.solution[index].tip_acceleration = (
-                problems.given[index].tip_acceleration + av + wp.cross(aw, problems.given[index].tip)
-            )
-            problems.solution[index].miss = miss
-            problems.solution[index].load = solver.force_sum * solver.force_sum
-    return more
 
 
 @wp.func
@@ -524,3 +397,18 @@ def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
                 last = 1
             more = apply_forces(problems, solver, own, joint_change, last, active)
     store_forces(problems, solver, own)
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=module_options(), launch_bounds=CONTACT_BOUNDS)
+def solve_queue(problems: ContactProblems, paused: PausedWhiskers):
+    """Solve the problems of one queue in place: ``group_size`` threads take one problem."""
+    thread = wp.tid()
+    count = paused.problem_size[wp.static(queue)]
+    which = thread // wp.static(group_size)
+    # All threads of a warp go on, or none.
+    if (thread // wp.static(WARP)) * wp.static(WARP // group_size) < count:
+        live = int(0)
+        if which < count:
+            live = int(1)
+        index = paused.problem_queue[wp.static(queue), wp.min(which, count - 1)]
+        solve_contacts(problems, index, thread % wp.static(group_size), live)

@@ -1,20 +1,21 @@
-"""Contacts of a step and their Delassus matrix G = J H⁻¹ Jᵀ: what a unit force at one contact does at the others.
+"""Contacts of a step, their Delassus matrix G = J H⁻¹ Jᵀ, and what their forces do to the chain.
 
-A group of threads takes one whisker, each thread one contact (the only thread of a group takes all of them): it carries
-the contact's three unit forces up the factorised chain, where force (w, v) leaves the joint rates u = Sᵀ(w, v) and goes
-on as (w, v) − UD⁻¹u, and owns three rows of G = h Σ uᵀD⁻¹u. A row of the matrix is a normal or one of two tangents.
+The matrix says what a unit force at one contact does at the others. A group of threads takes one whisker, each thread
+one contact (the only thread of a group takes all of them): it carries the contact's three unit forces up the factorised
+chain, where force (w, v) leaves the joint rates u = Sᵀ(w, v) and goes on as (w, v) − UD⁻¹u, and owns three rows of
+G = h Σ uᵀD⁻¹u. A row of the matrix is a normal or one of two tangents.
 """
 
 from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CREVICE
+from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
-from .algebra import vec2, vec3, vec6
+from .algebra import reader, vec2, vec3, vec6
 from .parameters import capacity, group_size, max_contacts, real
-from .state import ContactProblems, PerLink2, most_candidates, reader
-from .thread_groups import broadcast, warp_max
+from .state import ContactProblems, PerLink2, most_candidates
+from .thread_groups import broadcast, group_sum, warp_max
 
 own_contacts = max_contacts if group_size == 1 else 1
 row_size = 3 * max_contacts
@@ -58,7 +59,7 @@ class SolverState:
     thread: wp.int32
     """Place of the thread in its group."""
     live: wp.int32
-    """Whether the group has a whisker or only keeps others company."""
+    """1: the group has a whisker; 0: it only keeps others company."""
     own_count: wp.int32
     """Contacts of a thread."""
     unknown_zero: wp.int32
@@ -77,7 +78,7 @@ class SolverState:
     """Last link with a contact, of all whiskers of the warp."""
     converged: wp.int32
     gap_error: real
-    """How far (mm) the last sweep's forces missed."""
+    """Largest error (mm) of a gap in the last sweep."""
     force_change: real
     """Change of the forces in the last sweep; sum of the normal forces."""
     force_sum: real
@@ -151,6 +152,7 @@ def select_contacts(problems: ContactProblems, solver: wp.ref[SolverState], own:
             if wp.static(group_size == 1) or solver.contacts == solver.thread:
                 add_contact(problems, solver, own, wp.static(stride) * solver.contacts, slot)
             solver.contacts = solver.contacts + 1
+    # Threads of a warp walk the same links and contacts.
     top = int(-1)
     for k in range(solver.own_count):
         if solver.thread + k < solver.contacts:
@@ -176,6 +178,7 @@ def build_delassus(
     ju2 = PerRow1()
     wu1 = PerRow1()
     wu2 = PerRow1()
+    # w, v: the unit force of each row as it is below the present link; ju: its joint rates; wu: h D⁻¹ of them.
     for r in range(3 * each):
         for e in range(3 * count):
             matrix[r * wp.static(row_size) + e] = zero
@@ -202,6 +205,7 @@ def build_delassus(
                 if reached:
                     w = fw[r]
                     v = fv[r]
+                    # A contact's force enters at its own link.
                     if row(own.link, k) == i:
                         v = row(own.axis, r)
                         w = wp.cross(row(own.point, k), v)
@@ -213,6 +217,7 @@ def build_delassus(
                 ju2[r] = u2
                 wu1[r] = solver.step * (inv[0] * u1 + inv[1] * u2)
                 wu2[r] = solver.step * (inv[1] * u1 + inv[2] * u2)
+        # Both contacts share this joint: its part of G. One thread alone computes the lower half.
         for e in range(count):
             if wp.static(group_size > 1) or row(own.link, e) >= i:
                 for b in range(3):
@@ -225,6 +230,7 @@ def build_delassus(
         for r in range(3 * count):
             for e in range(r):
                 matrix[e * wp.static(row_size) + r] = row(matrix, r * wp.static(row_size) + e)
+    # Diagonal blocks, for the solution of single contacts.
     for k in range(each):
         if thread + k < solver.contacts:
             c = 3 * (thread + k)
@@ -237,3 +243,141 @@ def build_delassus(
             own.self_compliance[k, 3] = row(matrix, r1 + c + 1)
             own.self_compliance[k, 4] = row(matrix, r1 + c + 2)
             own.self_compliance[k, 5] = row(matrix, r2 + c + 2)
+
+
+@wp.func(inline=True)
+def contact_force(own: wp.ref[ThreadContacts], k: int) -> vec3:
+    """Return the force of a contact in world axes."""
+    force_k = row(own.axis, 3 * k) * row(own.force, 3 * k)
+    return (
+        force_k
+        + row(own.axis, 3 * k + 1) * row(own.force, 3 * k + 1)
+        + row(own.axis, 3 * k + 2) * row(own.force, 3 * k + 2)
+    )
+
+
+@wp.func(inline=True)
+def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts]):
+    """Write what the contacts do together, and their forces for the next step."""
+    zero = real(0.0)
+    force = vec3(zero, zero, zero)
+    moment = vec3(zero, zero, zero)
+    normal_sum = zero
+    arc_sum = zero
+    for k in range(solver.own_count):
+        if solver.thread + k < solver.contacts and solver.live == 1:
+            force_k = contact_force(own, k)
+            arc = row(own.arc, k)
+            problems.held[solver.job, solver.thread + k].arc = arc
+            problems.held[solver.job, solver.thread + k].force = force_k
+            force = force + force_k
+            moment = moment + wp.cross(row(own.point, k), force_k)
+            fn = row(own.force, 3 * k)
+            if fn > zero:
+                normal_sum += fn
+                arc_sum += fn * arc
+    normal_sum = group_sum(normal_sum)
+    arc_sum = group_sum(arc_sum)
+    force = vec3(group_sum(force[0]), group_sum(force[1]), group_sum(force[2]))
+    moment = vec3(group_sum(moment[0]), group_sum(moment[1]), group_sum(moment[2]))
+    if solver.thread == 0 and solver.live == 1:
+        problems.solution[solver.job].normal_sum = normal_sum
+        problems.solution[solver.job].arc_sum = arc_sum
+        problems.solution[solver.job].contact_force = force
+        problems.solution[solver.job].contact_moment = moment
+
+
+@wp.func(inline=True)
+def apply_forces(
+    problems: ContactProblems,
+    solver: wp.ref[SolverState],
+    own: wp.ref[ThreadContacts],
+    joint_change: wp.ref[PerLink2],
+    last: int,
+    active: int,
+) -> int:
+    """Carry the forces up the chain, then the change of acceleration down.
+
+    ``last`` says that there will be no further round. Returned is whether the forces press the whisker onto candidates
+    that do not take part, with room for them: then another round is needed.
+    """
+    zero = real(0.0)
+    none = vec3(zero, zero, zero)
+    first_joint = solver.job * wp.static(capacity)
+    first_candidate = solver.job * wp.static(most_candidates)
+    tw = none
+    tv = none
+    for back in range(solver.last_link + 1):
+        i = solver.last_link - back
+        for k in range(solver.own_count):
+            if solver.thread + k < solver.contacts and row(own.link, k) == i:
+                force_k = contact_force(own, k)
+                tv = tv + force_k
+                tw = tw + wp.cross(row(own.point, k), force_k)
+        u1 = zero
+        u2 = zero
+        if i < solver.links:
+            joint = problems.joint[first_joint + i]
+            u1 = wp.dot(joint.axis1, tw) + wp.dot(joint.moment1, tv)
+            u2 = wp.dot(joint.axis2, tw) + wp.dot(joint.moment2, tv)
+            tw = tw - joint.gain1_w * u1 - joint.gain2_w * u2
+            tv = tv - joint.gain1_v * u1 - joint.gain2_v * u2
+        # Joint accelerations D⁻¹u of all contacts' forces.
+        u1 = group_sum(u1)
+        u2 = group_sum(u2)
+        if i < solver.links:
+            inv = problems.joint[first_joint + i].inverse_inertia
+            joint_change[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
+    tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
+    tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
+    # Down again, and where the other candidates are then.
+    more = int(0)
+    if active == 1:
+        aw = none
+        av = none
+        for i in range(solver.links):
+            extra = vec2(zero, zero)
+            if i <= solver.last_link:
+                extra = row(joint_change, i)
+            joint = problems.joint[first_joint + i]
+            a1 = extra[0] - wp.dot(joint.gain1_w, aw) - wp.dot(joint.gain1_v, av)
+            a2 = extra[1] - wp.dot(joint.gain2_w, aw) - wp.dot(joint.gain2_v, av)
+            aw = aw + joint.axis1 * a1 + joint.axis2 * a2
+            av = av + joint.moment1 * a1 + joint.moment2 * a2
+            if solver.thread == 0:
+                problems.added_acceleration[solver.job, i] = vec2(a1, a2)
+            if solver.contacts < solver.candidates:
+                for j in range(solver.candidates):
+                    if problems.candidate_link[first_candidate + j] == i and (solver.selected >> j) % 2 == 0:
+                        candidate = problems.candidate[first_candidate + j]
+                        moved = candidate.free_velocity + (av + wp.cross(aw, candidate.point)) * solver.step
+                        predicted = candidate.gap + solver.step * wp.dot(candidate.normal, moved)
+                        problems.predicted_gap[first_candidate + j] = predicted
+                        if predicted < real(-wp.static(CLOSED)):
+                            more = int(1)
+        crowded = int(0)
+        if more == 1 and (solver.contacts == wp.static(max_contacts) or last == 1):
+            more = int(0)
+            crowded = int(1)
+        if more == 0 and solver.thread == 0:
+            unsolved = int(0)
+            miss = zero
+            if (
+                solver.converged == 0
+                and solver.gap_error > real(1e-2)
+                and solver.force_change > real(1e-2) * solver.force_sum
+            ):
+                unsolved = int(1)
+                miss = solver.force_change * solver.force_change
+            index = solver.job
+            problems.solution[index].contacts = solver.contacts
+            problems.solution[index].crowded = crowded
+            problems.solution[index].unsolved = unsolved
+            problems.solution[index].base_moment = problems.given[index].base_moment - tw
+            problems.solution[index].base_force = problems.given[index].base_force - tv
+            problems.solution[index].tip_acceleration = (
+                problems.given[index].tip_acceleration + av + wp.cross(aw, problems.given[index].tip)
+            )
+            problems.solution[index].miss = miss
+            problems.solution[index].load = solver.force_sum * solver.force_sum
+    return more

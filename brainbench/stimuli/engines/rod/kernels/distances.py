@@ -101,6 +101,7 @@ def point_triangle(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
     pq = q - p
     pr = r - p
     px = x - p
+    # Voronoi regions of p, q, pq, r, pr, qr, and the face.
     d1 = wp.dot(pq, px)
     d2 = wp.dot(pr, px)
     zero = real(0.0)
@@ -142,11 +143,13 @@ def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
     b = wp.dot(d1, d2)
     zero = real(0.0)
     one = real(1.0)
+    # On the infinite lines; parallel ones take the middle.
     determinant = aa * ee - b * b
     s = real(0.5)
     if determinant > real(1e-6) * aa * ee:
         s = minimum(maximum((b * f - c * ee) / determinant, zero), one)
     t = (b * s + f) / maximum(ee, real(tiny))
+    # Clamped to the second segment, then again to the first.
     if t < zero:
         t = zero
         s = minimum(maximum(-c / aa, zero), one)

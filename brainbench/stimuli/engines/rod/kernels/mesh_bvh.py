@@ -73,6 +73,7 @@ def nearest_triangles(
     count = shapes.faces[s]
     row = shapes.box[s]
     size = (count + wp.static(WIDE - 1)) // wp.static(WIDE)
+    # Boxes of all levels stand one behind the other, leaves first; the search begins at the top.
     level = int(0)
     while size > wp.static(WIDE):
         row = row + size
@@ -95,6 +96,7 @@ def nearest_triangles(
     middle = a + half
     reach = vec3(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
 
+    # Squared distances of the nearest so far.
     got = NearestTriangles()
     got.side = radius * radius
     got.end = got.side
@@ -124,16 +126,16 @@ def nearest_triangles(
                     # from its ends.
                     tp = wp.dot(p - a, axis)
                     tq = wp.dot(q - a, axis)
-                    motions = wp.dot(r - a, axis)
+                    tr = wp.dot(r - a, axis)
                     beside_p = p - a - axis * tp
                     beside_q = q - a - axis * tq
-                    beside_r = r - a - axis * motions
+                    beside_r = r - a - axis * tr
                     way = beside_p + beside_q + beside_r
                     beside = minimum(wp.dot(beside_p, way), minimum(wp.dot(beside_q, way), wp.dot(beside_r, way)))
                     beside = maximum(beside, zero)
                     beside = beside * beside / maximum(wp.length_sq(way), real(1e-20))
-                    low = minimum(tp, minimum(tq, motions))
-                    high = maximum(tp, maximum(tq, motions))
+                    low = minimum(tp, minimum(tq, tr))
+                    high = maximum(tp, maximum(tq, tr))
                     apart = maximum(zero, maximum(low - length, -high))
                     if sure * (beside + apart * apart) < minimum(side_most, got.side):
                         at = segment_triangle(a, b, p, q, r)
@@ -161,6 +163,7 @@ def nearest_triangles(
                             got.start_v = spot[0]
                             got.start_w = spot[1]
                             got.start_face = place
+        # Bounds that all threads of the group share.
         side = group_min(got.side)
         end = group_min(got.end)
         all_of = minimum(minimum(side, end), group_min(got.start))
@@ -215,12 +218,14 @@ def nearest_triangles(
                 if level == top:
                     busy = 0
                 else:
+                    # Nothing left below: back to the parent.
                     row = row + size
                     level = level + 1
                     size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
                     node = node // wp.static(WIDE)
             else:
                 rank = code % wp.static(WIDE)
+                # Open this child, and never again.
                 if rank // wp.static(children) == part:
                     side_kept[level, rank % wp.static(children)] = far
                     end_kept[level, rank % wp.static(children)] = far

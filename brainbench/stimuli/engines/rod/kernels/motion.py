@@ -69,6 +69,7 @@ def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
         + motions.turn[b] * v1
         + turning(motions.turn[b], motions.spin[b]) * s1
     )
+    # A cubic between quaternions is nearly one; normalised.
     pose.turn = turn / wp.length(turn)
     pose.spin = motions.spin[a] * v0 + motions.surge[a] * s0 + motions.spin[b] * v1 + motions.surge[b] * s1
     return pose

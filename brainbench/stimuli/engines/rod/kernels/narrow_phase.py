@@ -1,20 +1,20 @@
 """Exact distance of a link from a shape: from the triangles of a surface by its tree, from primitives in closed form.
 
 The sign of a distance from a surface is that of the angle-weighted pseudo-normal at the closest point (Bærentzen &
-Aanæs 2005). On a processor one thread searching for one link; on a GPU a group of threads.
+Aanæs 2005). On a processor one thread takes one link; on a GPU a group of threads does.
 """
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import FAR, MESH, MESHES
+from brainbench.stimuli.engines.rod.limits import DISTANCE_BOUNDS, FAR, MESH, MESHES, WARP
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
 from .algebra import unrotate, vec3, vec4
 from .distances import primitive, segment_primitive
 from .mesh_bvh import NearestTriangles, nearest_triangles
-from .motion import BodyMotion
-from .parameters import against, real
-from .state import LinkDistance, LinkTaper, ShapeArrays
+from .motion import BodyMotion, pose_at
+from .parameters import against, group_size, module_options, real
+from .state import ChainArrays, JobArrays, LinkDistance, LinkTaper, MotionArrays, PausedWhiskers, ShapeArrays
 
 
 @wp.func
@@ -25,6 +25,7 @@ def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
     on_p = u > low
     on_q = v > low
     on_r = w > low
+    # Slot 0 is the face, 1 to 3 its corners, 4 to 6 the edges opposite to them.
     slot = 0
     if on_p and not on_q and not on_r:
         slot = 1
@@ -50,7 +51,8 @@ def surface_point(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
 
 @wp.func
 def signed_direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
-    """Return the signed_direction out of a mesh and the signed distance, given the way from the closest point."""
+    """Return the direction out of a mesh and the signed distance, given the way from the closest point."""
+    # So near the surface, rounding would turn the way from it.
     if distance < real(1e-3) * radius:
         return vec4(outward[0], outward[1], outward[2], distance)
     side = real(1.0) / distance
@@ -142,6 +144,7 @@ def link_shape_distance(
 
     Contacts are told up to a gap of ``margin``; a negative one asks only for a bound of the distance, up to so far.
     """
+    # Into the frame and the unit of the shape.
     turn_s = shapes.turn[s]
     scale = shapes.scale[s]
     local = unrotate(body.turn, a_world - body.place) - shapes.place[s]
@@ -157,6 +160,7 @@ def link_shape_distance(
         if shapes.kind[s] == wp.static(MESH):
             meshed = 1
             searching = live
+        # Contacts are found within the margin; the nearest triangle of all as far as FAR, for the bound.
         within = (wp.max(taper.start_radius, taper.end_radius) + margin) / scale
         radius = wp.max(within, real(wp.static(FAR)) / scale)
         if margin < real(0.0):
@@ -164,6 +168,7 @@ def link_shape_distance(
             radius = -margin / scale
         got = nearest_triangles(shapes, s, a, b, radius, within, leaf - 1, part, searching)
         found = mesh_distance(shapes, s, a, b, ra, rb, within, got)
+    # Primitives: what lies between the ends, and the far end on its own.
     if meshed == 0:
         nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, a, b, ra, rb)
         found.clearance = nearest[1] + wp.min(ra, rb)
@@ -182,3 +187,42 @@ def link_shape_distance(
     found.gap = found.gap * scale
     found.end_gap = found.end_gap * scale
     return found
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=module_options(), launch_bounds=DISTANCE_BOUNDS)
+def measure_distances(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    jobs: JobArrays,
+    paused: PausedWhiskers,
+    threads: int,
+):
+    """Answer all queries: ``group_size`` threads take one link after the other, ``threads`` in all.
+
+    Reads ``paused.query``, ``query_time`` and ``query_margin``, and the links' last leaves; writes ``paused.answer``.
+    Scenes have one shape each.
+    """
+    thread = wp.tid()
+    part = thread % wp.static(group_size)
+    place = thread // wp.static(group_size)
+    count = wp.min(paused.query_count[0], paused.query.shape[0])
+    # All threads of a warp go on, or none.
+    while place - place % wp.static(WARP // group_size) < count:
+        live = int(0)
+        if place < count:
+            live = 1
+        which = wp.min(place, count - 1)
+        place = place + threads // wp.static(group_size)
+        index = paused.query[which].job
+        i = paused.query[which].link
+        s = shapes.first[jobs.scene[index]]
+        body = pose_at(motions, shapes.track[s], paused.query_time[index])
+        margin = paused.query_margin[index]
+        start = paused.query[which].start
+        stop = paused.query[which].stop
+        leaf = paused.link[i, index].leaf
+        taper = chains.taper[i, jobs.whisker[index]]
+        found = link_shape_distance(shapes, s, body, start, stop, taper, margin, leaf, part, live)
+        if live == 1 and part == 0:
+            paused.answer[which] = found

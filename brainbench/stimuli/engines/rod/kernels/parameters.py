@@ -10,11 +10,11 @@ real = wp.float32
 capacity = 12
 """Links that fit."""
 against = MESHES
-"""What there is to touch."""
+"""Kinds of shapes that there are to touch, see ``limits``."""
 sliced = False
-"""Whether whiskers pause for distances and contact forces."""
+"""True: whiskers pause for distances and contact forces."""
 cuda = False
-"""Whether the code is for a GPU."""
+"""True: the code is for a GPU."""
 bounds: tuple[int, int] | None = None
 """CUDA launch bounds of the kernel that takes steps."""
 max_contacts = contacts_for(capacity)

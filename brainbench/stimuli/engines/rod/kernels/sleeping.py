@@ -92,6 +92,7 @@ def check_rest(
         links = job.links
         if wait == WAIT_SLICE:
             links = int(0)
+        # Time in which the fastest object covers the distance of each link; a distance stays a bound while it rests.
         for i in range(links):
             link = chains.build[i, job.whisker]
             turned = x * link.bend_cosine + y * link.bend_sine

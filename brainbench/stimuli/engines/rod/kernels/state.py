@@ -13,11 +13,11 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
 
-from .algebra import mat33, vec2, vec3, vec4
+from .algebra import mat33, reader, vec2, vec3, vec4
 from .parameters import capacity, real
 
 WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST = 1, 2, 3, 4
-"""What a paused whisker waits for: distances of near links, its next slice, contact forces, distances at rest."""
+"""Reasons to pause: distances of near links, its next slice, contact forces, distances at rest."""
 
 most_candidates = contacts_for(capacity) + SPARE
 PerLink1: Any = wp.types.vector(capacity, real)
@@ -30,29 +30,10 @@ PerCandidate3: Any = wp.types.matrix((most_candidates, 3), real)
 PerCandidateInt: Any = wp.types.vector(most_candidates, wp.int32)
 
 
-def reader(*kinds: tuple[Any, Any]) -> Any:
-    """Return ``row(memory, index)`` for references to memory of each of these (type, type of its elements)."""
-    for memory, element in dict.fromkeys(kinds):
-
-        @wp.func_native("return wp::extract(memory, index);")
-        def row(memory: wp.ref[memory], index: int) -> element: ...
-
-    return row
-
-
 row = reader(
-    (PerLink2, vec2),
-    (PerLink3, vec3),
-    (PerNode3, vec3),
-    (PerCandidate3, vec3),
-    (PerLink1, real),
-    (PerCandidate1, real),
-    (PerLinkInt, wp.int32),
-    (PerCandidateInt, wp.int32),
-)
-
-
-# Arrays that a launch is given
+    (PerLink1, real), (PerLink2, vec2), (PerLink3, vec3), (PerLinkInt, wp.int32), (PerNode3, vec3),
+    (PerCandidate1, real), (PerCandidate3, vec3), (PerCandidateInt, wp.int32),
+)  # fmt: skip
 
 
 @wp.struct
@@ -61,7 +42,7 @@ class LinkBuild:
 
     length: real
     bend_cosine: real
-    """Of the angle at rest to the link before."""
+    """Cosine and sine of the angle at rest to the link before."""
     bend_sine: real
     mass: real
 
@@ -133,7 +114,7 @@ class MotionArrays:
 
 @wp.struct
 class ShapeArrays:
-    """What whiskers may touch: shapes of all scenes, and the triangles of the surfaces among them."""
+    """Objects that whiskers may touch: shapes of all scenes, and the triangles of the surfaces among them."""
 
     first: wp.array(dtype=wp.int32)
     """[scene + 1] first shape of each scene."""
@@ -208,9 +189,9 @@ class StepOptions:
     axes: mat33
     """Rotation of the results."""
     quasistatic: wp.int32
-    """Whether rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
+    """1: rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
     shape: wp.int32
-    """Whether shapes and contact wrenches are recorded."""
+    """1: shapes and contact wrenches are recorded."""
 
 
 @wp.struct
@@ -245,33 +226,6 @@ class ResultArrays:
     """[job] sum over the steps of the square of the contact forces (mN²)."""
 
 
-# What a thread keeps of its whisker
-
-
-@wp.struct
-class Twist:
-    """Angular velocity, and velocity of the point of the body that is at the base point."""
-
-    angular: vec3
-    linear: vec3
-
-
-@wp.struct
-class SpatialAcceleration:
-    """Angular acceleration, and rate of the linear part of a twist."""
-
-    angular: vec3
-    linear: vec3
-
-
-@wp.struct
-class Wrench:
-    """Moment about the base point, and force."""
-
-    moment: vec3
-    force: vec3
-
-
 @wp.struct
 class WhiskerJob:
     """Constants of a job."""
@@ -289,12 +243,12 @@ class WhiskerJob:
     first_load: wp.int32
     end_load: wp.int32
     can_rest: wp.int32
-    """Whether nothing but contact can move it."""
+    """1: nothing but contact can move it."""
 
 
 @wp.struct
 class WhiskerState:
-    """How far a whisker has come, and totals of its steps."""
+    """Progress of a whisker, and totals of its steps."""
 
     reading: wp.int32
     """Reading that the whisker is on its way to."""
@@ -307,7 +261,7 @@ class WhiskerState:
     contacts: wp.int32
     """Contacts of the last step."""
     is_near: wp.int32
-    """Whether any link may be near an object."""
+    """1: some link may be near an object."""
     top_speed: real
     """Speed of the fastest point."""
     velocity_jump: real
@@ -358,7 +312,7 @@ class ChainState:
 
 @wp.struct
 class ProximityState:
-    """What only contact needs of each link; without objects a kernel leaves it out."""
+    """State of each link that only contact needs; without objects a kernel leaves it out."""
 
     inverse_inertia: PerLink3
     """Inverse inertia D⁻¹ of the joint (11, 12, 22)."""
@@ -390,25 +344,22 @@ class ContactCandidates:
 
 @wp.struct
 class LinkDistance:
-    """How near a link comes to a shape: between its ends, and at its far end."""
+    """Distance of a link from a shape: between its ends, and at its far end."""
 
     between: wp.int32
-    """Whether something between the ends is near."""
+    """1: something between the ends is near."""
     share: real
     """Place along the link, 0 to 1."""
     gap: real
     normal: vec3
     end: wp.int32
-    """Whether the far end is near."""
+    """1: the far end is near."""
     end_gap: real
     end_normal: vec3
     clearance: real
     """Lower bound of the distance of the link's axis from the surface."""
     leaf: wp.int32
     """Leaf of the search tree (+ 1) where the nearest triangle is; 0 without."""
-
-
-# Contact problems and paused whiskers
 
 
 @wp.struct

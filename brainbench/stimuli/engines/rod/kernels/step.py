@@ -10,7 +10,7 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import FINEST, NOTHING, REST, TRAVEL
 
-from .algebra import vec3
+from .algebra import SpatialAcceleration, Twist, Wrench, vec3
 from .articulated_body import articulated_inertia, forward_kinematics, integrate_joint, joint_accelerations
 from .broad_phase import count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
@@ -33,12 +33,9 @@ from .state import (
     ProximityState,
     ResultArrays,
     ShapeArrays,
-    SpatialAcceleration,
     StepOptions,
-    Twist,
     WhiskerJob,
     WhiskerState,
-    Wrench,
     row,
 )
 
@@ -191,6 +188,7 @@ def run(
                     break
                 used = used + 1
             now = until - left
+            # Equal steps up to the next reading.
             steps = wp.max(1, int(wp.ceil(left / preferred_step(job, state) - real(1e-3))))
             h = left / real(steps)
             left_whole = left
@@ -220,6 +218,7 @@ def run(
                 moving = Twist()
                 moving.angular = pose.spin
                 moving.linear = pose.velocity
+                # The base moves as its track does within the step; gravity is an acceleration of the base.
                 base = SpatialAcceleration()
                 base.angular = (later.spin - moving.angular) / h
                 base.linear = (
@@ -286,6 +285,7 @@ def run(
                 arc_sum = problems.solution[index].arc_sum
                 if force_sum > zero:
                     touched = 1
+            # What contact did to the tip's speed, and may do again.
             state.velocity_jump = wp.max(h * wp.length(tip_acceleration), real(0.5) * state.velocity_jump)
             state.touching = state.touching + touched
             if state.pending_reading >= 0:
