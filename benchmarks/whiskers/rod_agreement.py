@@ -22,6 +22,7 @@ from benchmarks.report import table, write_section
 from brainbench.stimuli import Fidelity, Frames, Scene, simulate
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+from tests.factories.friction_reference import differences
 
 SHAPES = "ellipsoid-1,brick-2,torus-3,cone-1,bumpy-1,cylinder-1,superquadric-1,pyramid-1,vase-1,wedge-1"
 ACCURATE = Fidelity.preset("accurate")
@@ -56,21 +57,6 @@ def wrenches(scenes: Sequence[Scene], fidelity: Fidelity, backend: str, *, cache
     keep = backend != "rod" if cache is None else cache
     found = [simulate([scene], fidelity=fidelity, backend=backend, cache=keep)["wrench"].values[0] for scene in scenes]
     return np.concatenate([np.moveaxis(wrench, 1, 0) for wrench in found]).astype(float)
-
-
-def differences(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each whisker's own peak [whisker]: of the peaks, of the median reading in contact, root mean square.
-
-    Args:
-        found, truth: forces or moments [whisker, reading, 3].
-    """
-    size, other = (np.linalg.norm(values, axis=-1) for values in (truth, found))
-    peak = np.maximum(size.max(axis=1), 1e-30)
-    miss = np.linalg.norm(found - truth, axis=-1) / peak[:, None]
-    touching = size > 0.05 * peak[:, None]
-    touching |= ~touching.any(axis=1, keepdims=True)
-    readings = np.array([np.median(row[row_on]) for row, row_on in zip(miss, touching, strict=True)])
-    return np.abs(other.max(axis=1) / peak - 1), readings, np.sqrt((miss**2).mean(axis=1))
 
 
 def compare(found: np.ndarray, truth: np.ndarray) -> list[str]:

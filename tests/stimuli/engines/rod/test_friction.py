@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks.whiskers.friction_reference import Passing, Penalty, misses, solve
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.friction_reference import Passing, Penalty, misses, solve
 
 LINKS = 6
 
