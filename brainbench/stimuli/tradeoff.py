@@ -43,11 +43,12 @@ from brainbench.stimuli.engines.fidelity import SOLVERS, Fidelity, list_presets
 from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.figures.tradeoff import draw_bench, draw_collisions
+from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.mesh_solids import touchable
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import rodgers_solid
-from brainbench.stimuli.validation.bench_tests import peg, ringdown
+from brainbench.stimuli.validation.bench_tests import peg, ringdown, run_stable
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ class SimulationSetting:
     fidelity: Fidelity
     backend: str = DEFAULT_ENGINE
     collision: str | None = None
-    """How a concave object is touched, as in :data:`COLLISIONS`; None for the bench tests without one."""
+    """Collision geometry of a concave object, as in :data:`COLLISIONS`; None for the bench tests without one."""
 
     def __post_init__(self) -> None:
         if self.collision is not None:
@@ -119,18 +120,11 @@ def settings(
     for solver in solvers:
         if solver not in SOLVERS:
             raise unknown_name("solver", solver, SOLVERS)
-    plain = [
-        SimulationSetting(fidelity, name)
-        for name in backends
-        for fidelity in dict.fromkeys([*presets, *grid] if "dynamic" in solvers else [])
-    ]
-    plain += [
-        SimulationSetting(item, name)
-        for name in backends
-        if name == "rod" and "quasistatic" in solvers
-        for item in still
-    ]
-    return plain + [SimulationSetting(*point) for point in itertools.product(presets, backends, collisions)]
+    dynamic = dict.fromkeys([*presets, *grid] if "dynamic" in solvers else [])
+    chosen = [SimulationSetting(fidelity, name) for name in backends for fidelity in dynamic]
+    if "quasistatic" in solvers:
+        chosen += [SimulationSetting(fidelity, name) for name in backends if name == "rod" for fidelity in still]
+    return chosen + [SimulationSetting(*point) for point in itertools.product(presets, backends, collisions)]
 
 
 def measure_tradeoff(
@@ -327,15 +321,8 @@ def _into_hollow(setting: SimulationSetting) -> tuple[Trace, int]:
     # The hollow is a trough along the whisker, turned a little and aside, so that the whisker slides down its slope.
     obstacle = PlacedObject(solid, (0.01, 0.0042, 0.002), (0.0, math.pi / 2, 0.3), friction=0.0).obstacle()
     job = Job(_straight("C2"), _Whisk(math.radians(22)), (obstacle,), _FRAMES)
-    engine = get_engine(setting.backend)
-    body = touched(obstacle, surfaces=engine.surfaces)
-    pieces = len(body.parts) if body.surface is None else len(body.surface.faces)
-    # What an engine loads or compiles at first use is no cost of the setting.
-    engine.run([replace(job, times=_FRAMES[:2])], setting.fidelity, workers=1)
-    (trace,) = engine.run([job], setting.fidelity, workers=1)
-    if trace.status != "ok":
-        raise DataError(f"The simulation was unstable: {trace.reason}.")
-    return trace, pieces
+    body = touched(obstacle, surfaces=get_engine(setting.backend).surfaces)
+    return _timed([job], setting)[0], len(body.parts) if body.surface is None else len(body.surface.faces)
 
 
 def _ring_error(whisker: Whisker, setting: SimulationSetting) -> float:
@@ -357,8 +344,7 @@ class _Whisk:
     amplitude: float
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        ramp = np.clip(times / 0.025, 0, 1)
-        swing = self.amplitude * (1 - np.cos(2 * np.pi * 20 * times) * (ramp**3 * (10 - 15 * ramp + 6 * ramp**2)))
+        swing = self.amplitude * (1 - np.cos(2 * np.pi * 20 * times) * smooth_step(times, 0.025))
         euler = np.tile([math.pi / 2, 0.0, -math.pi / 2], (len(times), 1))
         euler[:, 0] += swing - swing[0]
         return np.zeros((len(times), 3)), euler
@@ -375,13 +361,14 @@ def _whisking(setting: SimulationSetting) -> list[Trace]:
     for friction, degrees in ((0.0, 12), (0.48, 12), (0.48, 25)):
         post = Obstacle((Capsule((0.0107, 0.0012, -0.02), (0.0107, 0.0012, 0.02), 1e-3),), friction=friction)
         jobs.append(Job(whisker, _Whisk(math.radians(degrees)), (post,), _FRAMES))
+    return _timed(jobs, setting)
+
+
+def _timed(jobs: Sequence[Job], setting: SimulationSetting) -> list[Trace]:
     engine = get_engine(setting.backend)
+    # What an engine loads or compiles at first use is no cost of the setting.
     engine.run([replace(job, times=_FRAMES[:2]) for job in jobs], setting.fidelity, workers=1)
-    traces = engine.run(jobs, setting.fidelity, workers=1)
-    for trace in traces:
-        if trace.status != "ok":
-            raise DataError(f"The simulation was unstable: {trace.reason}.")
-    return traces
+    return run_stable(engine, jobs, setting.fidelity)
 
 
 def _difference(trace: Trace, reference: Trace) -> float:

@@ -27,6 +27,7 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 from brainbench.core.files import write_text
+from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
 from brainbench.stimuli.whiskers.selection import ROWS
 
@@ -130,7 +131,7 @@ def save_parameters(
     root = Path(folder)
     mounts = array.mounts
     rows: dict[str, list[list[str]]] = {
-        "param_name": [[_full_name(mount)] for mount in mounts],
+        "param_name": [[mount.full_name] for mount in mounts],
         "param_side_row_col": [[str(int(m.side == "right")), str(m.row + 1), str(m.col)] for m in mounts],
         "param_s_a": [[_text(m.whisker.arc_length * _MILLI), _text(-m.whisker.curvature / _MILLI)] for m in mounts],
         "param_bp_pos": [[_text(value * _MILLI) for value in m.position] for m in mounts],
@@ -212,7 +213,7 @@ def _write_kinematics(one: xr.Dataset, root: Path, names: Sequence[str], shapes:
 
 
 def _run_names(one: xr.Dataset) -> list[str]:
-    """Names with their side: ``RC2``."""
+    """Return the names with their side: ``RC2``."""
     if "side" not in one.coords:
         raise UsageError("The stimulus set does not say on which side its whiskers are; WHISKiT's names need it.")
     sides = [str(side)[0].upper() for side in one["side"].values]
@@ -229,36 +230,29 @@ def _write(path: Path, values: NDArray[np.float64], end: str) -> None:
 
 
 def _names(root: Path) -> list[str]:
-    text = _read(root / "param_name.csv")
+    path = _existing(root, "param_name")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
     return [line.strip().rstrip(",") for line in text.splitlines() if line.strip()]
 
 
 def _table(root: Path, name: str, lines: int, columns: int | None) -> NDArray[np.float64]:
-    path = root / f"{name}.csv"
-    text = _read(path)
-    try:
-        rows = [[float(cell) for cell in line.rstrip(", ").split(",")] for line in text.splitlines() if line.strip()]
-        table = np.array(rows, dtype=float)
-    except ValueError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a table of numbers ({error}).") from error
-    if table.ndim != 2 or len(table) != lines or (columns is not None and table.shape[1] != columns):
+    path = _existing(root, name)
+    table = read_numbers(path)
+    if len(table) != lines or (columns is not None and table.shape[1] != columns):
         raise DataError(
             f"{os.fspath(path)!r} has shape {list(table.shape)}; {lines} names need [{lines}, {columns or 'links'}]."
         )
     return table
 
 
-def _read(path: Path) -> str:
+def _existing(root: Path, name: str) -> Path:
+    path = root / f"{name}.csv"
     if not path.is_file():
         raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}; a WHISKiT parameter folder has one.")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
-
-
-def _full_name(mount: MountedWhisker) -> str:
-    return mount.side[0].upper() + mount.name
+    return path
 
 
 def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -267,5 +261,5 @@ def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def _text(value: float) -> str:
-    """Enough digits for any published table, and none that only changing the unit brought in."""
+    """Return enough digits for any published table, and none that only changing the unit brought in."""
     return f"{value:.12g}"

@@ -1,4 +1,4 @@
-"""What pictures share: matplotlib without a display, colours of the rows, round lengths for scale bars."""
+"""Common parts of pictures: matplotlib without a display, colours of the rows, round lengths for scale bars."""
 
 from __future__ import annotations
 

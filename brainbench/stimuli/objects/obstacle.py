@@ -41,7 +41,7 @@ class ConvexPart:
         object.__setattr__(self, "vertices", points)
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ConvexPart:
@@ -76,7 +76,7 @@ class TriangleMesh:
         object.__setattr__(self, "faces", faces)
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
@@ -114,7 +114,7 @@ class Sphere:
         _check_vector("sphere", centre=self.centre)
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.add(self.centre, [[-self.radius] * 3, [self.radius] * 3])
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Sphere:
@@ -128,7 +128,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class _Segment:
-    """What capsules and cylinders share: a radius around the segment from ``start`` to ``end``."""
+    """Base of capsules and cylinders: a radius around the segment from ``start`` to ``end``."""
 
     start: Vector
     end: Vector
@@ -155,7 +155,7 @@ class Capsule(_Segment):
     """All points within ``radius`` of the segment from ``start`` to ``end``."""
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         ends = np.array([self.start, self.end])
         return np.stack([ends.min(axis=0) - self.radius, ends.max(axis=0) + self.radius])
 
@@ -164,7 +164,7 @@ class Cylinder(_Segment):
     """A flat-ended cylinder around the segment from ``start`` to ``end``."""
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         ends = np.array([self.start, self.end])
         axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         reach = self.radius * np.sqrt(np.clip(1 - axis**2, 0, 1))
@@ -188,7 +188,7 @@ class Box:
             raise UsageError(f"The quaternion of a box must have length 1; {self.quaternion} has length {length:g}.")
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         reach = np.abs(rotation_matrix(self.quaternion)) @ np.array(self.half_sizes)
         return np.stack([np.array(self.centre) - reach, np.array(self.centre) + reach])
 
@@ -237,7 +237,7 @@ class Obstacle:
 
 
 def rotation_matrix(quaternion: ArrayLike) -> NDArray[np.float64]:
-    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4] (w, x, y, z)."""
+    """Return the rotation matrices [..., 3, 3] of unit quaternions [..., 4] (w, x, y, z)."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.rotations import euler_matrix
 from brainbench.geometry import DecompositionSettings, Mesh, load_mesh
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -18,7 +19,6 @@ from brainbench.stimuli.objects import procedural
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid, shape_solids
 from brainbench.stimuli.objects.obstacle import TriangleMesh, rotation_matrix
 from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.objects.primitives import RODGERS_CONTROL, box, capsule, cylinder, rodgers_solid, sphere
 from brainbench.stimuli.whiskers.whisker import Whisker
 
