@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import from_matrices
+from brainbench.core.rotations import from_matrices, to_matrices
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
     """Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
@@ -189,12 +189,12 @@ class Box:
 
     def bounds(self) -> NDArray[np.float64]:
         """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
-        reach = np.abs(rotation_matrix(self.quaternion)) @ np.array(self.half_sizes)
+        reach = np.abs(to_matrices(self.quaternion)) @ np.array(self.half_sizes)
         return np.stack([np.array(self.centre) - reach, np.array(self.centre) + reach])
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Box:
         """Return the box rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
-        turned = tuple(from_matrices(rotation @ rotation_matrix(self.quaternion)).tolist())
+        turned = tuple(from_matrices(rotation @ to_matrices(self.quaternion)).tolist())
         return Box(_placed(self.centre, rotation, translation), self.half_sizes, turned)
 
     def scaled(self, factor: float) -> Box:
@@ -234,17 +234,6 @@ class Obstacle:
             raise UsageError("An obstacle needs at least one part or a surface.")
         if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
             raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
-
-
-def rotation_matrix(quaternion: ArrayLike) -> NDArray[np.float64]:
-    """Return the rotation matrices [..., 3, 3] of unit quaternions [..., 4] (w, x, y, z)."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _halves(patch: NDArray[np.int64], middle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -64,7 +64,7 @@ class Solid:
         return self.scaled(diagonal / self.diagonal)
 
     def config(self) -> dict[str, Any]:
-        """Return plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
+        """Return plain values that determine the physics; parts count by a hash of numbers or origin."""
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
         if self.origin is not None:

@@ -108,7 +108,7 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
 
 @lru_cache(maxsize=256)
 def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
-    """Return the equilibrium of large bending by a frictionless point peg at the point (``at``, ``offset``) of the plane [m].
+    """Return the equilibrium of large bending by a frictionless point peg at the point (``at``, ``offset``) [m].
 
     Solves x' = cos θ, y' = sin θ, E I(s)(θ' − κ₀(s)) = (a − x) Fy − (d − y) Fx with F normal to the rod at
     the contact, on the branch that starts from the undeformed rod. The peg pushes towards +y when
@@ -123,7 +123,7 @@ def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
 
 
 def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radius: float, *, side: int = 1) -> Contact:
-    """Return the equilibrium of large bending by a frictionless round peg of radius ``peg_radius`` at ``centre`` [m].
+    """Return the equilibrium with a frictionless round peg of radius ``peg_radius`` at ``centre`` [m].
 
     The rod's own radius counts: its centre line passes one radius sum from the axis. The peg pushes
     towards +y for ``side`` 1 and towards −y for −1.
@@ -278,7 +278,7 @@ class _Branch:
         )
 
     def _integrate(self, slope: float, force: float, arc: float) -> tuple[float, float, float, float]:
-        """Return base angle, contact point (x, y) and base moment, by Runge-Kutta steps from the contact to the base."""
+        """Return base angle, contact point (x, y) and base moment: Runge-Kutta steps from contact to base."""
         half = np.linspace(arc, 0.0, 2 * _STEPS + 1)
         flexibility = 1 / np.maximum(self.whisker.bending_stiffness(half), 1e-300)
         rest = self._rest_curvature(half)

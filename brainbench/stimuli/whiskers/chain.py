@@ -56,7 +56,7 @@ class Chain:
         return len(self.lengths)
 
     def frequencies(self, count: int = 1) -> NDArray[np.float64]:
-        """Return the lowest natural angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
+        """Return the lowest angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
         from scipy.linalg import eigh
 
         last = min(count, self.links) - 1

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.rotations import euler_matrix
+
 if TYPE_CHECKING:
     from manifold3d import Manifold
     from numpy.typing import ArrayLike, NDArray
@@ -72,14 +74,7 @@ class Body:
 
     def turned(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Body:
         """Rotate by degrees about the fixed x, then y, then z axis."""
-        matrix = np.eye(3)
-        for axis, angle in enumerate((x, y, z)):
-            c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-            one = np.eye(3)
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            one[i, i], one[i, j], one[j, i], one[j, j] = c, -s, s, c
-            matrix = one @ matrix
-        return self._mapped(matrix)
+        return self._mapped(euler_matrix(np.radians((x, y, z))))
 
     def stretched(self, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Body:
         """Scale by positive factors along the axes."""
