@@ -34,15 +34,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, DataError, missing_dependency, unknown_name
-from brainbench.core.files import atomic_path, read_json, write_json, write_text
+from brainbench.core.errors import BrainbenchError, DataError, unknown_name
+from brainbench.core.files import read_json, write_json, write_text
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import SOLVERS, Fidelity, list_presets
 from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.engines.reach import touched
-from brainbench.stimuli.figures.tradeoff import draw_bench, draw_collisions
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.mesh_solids import touchable
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
@@ -169,15 +168,10 @@ def measure_tradeoff(
 
 def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
     """Write points as comma-separated values, one row each, atomically; what is not known stays empty."""
-    import csv
-    from io import StringIO
+    import pandas as pd
 
-    rows = list(points)
-    text = StringIO()
-    writer = csv.DictWriter(text, fieldnames=sorted({name for row in rows for name in row}), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
-    return write_text(path, text.getvalue())
+    # Columns of objects, so that whole numbers stay whole beside missing ones.
+    return write_text(path, pd.DataFrame(list(points), dtype=object).sort_index(axis=1).to_csv(index=False))
 
 
 def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> list[TradeoffPoint]:
@@ -202,34 +196,10 @@ def collision_points(points: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return [point for point in points if point.get("collision")]
 
 
-def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
-    """Draw error against cost, with the front of each backend and the presets, to an image whose suffix is the format.
-
-    A second panel has the collision geometries of a concave object, where the table has any.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed (extra ``report``).
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_dependency("matplotlib", extra="report", purpose="Plotting the trade-off") from error
-    chosen = list(points)
-    hollow = [point for point in collision_points(chosen) if point["error"] is not None]
-    figure = Figure(figsize=(11 if hollow else 7, 4.5), layout="constrained")
-    axes = figure.subplots(1, 2 if hollow else 1, squeeze=False)[0]
+def preset_of(point: dict[str, Any]) -> str:
+    """Return the name of the preset with the resolution of a point; empty when there is none."""
     presets = {_key(_fields(SimulationSetting(Fidelity.preset(name))))[: len(_NAMES)]: name for name in list_presets()}
-    groups = sorted({(point["backend"], _moves(point)) for point in chosen if not point.get("collision")}, reverse=True)
-    for number, (backend, moves) in enumerate(sorted(groups, key=lambda group: (not group[1], group[0]))):
-        some = [point for point in chosen if (point["backend"], _moves(point)) == (backend, moves)]
-        usable = [point for point in some if point["error"] is not None and not point.get("collision")]
-        names = [presets.get(_key(point)[: len(_NAMES)], "") for point in usable]
-        draw_bench(axes[0], usable, names, front(usable), f"C{number}")
-    if hollow:
-        draw_collisions(axes[1], hollow)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
-    return Path(path)
+    return presets.get(_key(point)[: len(_NAMES)], "")
 
 
 _NAMES = ("links", "links_per_mm", "time_step", "steps_per_period")
