@@ -268,8 +268,8 @@ def make_data(args: argparse.Namespace, gpus: int) -> Path:
 
 def make_shards(args: argparse.Namespace) -> None:
     """Make every n-th shard of the data set."""
-    from brainbench.stimuli.sweeps.local_pool import run_here
     from brainbench.stimuli.sweeps.manifest import is_whole
+    from brainbench.stimuli.sweeps.running import run_here
 
     index, count = map(int, args.shards.split("/"))
     folder = args.work / "data"

@@ -25,8 +25,8 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.rod.sweeps import BLOCK, SweepLauncher
 from brainbench.stimuli.engines.trust import LARGEST_RESIDUAL
 from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.sweeps.grid import default_array
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.chain import build_chain
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def free(
     """Whiskers that swing under gravity, nothing near: pure integration."""
     step = 1e-4
     fidelity = Fidelity(links=links, time_step=step, precision=precision)
-    chains = [build_chain(mount.whisker, links) for mount in default_array("mouse")]
+    chains = [build_chain(mount.whisker, links) for mount in WhiskerArray.mouse()]
     solver = WhiskerSolver(chains, fidelity, pick_device(device_name), NOTHING, block=block, bounds=bounds)
     motions, shapes = PackedMotions(), PackedShapes()
     motions.add(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])), 0.0, 1.0)
@@ -89,7 +89,7 @@ def peer(device_name: str, worlds: int, links: int, steps: int) -> None:
     from brainbench.stimuli.engines.reach import reachable
 
     wp = warp()
-    whisker = next(mount.whisker for mount in default_array("mouse") if mount.name == "C2")
+    whisker = next(mount.whisker for mount in WhiskerArray.mouse() if mount.name == "C2")
     job = Job(whisker, StillFollicle(), (), np.array([1e-2]), gravity=(0.0, 0.0, -9.81))
     times = np.arange(101) * 1e-4
     reach = reachable(whisker, np.zeros((len(times), 3)), (), times, surfaces=False)

@@ -26,7 +26,7 @@ from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.objects.collections import NamedObject, resolve_objects
 from brainbench.stimuli.objects.primitives import box
-from brainbench.stimuli.sweeps import local_pool, shards
+from brainbench.stimuli.sweeps import running, shards
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
 from brainbench.stimuli.sweeps.shards import _write_all, prepare_shard
@@ -111,21 +111,21 @@ def write_set(folder: Path, sweeps: int) -> list[list[str]]:
         for name in (f"box-{index}" for index in range(sweeps // 16))
     }
     plan = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, Settings(Fidelity(), shard_size=2048))
-    run, local_pool.run_here = (
-        local_pool.run_here,
-        lambda tasks, where, workers, done: local_pool.run_pipelined(tasks, where, 1, done),
+    run, running.run_here = (
+        running.run_here,
+        lambda tasks, where, workers, done: running.run_pipelined(tasks, where, 1, done),
     )
     # What other processes do while the GPU works is measured by itself.
     each = [seconds(lambda task=task: prepare_shard(task), 1) for task in plan.shards]
     ready = [(task, prepare_shard(task)) for task in plan.shards]
-    ahead, local_pool._built_ahead = local_pool._built_ahead, lambda tasks, pool, ahead: iter(ready)
-    pool, local_pool._pool = local_pool._pool, ThreadPoolExecutor  # type: ignore[assignment]
+    ahead, running._built_ahead = running._built_ahead, lambda tasks, pool, ahead: iter(ready)
+    pool, running._pool = running._pool, ThreadPoolExecutor  # type: ignore[assignment]
     try:
         took = seconds(lambda: generate(plan, folder), 1)
     finally:
-        local_pool.run_here, local_pool._pool, local_pool._built_ahead = run, pool, ahead
+        running.run_here, running._pool, running._built_ahead = run, pool, ahead
     means = [sum(item) / plan.sweeps * 2048 * 1e3 for item in zip(*each, strict=True)]
-    what = f"{plan.sweeps:,} sweeps in {len(plan.shards)} shards: {local_pool.WRITERS} threads hash, write, wait"
+    what = f"{plan.sweeps:,} sweeps in {len(plan.shards)} shards: {running.WRITERS} threads hash, write, wait"
     prepare = [
         "prepare a shard of 2048 sweeps of 128 objects, beside building them",
         *(f"{one:.0f} ms" for one in means),

@@ -52,7 +52,9 @@ def whisker(
     if csv is not None:
         tradeoff.write_csv(points, csv)
     if plot is not None:
-        tradeoff.plot_tradeoff(points, plot)
+        from brainbench.stimuli.figures.tradeoff import plot_tradeoff
+
+        plot_tradeoff(points, plot)
     best = tradeoff.front(points)
     setting = {">links": "{0[links]}", ">step ms": lambda point: f"{point['time_step'] * 1e3:g}"}
     text = table_of(

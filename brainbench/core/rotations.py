@@ -41,6 +41,15 @@ def from_rpy(angles: ArrayLike) -> NDArray[np.float64]:
     return np.roll(Rotation.from_euler("xyz", a.reshape(-1, 3)).as_quat(), 1, axis=-1).reshape(*a.shape[:-1], 4)
 
 
+def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation matrix [3, 3] of turns about the fixed x, then y, then z axis by ``angles`` [3] (rad)."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
 def from_z_axis(direction: ArrayLike) -> NDArray[np.float64]:
     """Return the quaternion [4] of the shortest turn of the z axis to a unit vector [3]."""
     x, y, z = np.asarray(direction, dtype=np.float64)

@@ -1,4 +1,9 @@
-"""Whisker stimuli: arrays, objects and motion make scenes, engines simulate them into forces and moments."""
+"""Whisker stimuli: forces and moments at the base of whiskers that touch objects.
+
+``whiskers``, ``objects`` and ``motion`` make ``scenes``; ``engines`` simulate them (:func:`simulate`), many at once as
+``sweeps``; the wrenches go to a stimulus set or as an array [K, T, C, H, W] to a model (:func:`load_stimuli`).
+``validation`` holds engines against closed forms, ``figures`` draws scenes and traces.
+"""
 
 from __future__ import annotations
 
@@ -62,40 +67,25 @@ __all__ = [
     "write_stimulus_set",
 ]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    {
-        "Animal": ".scenes.scene",
-        "Fidelity": ".engines.fidelity",
-        "Frames": ".scenes.frames",
-        "Head": ".scenes.scene",
-        "Path": ".motion.trajectories",
-        "PlacedObject": ".objects.placed_object",
-        "Recipe": ".scenes.scene_files",
-        "Recorded": ".motion.recorded",
-        "Scene": ".scenes.scene",
-        "Solid": ".objects.solid",
-        "Spin": ".motion.trajectories",
-        "Still": ".motion.trajectories",
-        "Stimuli": ".sources",
-        "SweepGrid": ".sweeps.grid",
-        "Translation": ".motion.trajectories",
-        "Whisker": ".whiskers.whisker",
-        "WhiskerArray": ".whiskers.array",
-        "Whisking": ".motion.trajectories",
-        "describe_recipe": ".scenes.recipes",
-        "get_engine": ".engines",
-        "get_recipe": ".scenes.recipes",
-        "list_recipes": ".scenes.recipes",
-        "load_scene": ".scenes.scene_files",
-        "load_shapenet": ".objects.shapenet",
-        "load_stimuli": ".sources",
-        "load_trajectory": ".motion.recorded",
-        "read_stimulus_set": ".stimulus_set",
-        "references": ".validation.references.",
-        "simulate": ".simulation",
-        "to_frame": ".readout",
-        "to_grid": ".readout",
-        "write_stimulus_set": ".stimulus_set",
-    },
-)
+_MODULES = {
+    ".engines": ("get_engine",),
+    ".engines.fidelity": ("Fidelity",),
+    ".motion.recorded": ("Recorded", "load_trajectory"),
+    ".motion.trajectories": ("Path", "Spin", "Still", "Translation", "Whisking"),
+    ".objects.placed_object": ("PlacedObject",),
+    ".objects.shapenet": ("load_shapenet",),
+    ".objects.solid": ("Solid",),
+    ".readout": ("to_frame", "to_grid"),
+    ".scenes.frames": ("Frames",),
+    ".scenes.recipes": ("describe_recipe", "get_recipe", "list_recipes"),
+    ".scenes.scene": ("Animal", "Head", "Scene"),
+    ".scenes.scene_files": ("Recipe", "load_scene"),
+    ".simulation": ("simulate",),
+    ".sources": ("Stimuli", "load_stimuli"),
+    ".stimulus_set": ("read_stimulus_set", "write_stimulus_set"),
+    ".sweeps.grid": ("SweepGrid",),
+    ".validation.references.": ("references",),
+    ".whiskers.array": ("WhiskerArray",),
+    ".whiskers.whisker": ("Whisker",),
+}
+__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

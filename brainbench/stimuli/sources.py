@@ -80,14 +80,12 @@ def load_stimuli(
         return source if whiskers == "all" else load_stimuli(_dataset_of(source), whiskers=whiskers)
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
-    if isinstance(source, str) and is_recipe(source):
-        recipe = get_recipe(source, whiskers=whiskers)
-        return _from_recipe(recipe, fidelity, backend, progress, cache)
-    path = Path(source)
-    if path.suffix == ".toml":
-        from brainbench.stimuli.scenes.scene_files import load_scene
+    if (recipe := _recipe(source, whiskers)) is not None:
+        from brainbench.stimuli.simulation import simulate
 
-        return _from_recipe(load_scene(path, whiskers=whiskers), fidelity, backend, progress, cache)
+        dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
+        return _from_dataset(dataset, "all", recipe.description.strip() or recipe.name)
+    path = Path(source)
     if path.suffix in _HDF5 or path.is_file():
         return _from_hdf5(path, whiskers)
     hint = f"Or a path: a scene file (.toml), or a stimulus-set or array file ({', '.join(_HDF5)})."
@@ -105,27 +103,22 @@ def prepare_stimuli(
 
     Whatever does not have to be simulated is left alone, and so is what cannot be: ``load_stimuli`` says why.
     """
-    from brainbench.stimuli.scenes.scene_files import load_scene
     from brainbench.stimuli.simulation import prepare
 
     with contextlib.suppress(BrainbenchError, OSError):
-        if isinstance(source, str) and is_recipe(source):
-            prepare(get_recipe(source, whiskers=whiskers).scenes, fidelity=fidelity, progress=progress)
-        elif isinstance(source, (str, os.PathLike)) and Path(source).suffix == ".toml":
-            prepare(load_scene(Path(source), whiskers=whiskers).scenes, fidelity=fidelity, progress=progress)
+        if isinstance(source, (str, os.PathLike)) and (recipe := _recipe(source, whiskers)) is not None:
+            prepare(recipe.scenes, fidelity=fidelity, progress=progress)
 
 
-def _from_recipe(
-    recipe: Recipe,
-    fidelity: Fidelity | str | None,
-    backend: WhiskerEngine | str,
-    progress: Progress | None,
-    cache: bool,
-) -> Stimuli:
-    from brainbench.stimuli.simulation import simulate
+def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
+    """Return the scenes that a recipe name or the path of a scene file names; None for anything else."""
+    if isinstance(source, str) and is_recipe(source):
+        return get_recipe(source, whiskers=whiskers)
+    if Path(source).suffix != ".toml":
+        return None
+    from brainbench.stimuli.scenes.scene_files import load_scene
 
-    dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
-    return _from_dataset(dataset, "all", recipe.description.strip() or recipe.name)
+    return load_scene(source, whiskers=whiskers)
 
 
 def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimuli:

@@ -34,20 +34,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, DataError, missing_dependency, unknown_name
-from brainbench.core.files import atomic_path, read_json, write_json, write_text
+from brainbench.core.errors import BrainbenchError, DataError, unknown_name
+from brainbench.core.files import read_json, write_json, write_text
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import SOLVERS, Fidelity, list_presets
 from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.engines.reach import touched
-from brainbench.stimuli.figures.tradeoff import draw_bench, draw_collisions
+from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.mesh_solids import touchable
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import rodgers_solid
-from brainbench.stimuli.validation.bench_tests import peg, ringdown
+from brainbench.stimuli.validation.bench_tests import peg, ringdown, run_stable
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class SimulationSetting:
     fidelity: Fidelity
     backend: str = DEFAULT_ENGINE
     collision: str | None = None
-    """How a concave object is touched, as in :data:`COLLISIONS`; None for the bench tests without one."""
+    """Collision geometry of a concave object, as in :data:`COLLISIONS`; None for the bench tests without one."""
 
     def __post_init__(self) -> None:
         if self.collision is not None:
@@ -119,18 +119,11 @@ def settings(
     for solver in solvers:
         if solver not in SOLVERS:
             raise unknown_name("solver", solver, SOLVERS)
-    plain = [
-        SimulationSetting(fidelity, name)
-        for name in backends
-        for fidelity in dict.fromkeys([*presets, *grid] if "dynamic" in solvers else [])
-    ]
-    plain += [
-        SimulationSetting(item, name)
-        for name in backends
-        if name == "rod" and "quasistatic" in solvers
-        for item in still
-    ]
-    return plain + [SimulationSetting(*point) for point in itertools.product(presets, backends, collisions)]
+    dynamic = dict.fromkeys([*presets, *grid] if "dynamic" in solvers else [])
+    chosen = [SimulationSetting(fidelity, name) for name in backends for fidelity in dynamic]
+    if "quasistatic" in solvers:
+        chosen += [SimulationSetting(fidelity, name) for name in backends if name == "rod" for fidelity in still]
+    return chosen + [SimulationSetting(*point) for point in itertools.product(presets, backends, collisions)]
 
 
 def measure_tradeoff(
@@ -175,15 +168,10 @@ def measure_tradeoff(
 
 def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
     """Write points as comma-separated values, one row each, atomically; what is not known stays empty."""
-    import csv
-    from io import StringIO
+    import pandas as pd
 
-    rows = list(points)
-    text = StringIO()
-    writer = csv.DictWriter(text, fieldnames=sorted({name for row in rows for name in row}), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
-    return write_text(path, text.getvalue())
+    # Columns of objects, so that whole numbers stay whole beside missing ones.
+    return write_text(path, pd.DataFrame(list(points), dtype=object).sort_index(axis=1).to_csv(index=False))
 
 
 def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> list[TradeoffPoint]:
@@ -208,34 +196,10 @@ def collision_points(points: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return [point for point in points if point.get("collision")]
 
 
-def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
-    """Draw error against cost, with the front of each backend and the presets, to an image whose suffix is the format.
-
-    A second panel has the collision geometries of a concave object, where the table has any.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed (extra ``report``).
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_dependency("matplotlib", extra="report", purpose="Plotting the trade-off") from error
-    chosen = list(points)
-    hollow = [point for point in collision_points(chosen) if point["error"] is not None]
-    figure = Figure(figsize=(11 if hollow else 7, 4.5), layout="constrained")
-    axes = figure.subplots(1, 2 if hollow else 1, squeeze=False)[0]
+def preset_of(point: dict[str, Any]) -> str:
+    """Return the name of the preset with the resolution of a point; empty when there is none."""
     presets = {_key(_fields(SimulationSetting(Fidelity.preset(name))))[: len(_NAMES)]: name for name in list_presets()}
-    groups = sorted({(point["backend"], _moves(point)) for point in chosen if not point.get("collision")}, reverse=True)
-    for number, (backend, moves) in enumerate(sorted(groups, key=lambda group: (not group[1], group[0]))):
-        some = [point for point in chosen if (point["backend"], _moves(point)) == (backend, moves)]
-        usable = [point for point in some if point["error"] is not None and not point.get("collision")]
-        names = [presets.get(_key(point)[: len(_NAMES)], "") for point in usable]
-        draw_bench(axes[0], usable, names, front(usable), f"C{number}")
-    if hollow:
-        draw_collisions(axes[1], hollow)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
-    return Path(path)
+    return presets.get(_key(point)[: len(_NAMES)], "")
 
 
 _NAMES = ("links", "links_per_mm", "time_step", "steps_per_period")
@@ -327,15 +291,8 @@ def _into_hollow(setting: SimulationSetting) -> tuple[Trace, int]:
     # The hollow is a trough along the whisker, turned a little and aside, so that the whisker slides down its slope.
     obstacle = PlacedObject(solid, (0.01, 0.0042, 0.002), (0.0, math.pi / 2, 0.3), friction=0.0).obstacle()
     job = Job(_straight("C2"), _Whisk(math.radians(22)), (obstacle,), _FRAMES)
-    engine = get_engine(setting.backend)
-    body = touched(obstacle, surfaces=engine.surfaces)
-    pieces = len(body.parts) if body.surface is None else len(body.surface.faces)
-    # What an engine loads or compiles at first use is no cost of the setting.
-    engine.run([replace(job, times=_FRAMES[:2])], setting.fidelity, workers=1)
-    (trace,) = engine.run([job], setting.fidelity, workers=1)
-    if trace.status != "ok":
-        raise DataError(f"The simulation was unstable: {trace.reason}.")
-    return trace, pieces
+    body = touched(obstacle, surfaces=get_engine(setting.backend).surfaces)
+    return _timed([job], setting)[0], len(body.parts) if body.surface is None else len(body.surface.faces)
 
 
 def _ring_error(whisker: Whisker, setting: SimulationSetting) -> float:
@@ -357,8 +314,7 @@ class _Whisk:
     amplitude: float
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        ramp = np.clip(times / 0.025, 0, 1)
-        swing = self.amplitude * (1 - np.cos(2 * np.pi * 20 * times) * (ramp**3 * (10 - 15 * ramp + 6 * ramp**2)))
+        swing = self.amplitude * (1 - np.cos(2 * np.pi * 20 * times) * smooth_step(times, 0.025))
         euler = np.tile([math.pi / 2, 0.0, -math.pi / 2], (len(times), 1))
         euler[:, 0] += swing - swing[0]
         return np.zeros((len(times), 3)), euler
@@ -375,13 +331,14 @@ def _whisking(setting: SimulationSetting) -> list[Trace]:
     for friction, degrees in ((0.0, 12), (0.48, 12), (0.48, 25)):
         post = Obstacle((Capsule((0.0107, 0.0012, -0.02), (0.0107, 0.0012, 0.02), 1e-3),), friction=friction)
         jobs.append(Job(whisker, _Whisk(math.radians(degrees)), (post,), _FRAMES))
+    return _timed(jobs, setting)
+
+
+def _timed(jobs: Sequence[Job], setting: SimulationSetting) -> list[Trace]:
     engine = get_engine(setting.backend)
+    # What an engine loads or compiles at first use is no cost of the setting.
     engine.run([replace(job, times=_FRAMES[:2]) for job in jobs], setting.fidelity, workers=1)
-    traces = engine.run(jobs, setting.fidelity, workers=1)
-    for trace in traces:
-        if trace.status != "ok":
-            raise DataError(f"The simulation was unstable: {trace.reason}.")
-    return traces
+    return run_stable(engine, jobs, setting.fidelity)
 
 
 def _difference(trace: Trace, reference: Trace) -> float:

@@ -18,15 +18,16 @@ what follows; the thesis's programs write and expect none.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 from brainbench.core.files import write_text
+from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
 from brainbench.stimuli.whiskers.selection import ROWS
 
@@ -129,16 +130,17 @@ def save_parameters(
         )
     root = Path(folder)
     mounts = array.mounts
-    rows: dict[str, list[list[str]]] = {
-        "param_name": [[_full_name(mount)] for mount in mounts],
-        "param_side_row_col": [[str(int(m.side == "right")), str(m.row + 1), str(m.col)] for m in mounts],
-        "param_s_a": [[_text(m.whisker.arc_length * _MILLI), _text(-m.whisker.curvature / _MILLI)] for m in mounts],
-        "param_bp_pos": [[_text(value * _MILLI) for value in m.position] for m in mounts],
-        "param_bp_angles": [[_text(value) for value in m.angles] for m in mounts],
-        "param_angles": [[_text(value) for value in line] for line in table],
+    rows: dict[str, list[Any]] = {
+        "param_name": [[mount.full_name] for mount in mounts],
+        "param_side_row_col": [[int(m.side == "right"), m.row + 1, m.col] for m in mounts],
+        "param_s_a": [[m.whisker.arc_length * _MILLI, -m.whisker.curvature / _MILLI] for m in mounts],
+        "param_bp_pos": [[value * _MILLI for value in m.position] for m in mounts],
+        "param_bp_angles": [m.angles for m in mounts],
+        "param_angles": table.tolist(),
     }
     for name, lines in rows.items():
-        write_text(root / f"{name}.csv", "".join(",".join(line) + "\n" for line in lines))
+        # Enough digits for any published table, and none that only changing the unit brought in.
+        _write(root / f"{name}.csv", lines, digits=12)
     return root
 
 
@@ -180,10 +182,10 @@ def save_run(
     names = _run_names(one)
     end = ",\n" if dialect == "sense-lab" else "\n"
     root = Path(folder)
-    write_text(root / "whisker_ID.csv", "".join(name + end for name in names))
+    _write(root / "whisker_ID.csv", [[name] for name in names], end)
     wrench = one["wrench"].values.astype(float) * np.repeat([1e3, 1e6], 3)
     for index, channel in enumerate(CHANNELS):
-        _write(root / "dynamics" / f"{channel}.csv", wrench[:, :, index], end)
+        _write(root / "dynamics" / f"{channel}.csv", wrench[:, :, index].tolist(), end)
     if shapes is not None:
         _write_kinematics(one, root / "kinematics", names, shapes, end)
     return root
@@ -201,18 +203,18 @@ def _write_kinematics(one: xr.Dataset, root: Path, names: Sequence[str], shapes:
         links = joints.shape[1] - 1
         points = np.concatenate([joints[:, :1], (joints[:, :-1] + joints[:, 1:]) / 2], axis=1) * _MILLI
         for axis, letter in enumerate("xyz"):
-            _write(root / letter / f"{name}.csv", points[:, :, axis], end)
+            _write(root / letter / f"{name}.csv", points[:, :, axis].tolist(), end)
         flags = np.zeros((times, links), dtype=int)
         when = np.flatnonzero(touches[:, index] & np.isfinite(arcs[:, index]))
         # Links do not stretch, so their chords in any frame tell the arc length.
         length = np.linalg.norm(np.diff(joints[0], axis=0), axis=1).sum()
         link = np.clip((arcs[when, index] / length * links).astype(int), 0, links - 1)
         flags[when, link] = 1
-        write_text(root / "c" / f"{name}.csv", "".join(",".join(map(str, line)) + end for line in flags.tolist()))
+        _write(root / "c" / f"{name}.csv", flags.tolist(), end)
 
 
 def _run_names(one: xr.Dataset) -> list[str]:
-    """Names with their side: ``RC2``."""
+    """Return the names with their side: ``RC2``."""
     if "side" not in one.coords:
         raise UsageError("The stimulus set does not say on which side its whiskers are; WHISKiT's names need it.")
     sides = [str(side)[0].upper() for side in one["side"].values]
@@ -223,49 +225,37 @@ def _run_names(one: xr.Dataset) -> list[str]:
     return names
 
 
-def _write(path: Path, values: NDArray[np.float64], end: str) -> None:
-    lines = (",".join(f"{value:.7g}" for value in line) for line in values.tolist())
-    write_text(path, "".join(line + end for line in lines))
+def _write(path: Path, lines: Iterable[Iterable[float | str]], end: str = "\n", *, digits: int = 7) -> None:
+    cells = ((cell if isinstance(cell, str) else f"{cell:.{digits}g}" for cell in line) for line in lines)
+    write_text(path, "".join(",".join(line) + end for line in cells))
 
 
 def _names(root: Path) -> list[str]:
-    text = _read(root / "param_name.csv")
+    path = _existing(root, "param_name")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
     return [line.strip().rstrip(",") for line in text.splitlines() if line.strip()]
 
 
 def _table(root: Path, name: str, lines: int, columns: int | None) -> NDArray[np.float64]:
-    path = root / f"{name}.csv"
-    text = _read(path)
-    try:
-        rows = [[float(cell) for cell in line.rstrip(", ").split(",")] for line in text.splitlines() if line.strip()]
-        table = np.array(rows, dtype=float)
-    except ValueError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a table of numbers ({error}).") from error
-    if table.ndim != 2 or len(table) != lines or (columns is not None and table.shape[1] != columns):
+    path = _existing(root, name)
+    table = read_numbers(path)
+    if len(table) != lines or (columns is not None and table.shape[1] != columns):
         raise DataError(
             f"{os.fspath(path)!r} has shape {list(table.shape)}; {lines} names need [{lines}, {columns or 'links'}]."
         )
     return table
 
 
-def _read(path: Path) -> str:
+def _existing(root: Path, name: str) -> Path:
+    path = root / f"{name}.csv"
     if not path.is_file():
         raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}; a WHISKiT parameter folder has one.")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
-
-
-def _full_name(mount: MountedWhisker) -> str:
-    return mount.side[0].upper() + mount.name
+    return path
 
 
 def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
     x, y, z = map(float, values)
     return x, y, z
-
-
-def _text(value: float) -> str:
-    """Enough digits for any published table, and none that only changing the unit brought in."""
-    return f"{value:.12g}"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.trajectories import Path, Still, Translation, Whisking, smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule
 from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.objects.primitives import capsule, sphere
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.recipes import get_recipe

@@ -10,6 +10,7 @@ import pytest
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.stimuli import tradeoff
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.figures.tradeoff import plot_tradeoff
 from brainbench.stimuli.tradeoff import SimulationSetting
 
 
@@ -39,10 +40,10 @@ def test_a_setting_is_measured_once_and_the_reference_differs_from_itself_by_not
     with (tmp_path / "table.csv").open() as stream:
         assert [int(row["links"]) for row in csv.DictReader(stream)] == [8, 6]
     if importlib.util.find_spec("matplotlib"):
-        assert tradeoff.plot_tradeoff(both, tmp_path / "plot.png").stat().st_size > 1000
+        assert plot_tradeoff(both, tmp_path / "plot.png").stat().st_size > 1000
     else:
         with pytest.raises(MissingDependencyError, match=r"brainbench\[report\]"):
-            tradeoff.plot_tradeoff(both, tmp_path / "plot.png")
+            plot_tradeoff(both, tmp_path / "plot.png")
 
 
 def test_a_table_of_other_experiments_is_refused(tmp_path):
@@ -72,7 +73,7 @@ def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_
     # Kept points are not measured again.
     assert tradeoff.measure_tradeoff(path, chosen[1:]) == [bench, exact, cut, hull]
     if importlib.util.find_spec("matplotlib"):
-        assert tradeoff.plot_tradeoff([bench, exact, cut, hull], tmp_path / "plot.png").stat().st_size > 1000
+        assert plot_tradeoff([bench, exact, cut, hull], tmp_path / "plot.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("text", ["hul", "decomposition", "decomposition-fine", "hull-0.1"])

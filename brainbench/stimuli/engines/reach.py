@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.stimuli.objects.obstacle import Obstacle, rotation_matrix
+from brainbench.core.rotations import to_matrices
+from brainbench.stimuli.objects.obstacle import Obstacle
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -100,7 +101,7 @@ def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> N
     if obstacle.motion is None:
         return points[:1] if np.ptp(points, axis=0).max() == 0 else points
     position, quaternion = obstacle.motion(times)
-    return np.einsum("nji,nj->ni", rotation_matrix(quaternion), points - position)
+    return np.einsum("nji,nj->ni", to_matrices(quaternion), points - position)
 
 
 def _largest_step(points: NDArray) -> float:

@@ -102,7 +102,7 @@ class Annotation:
         self._text(left, low - 10 * self._unit, label, size=17, va="bottom")
 
     def _triad(self) -> None:
-        """Arrows along the world's axes, as the camera sees them from afar."""
+        """Draw arrows along the world's axes, as the camera sees them from afar."""
         reach = 58 * self._unit
         flat = (self.picture.lens.axes[:2] * [[1.0], [-1.0]]).T
         # The origin lies so far from the corner that every arrow and its name stay in the picture.

@@ -29,7 +29,7 @@ VIEWS: dict[str, Vector] = {
     "back": (0.0, -1.0, 0.0),
     "oblique": (0.42, -0.72, 0.55),
 }
-"""Where the camera stands as seen from the target, in world axes (x right, y rostral, z dorsal): ``side`` looks
+"""Directions from the target to the camera, in world axes (x right, y rostral, z dorsal): ``side`` looks
 at the animal's right side, ``front`` into its face."""
 
 PROJECTIONS = ("perspective", "orthographic")
@@ -37,7 +37,7 @@ PROJECTIONS = ("perspective", "orthographic")
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a picture is taken from.
+    """Viewpoint, projection and frame of a picture.
 
     Raises:
         UsageError: a view or projection is unknown, or a number lies outside its range.

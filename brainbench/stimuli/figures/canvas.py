@@ -1,4 +1,4 @@
-"""What pictures share: matplotlib without a display, colours of the rows, round lengths for scale bars."""
+"""Common parts of pictures: matplotlib without a display, colours of the rows, round lengths for scale bars."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def save_figure(figure: Figure, path: Path, **options: Any) -> Path:
 
     suffix = path.suffix.lower().lstrip(".")
     # Without a date and with a fixed salt, equal pictures are equal files.
-    stamp = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[suffix]
+    stamp = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(suffix)
     with atomic_path(path) as temporary, rc_context({"svg.hashsalt": "brainbench"}):
         figure.savefig(temporary, format=suffix, metadata=stamp, **options)
     return path

@@ -70,7 +70,7 @@ class Triangles:
 
 @dataclass(frozen=True, eq=False)
 class RasterLayer:
-    """What is visible at each pixel of a picture of some triangles."""
+    """Surface that is visible at each pixel of a picture of some triangles."""
 
     nearness: NDArray[np.float64]
     """[H, W] nearness of the surface; −∞ where there is none."""

@@ -47,7 +47,7 @@ _SINKS = 0.004
 
 @dataclass(frozen=True)
 class Style:
-    """How a scene is drawn.
+    """Colours, size and quality of a picture of a scene.
 
     Raises:
         UsageError: a colouring is unknown, or a number lies outside its range.
@@ -60,13 +60,13 @@ class Style:
     thickness: float = 2.0
     """Whiskers are drawn so many times as thick as they are, and never thinner than a pixel."""
     opacity: float = 1.0
-    """Of the objects, from 0 to 1; whiskers behind them shine through."""
+    """Opacity of the objects, from 0 to 1; whiskers behind them shine through."""
     size: tuple[int, int] = (1280, 960)
     """Width and height in pixels."""
     supersampling: int = 2
     """Samples per pixel and direction; smooths edges at its square of the cost."""
     frames_per_second: float = 25.0
-    """Of a film."""
+    """Frames per second of a film."""
 
     def __post_init__(self) -> None:
         if self.color not in COLORINGS:
@@ -134,7 +134,7 @@ class Picture:
         return np.round(255 / factor**2 * np.asarray(total)).astype(np.uint8)
 
     def _objects(self, index: int, lens: Lens) -> tuple[Triangles, RasterLayer]:
-        """Triangles of the objects and what the camera sees of them; found once when nothing moves."""
+        """Return the triangles of the objects and what the camera sees of them; found once when nothing moves."""
         if self._cached is not None and self._still:
             return self._cached
         time = float(self.recording.times[index])
@@ -279,5 +279,5 @@ def film_times(scene: Scene, start: float = 0.0, stop: float | None = None, step
 
 
 def _rgb(color: str) -> NDArray[np.float64]:
-    """Red, green and blue from 0 to 1 of a colour written #rrggbb."""
+    """Return the red, green and blue from 0 to 1 of a colour written #rrggbb."""
     return np.array([int(color[at : at + 2], 16) for at in (1, 3, 5)]) / 255

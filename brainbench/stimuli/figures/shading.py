@@ -29,7 +29,7 @@ class Light:
     nearness: NDArray[np.float64]
     """[H, W] of the surfaces that the lamp sees."""
     strength: float = 1.0
-    """Of the shadows, from 0 to 1: translucent objects throw weaker ones."""
+    """Strength of the shadows, from 0 to 1: translucent objects throw weaker ones."""
 
     @property
     def direction(self) -> NDArray[np.float64]:

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from brainbench.core.rotations import euler_matrix, to_matrices
 from brainbench.geometry import Mesh
 from brainbench.stimuli.figures.raster import Triangles
 from brainbench.stimuli.motion.trajectories import Path, Spin
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, Sphere, rotation_matrix
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, Sphere
+from brainbench.stimuli.objects.procedural.bodies import transported_normals
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -40,7 +42,7 @@ class DrawnSurface:
     normals: NDArray[np.float64]
     """[F, 3, 3] unit vectors."""
     motion: RigidMotion | None
-    """How the object moves from there; None when it stands still."""
+    """Motion of the object from there; None when it stands still."""
 
     def at(self, time: float, color: ArrayLike) -> Triangles:
         """Return the triangles at ``time`` (s) in one colour (red, green, blue)."""
@@ -48,14 +50,12 @@ class DrawnSurface:
         if self.motion is None:
             return Triangles(self.corners, self.normals, colors)
         positions, quaternions = self.motion(np.array([time]))
-        turn = rotation_matrix(quaternions)[0]
+        turn = to_matrices(quaternions)[0]
         return Triangles(self.corners @ turn.T + positions[0], self.normals @ turn.T, colors)
 
 
 def object_surface(item: PlacedObject) -> DrawnSurface:
     """Return the surface of an object: its mesh, or what whiskers touch when it has none."""
-    from brainbench.stimuli.objects.placement import euler_matrix
-
     obstacle = item.obstacle()
     if item.solid.mesh is None and obstacle.surface is not None:
         meshes = [Mesh(obstacle.surface.vertices, obstacle.surface.faces.astype(np.int64))]
@@ -72,6 +72,7 @@ def object_surface(item: PlacedObject) -> DrawnSurface:
 def part_mesh(part: Part) -> Mesh:
     """Return the surface of one convex part; round shapes have :data:`ROUND` corners a turn."""
     from trimesh import creation
+    from trimesh.geometry import align_vectors
 
     match part:
         case Sphere():
@@ -79,33 +80,21 @@ def part_mesh(part: Part) -> Mesh:
             solid.apply_translation(part.centre)
         case Box():
             place = np.eye(4)
-            place[:3, :3], place[:3, 3] = rotation_matrix(part.quaternion), part.centre
+            place[:3, :3], place[:3, 3] = to_matrices(part.quaternion), part.centre
             solid = creation.box(2 * np.array(part.half_sizes), transform=place)
         case Cylinder():
             solid = creation.cylinder(part.radius, sections=ROUND, segment=[part.start, part.end])
         case Capsule():
-            bend = np.linspace(0, np.pi / 2, ROUND // 4 + 1)
-            cap = np.column_stack([np.cos(bend), np.sin(bend)])
+            along = np.subtract(part.end, part.start)
             # At radius 1 and scaled afterwards: trimesh merges points by an absolute tolerance.
-            length = math.dist(part.start, part.end) / part.radius
-            profile = np.concatenate([cap[::-1] * [1, -1], cap + np.array([0.0, length])])
-            profile[[0, -1], 0] = 0
-            solid = creation.revolve(profile, sections=ROUND)
-            solid.apply_transform(_upright(part))
+            solid = creation.capsule(float(np.linalg.norm(along)) / part.radius, 1.0, count=[ROUND // 2, ROUND])
+            solid.apply_translation(-solid.bounds.mean(axis=0))
+            solid.apply_scale(part.radius)
+            solid.apply_transform(align_vectors([0.0, 0.0, 1.0], along))
+            solid.apply_translation(np.add(part.start, part.end) / 2)
         case ConvexPart():
             return Mesh(part.vertices, np.array([[0, 1, 2]])).hull()
     return Mesh(solid.vertices, solid.faces)
-
-
-def _upright(part: Capsule) -> NDArray[np.float64]:
-    """Return the transform [4, 4] from units of the radius that lays z on a capsule's axis, the origin on its start."""
-    start, end = np.array(part.start), np.array(part.end)
-    along = (end - start) / np.linalg.norm(end - start)
-    side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    side /= np.linalg.norm(side)
-    place = np.eye(4)
-    place[:3] = np.column_stack([part.radius * side, part.radius * np.cross(along, side), part.radius * along, start])
-    return place
 
 
 def corner_normals(mesh: Mesh) -> NDArray[np.float64]:
@@ -143,7 +132,7 @@ def tube(line: NDArray[np.float64], radii: NDArray[np.float64], colors: NDArray[
     """
     along = np.gradient(line, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
-    across = _transported(along)
+    across = transported_normals(along)
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     spokes = np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * np.cross(along, across)[:, None]
     rings = line[:, None] + radii[:, None, None] * spokes
@@ -178,17 +167,6 @@ def smoothed(values: NDArray[np.float64], per_link: int) -> NDArray[np.float64]:
     last = len(values) - degree
     knots = np.concatenate([np.zeros(degree), np.arange(last + 1), np.full(degree, last)])
     return BSpline(knots, values, degree)(np.linspace(0, last, (len(values) - 1) * per_link + 1))
-
-
-def _transported(along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unit vectors [n, 3] across a curve that turn about it as little as possible."""
-    across = np.empty_like(along)
-    vector = np.eye(3)[np.argmin(np.abs(along[0]))]
-    for index, tangent in enumerate(along):
-        vector = vector - (vector @ tangent) * tangent
-        vector = vector / np.linalg.norm(vector)
-        across[index] = vector
-    return across
 
 
 def _strips(rings: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -29,7 +29,7 @@ QUANTITIES = {
     "F": CHANNELS[:3],
     "M": CHANNELS[3:],
 }
-"""What can be plotted: one channel, the three components together, or (``F``, ``M``) their magnitude."""
+"""Quantities that can be plotted: one channel, the three components together, or (``F``, ``M``) their magnitude."""
 LINE_COLORS = ("#d1495b", "#2a9d6f", "#3466ac")
 CONTACT_COLOR = "#f3d9a4"
 _UNITS = {"F": ("mN", 1e3), "M": ("µN·m", 1e6)}

@@ -32,7 +32,7 @@ import numpy as np
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
-from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,10 +41,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-Vector = tuple[float, float, float]
-
 _TAIL = 0.01
-"""How long [s] the last velocity is held beyond the end, for the last steps of a simulation."""
+"""Time [s] for which the last velocity is held beyond the end, for the last steps of a simulation."""
 _NODES = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
 
 
@@ -160,7 +158,7 @@ class Trajectory:
         return knots
 
     def _turn(self, start: NDArray[np.float64], step: NDArray[np.float64], which: int) -> NDArray[np.float64]:
-        """Rotation vectors [m, 3] from ``start`` [m] over ``step`` [m] (s): h (ω₁ + ω₂)/2 − √3/12 h² ω₁ × ω₂."""
+        """Return rotation vectors [m, 3] from ``start`` [m] over ``step`` [m] (s): h (ω₁ + ω₂)/2 − √3/12 h² ω₁ × ω₂."""
         end = (self.velocity.shape[1] - 1) / self.rate
         first, second = (self._splines[which](np.minimum(start + node * step, end)) for node in _NODES)
         h = step[:, None]
@@ -185,7 +183,7 @@ class Recorded:
         Raises:
             UsageError: the trajectory has no whisker of this row and side.
         """
-        name = _full_name(mount)
+        name = mount.full_name
         if name in self.trajectory.names:
             return name
         row = [other for other in self.trajectory.names if other[:2] == name[:2]]
@@ -200,7 +198,7 @@ class Recorded:
 
     def initial_angles(self, mount: MountedWhisker) -> NDArray[np.float64]:
         """Return (θ, φ, ζ) [3] (rad) at t = 0."""
-        if (given := self.initial.get(_full_name(mount))) is not None:
+        if (given := self.initial.get(mount.full_name)) is not None:
             return np.array(given, dtype=float)
         return np.array(mount.angles) + self.start * np.array(self.rotations.rates(mount))
 
@@ -213,10 +211,10 @@ class Recorded:
         """
         first = self.initial_angles(mount)
         base, line = base_rotation(first), self.line(mount)
-        return follow_angles(lambda t: self.trajectory.rotation(line, t) @ base, times, first, _full_name(mount))
+        return follow_angles(lambda t: self.trajectory.rotation(line, t) @ base, times, first, mount.full_name)
 
     def config(self) -> dict[str, Any]:
-        """Plain values for hashing and display; the recording counts by its hash."""
+        """Return plain values for hashing and display; the recording counts by its hash."""
         from brainbench.core.files import to_plain
 
         return {
@@ -265,10 +263,6 @@ def load_initial_angles(path: str | os.PathLike[str], *, layout: str | None = No
     return {name: (float(a), float(b), float(c)) for name, (a, b, c) in zip(names, table, strict=True)}
 
 
-def _full_name(mount: MountedWhisker) -> str:
-    return mount.side[0].upper() + mount.name
-
-
 def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tuple[str, ...]:
     fitting = [name for name, names in LAYOUTS.items() if len(names) == lines]
     if layout is None:
@@ -287,9 +281,17 @@ def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tupl
 
 
 def _read_table(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Numbers [line, column] of a comma-separated file."""
     if not Path(path).is_file():
         raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
+    return read_numbers(path)
+
+
+def read_numbers(path: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """Return the numbers [line, column] of a comma-separated file; lines may end with a comma.
+
+    Raises:
+        DataError: something is no number, or lines differ in length.
+    """
     try:
         lines = Path(path).read_text(encoding="utf-8").split("\n")
         rows = [[float(cell) for cell in line.rstrip(",\r ").split(",")] for line in lines if line.strip()]

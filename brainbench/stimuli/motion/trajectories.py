@@ -1,11 +1,11 @@
-"""How whiskers and objects move: whisking after Knutsen, translation, turning, keyframes, rest. In rad and s."""
+"""Motions of whiskers, heads and objects: whisking, translation, spin, keyframes, rest. In rad, m and s."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Rotations:
-    """How elevation φ and torsion ζ follow azimuth θ in each row: dφ/dθ and dζ/dθ for rows A to E."""
+    """Coupling of elevation φ and torsion ζ to azimuth θ in each row: dφ/dθ and dζ/dθ for rows A to E."""
 
     name: str
     elevation: tuple[float, float, float, float, float]
@@ -43,8 +43,18 @@ measured in rats: ``knutsen`` as WHISKiT uses them (Zweifel et al. 2021), ``knut
 published fit."""
 
 
+class _Motion:
+    """Base of all motions that their fields determine."""
+
+    def config(self) -> dict[str, Any]:
+        """Return plain values for hashing and display."""
+        from brainbench.core.files import to_plain
+
+        return {"kind": type(self).__name__.lower(), **to_plain(self)}
+
+
 @dataclass(frozen=True)
-class Still:
+class Still(_Motion):
     """Nothing moves."""
 
     def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -59,13 +69,9 @@ class Still:
         """Return zeros [n, 3]."""
         return np.zeros((len(times), 3))
 
-    def config(self) -> dict[str, Any]:
-        """Plain values for hashing and display."""
-        return {"kind": "still"}
-
 
 @dataclass(frozen=True)
-class Whisking:
+class Whisking(_Motion):
     """Sinusoidal whisking of the whole array about its rest pose.
 
     With the azimuth a(t) = (protraction + retraction)/2 · cos(2πft + π) + (protraction − retraction)/2
@@ -112,52 +118,45 @@ class Whisking:
         azimuth = self.azimuth(times)[:, None]
         return np.array(mount.angles) + azimuth * np.array(self.rotations.rates(mount))
 
-    def config(self) -> dict[str, Any]:
-        """Plain values for hashing and display."""
-        from brainbench.core.files import to_plain
-
-        return {"kind": "whisking", **to_plain(self)}
-
 
 @dataclass(frozen=True)
-class Translation:
-    """Straight motion that reaches its velocity smoothly.
-
-    The speed grows as 6u⁵ − 15u⁴ + 10u³ during ``onset`` and then stays.
-    """
+class _SteadyMotion(_Motion):
+    """Motion that reaches its velocity smoothly: the speed grows as 6u⁵ − 15u⁴ + 10u³ during ``onset``, then stays."""
 
     velocity: Vector
-    """Final velocity [m/s, world]."""
+    """Final velocity in the world: [m/s] of a translation; [rad/s] of a spin, along the axis by the right-hand rule."""
     onset: float = 0.01
     """Duration of the smooth start [s]; 0 moves at full speed from the first instant."""
 
+    _unit: ClassVar[str]
+
     def __post_init__(self) -> None:
+        name = type(self).__name__.lower()
         if len(self.velocity) != 3 or not all(math.isfinite(value) for value in self.velocity):
-            raise UsageError(f"A velocity is three finite numbers in m/s; received {self.velocity!r}.")
-        _require("translation onset (s)", self.onset)
+            raise UsageError(
+                f"The velocity of a {name} is three finite numbers in {self._unit}; received {self.velocity!r}."
+            )
+        _require(f"{name} onset (s)", self.onset)
+
+    def _moved(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the integral [n, 3] of the velocity since t = 0."""
+        return _smooth_path(times, self.onset)[:, None] * np.array(self.velocity)
+
+
+class Translation(_SteadyMotion):
+    """Straight motion that reaches its velocity smoothly."""
+
+    _unit = "m/s"
 
     def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far it has moved since t = 0, [n, 3] (m, world)."""
-        return _smooth_path(times, self.onset)[:, None] * np.array(self.velocity)
-
-    def config(self) -> dict[str, Any]:
-        """Plain values for hashing and display."""
-        return {"kind": "translation", "velocity": list(self.velocity), "onset": self.onset}
+        return self._moved(times)
 
 
-@dataclass(frozen=True)
-class Spin:
+class Spin(_SteadyMotion):
     """Turning about an axis through the body's origin that reaches its speed smoothly, as :class:`Translation` does."""
 
-    velocity: Vector
-    """Final angular velocity [rad/s, world], along the axis by the right-hand rule."""
-    onset: float = 0.01
-    """Duration of the smooth start [s]; 0 turns at full speed from the first instant."""
-
-    def __post_init__(self) -> None:
-        if len(self.velocity) != 3 or not all(math.isfinite(value) for value in self.velocity):
-            raise UsageError(f"An angular velocity is three finite numbers in rad/s; received {self.velocity!r}.")
-        _require("spin onset (s)", self.onset)
+    _unit = "rad/s"
 
     def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return zeros [n, 3]: the origin stays."""
@@ -167,15 +166,11 @@ class Spin:
         """Return how far the body has turned since t = 0, rotation matrices [n, 3, 3] in world axes."""
         from scipy.spatial.transform import Rotation
 
-        return Rotation.from_rotvec(_smooth_path(times, self.onset)[:, None] * np.array(self.velocity)).as_matrix()
-
-    def config(self) -> dict[str, Any]:
-        """Plain values for hashing and display."""
-        return {"kind": "spin", "velocity": list(self.velocity), "onset": self.onset}
+        return Rotation.from_rotvec(self._moved(times)).as_matrix()
 
 
 @dataclass(frozen=True)
-class Path:
+class Path(_Motion):
     """Motion of a body through keyframes: translation and rotation, such as those of a tracked head.
 
     Positions follow a natural cubic spline and orientations a rotation spline, so velocity and acceleration are
@@ -187,11 +182,11 @@ class Path:
     """
 
     times: tuple[float, ...]
-    """When [s], ascending from 0, at least two."""
+    """Times of the keyframes [s], ascending from 0, at least two."""
     displacements: tuple[Vector, ...]
-    """How far the body's origin has moved since t = 0 [m, world]."""
+    """Displacements of the body's origin since t = 0 [m, world]."""
     rotations: tuple[Vector, ...]
-    """How far the body has turned about its origin since t = 0: angles [rad] about the world's x, then y, then z."""
+    """Rotations of the body about its origin since t = 0: angles [rad] about the world's x, then y, then z."""
 
     def __post_init__(self) -> None:
         for name in ("displacements", "rotations"):
@@ -228,12 +223,6 @@ class Path:
 
         spline = RotationSpline(self.times, Rotation.from_euler("xyz", self.rotations))
         return spline(self._within(times)).as_matrix()
-
-    def config(self) -> dict[str, Any]:
-        """Plain values for hashing and display."""
-        from brainbench.core.files import to_plain
-
-        return {"kind": "path", **to_plain(self)}
 
     def _within(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         times = np.asarray(times, dtype=float)

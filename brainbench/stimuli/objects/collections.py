@@ -48,7 +48,7 @@ class NamedObject:
     label: str
     """Class label."""
     source: str
-    """What it is made from: equal sources make equal objects."""
+    """Description of what it is made from: equal sources make equal objects."""
     load: Callable[[], Solid]
 
 
@@ -129,7 +129,7 @@ def _make(family: str, seed: int, detail: int, collision: str | None) -> Solid:
 
 
 def _detail(family: str, seed: int) -> int:
-    """Triangles of a member: drawn evenly on a logarithmic scale within the range that shapes allow."""
+    """Return the triangles of a member, drawn evenly on a logarithmic scale within the range that shapes allow."""
     generator = np.random.default_rng([zlib.crc32(b"detail"), zlib.crc32(family.encode()), seed])
     low, high = DETAIL
     return int(math.exp(generator.uniform(math.log(low), math.log(high))))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 COLLISIONS = ("exact", "hull", "pieces", "decomposition")
-"""What whiskers touch of a mesh. ``exact``: the surface itself; a concave one without known convex parts can be
+"""Parts of a mesh that whiskers touch. ``exact``: the surface itself; a concave one without known convex parts can be
 touched by the backend ``rod`` only, because ``mujoco`` and ``bullet`` collide convex bodies. ``hull``: the convex
 hull. ``pieces``: the hull of each connected piece, for files that bring a convex decomposition along.
 ``decomposition``: convex pieces cut by CoACD or V-HACD."""

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import from_matrices
+from brainbench.core.rotations import from_matrices, to_matrices
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
     """Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
@@ -41,7 +41,7 @@ class ConvexPart:
         object.__setattr__(self, "vertices", points)
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ConvexPart:
@@ -76,7 +76,7 @@ class TriangleMesh:
         object.__setattr__(self, "faces", faces)
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
@@ -114,7 +114,7 @@ class Sphere:
         _check_vector("sphere", centre=self.centre)
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.add(self.centre, [[-self.radius] * 3, [self.radius] * 3])
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Sphere:
@@ -128,7 +128,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class _Segment:
-    """What capsules and cylinders share: a radius around the segment from ``start`` to ``end``."""
+    """Base of capsules and cylinders: a radius around the segment from ``start`` to ``end``."""
 
     start: Vector
     end: Vector
@@ -155,7 +155,7 @@ class Capsule(_Segment):
     """All points within ``radius`` of the segment from ``start`` to ``end``."""
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         ends = np.array([self.start, self.end])
         return np.stack([ends.min(axis=0) - self.radius, ends.max(axis=0) + self.radius])
 
@@ -164,7 +164,7 @@ class Cylinder(_Segment):
     """A flat-ended cylinder around the segment from ``start`` to ``end``."""
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         ends = np.array([self.start, self.end])
         axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         reach = self.radius * np.sqrt(np.clip(1 - axis**2, 0, 1))
@@ -188,13 +188,13 @@ class Box:
             raise UsageError(f"The quaternion of a box must have length 1; {self.quaternion} has length {length:g}.")
 
     def bounds(self) -> NDArray[np.float64]:
-        """Axis-aligned bounds [2, 3]: lowest and highest corner."""
-        reach = np.abs(rotation_matrix(self.quaternion)) @ np.array(self.half_sizes)
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
+        reach = np.abs(to_matrices(self.quaternion)) @ np.array(self.half_sizes)
         return np.stack([np.array(self.centre) - reach, np.array(self.centre) + reach])
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Box:
         """Return the box rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
-        turned = tuple(from_matrices(rotation @ rotation_matrix(self.quaternion)).tolist())
+        turned = tuple(from_matrices(rotation @ to_matrices(self.quaternion)).tolist())
         return Box(_placed(self.centre, rotation, translation), self.half_sizes, turned)
 
     def scaled(self, factor: float) -> Box:
@@ -234,17 +234,6 @@ class Obstacle:
             raise UsageError("An obstacle needs at least one part or a surface.")
         if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
             raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
-
-
-def rotation_matrix(quaternion: ArrayLike) -> NDArray[np.float64]:
-    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4] (w, x, y, z)."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _halves(patch: NDArray[np.int64], middle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

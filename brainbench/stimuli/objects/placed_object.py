@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle, Vector
-from brainbench.stimuli.objects.placement import euler_matrix, translating, turning
 from brainbench.stimuli.objects.solid import Solid
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
+
+    from brainbench.stimuli.objects.obstacle import RigidMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,11 +24,11 @@ class PlacedObject:
 
     solid: Solid
     position: Vector = (0.0, 0.0, 0.0)
-    """Where the solid's origin lies [m]."""
+    """Position of the solid's origin [m]."""
     rotation: Vector = (0.0, 0.0, 0.0)
     """Angles [rad] about the world's x, then y, then z axis."""
     motion: Still | Translation | Spin | Path = field(default_factory=Still)
-    """How it moves from there; it turns about its solid's origin."""
+    """Motion from there; the object turns about its solid's origin."""
     friction: float | None = None
     """Coulomb coefficient of its contacts; None takes each whisker's own."""
 
@@ -40,20 +42,26 @@ class PlacedObject:
         axes, origin = (np.eye(3), np.zeros(3)) if frame is None else (np.asarray(frame[0]), np.asarray(frame[1]))
         rotation = axes.T @ euler_matrix(self.rotation)
         place = axes.T @ (np.asarray(self.position) - origin)
-        motion = self.motion
-        path = None
-        if isinstance(motion, (Spin, Path)):
-            path = turning(motion, axes, place)
-        elif isinstance(motion, Translation):
-            path = translating(motion, axes)
         # What turns is expressed about its own origin, which stays near it.
-        shift = np.zeros(3) if isinstance(motion, (Spin, Path)) else place
+        shift = np.zeros(3) if isinstance(self.motion, (Spin, Path)) else place
         parts = tuple(part.moved(rotation, shift) for part in self.solid.parts)
         surface = self.solid.surface and self.solid.surface.moved(rotation, shift)
-        return Obstacle(parts=parts, motion=path, friction=self.friction, surface=surface)
+        return Obstacle(parts=parts, motion=self._motion(axes, place), friction=self.friction, surface=surface)
+
+    def _motion(self, axes: NDArray[np.float64], place: NDArray[np.float64]) -> RigidMotion | None:
+        """Return the motion in the frame ``axes`` [3, 3] of a body whose origin is at ``place`` [3] (m) at t = 0."""
+        motion = self.motion
+        if isinstance(motion, Still):
+            return None
+        if isinstance(motion, Translation):
+            return lambda times: (motion.displacement(times) @ axes, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1)))
+        return lambda times: (
+            place + motion.displacement(times) @ axes,
+            from_matrices(axes.T @ motion.turn(times) @ axes),
+        )
 
     def config(self) -> dict[str, Any]:
-        """Plain values that determine the physics."""
+        """Return plain values that determine the physics."""
         return {
             "solid": self.solid.config(),
             "position": list(self.position),

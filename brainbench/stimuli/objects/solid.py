@@ -30,9 +30,9 @@ class Solid:
     mesh: Mesh | None = None
     """Surface for pictures and measurements; None for primitives."""
     notes: tuple[str, ...] = ()
-    """What a user should know, such as a concavity lost to the convex hull."""
+    """Remarks for the user, such as a concavity lost to the convex hull."""
     origin: Mapping[str, Any] | None = None
-    """What the parts were computed from, where their last digits depend on the machine; :meth:`config` has it."""
+    """Source of the parts, where their last digits depend on the machine; :meth:`config` has it."""
     surface: TriangleMesh | None = None
     """The exact surface [m], for engines that collide meshes; None where the parts are exact by themselves
     (primitives) or stand for the solid (``pieces``, ``decomposition``)."""
@@ -64,7 +64,7 @@ class Solid:
         return self.scaled(diagonal / self.diagonal)
 
     def config(self) -> dict[str, Any]:
-        """Plain values that determine the physics; the parts count by a hash of their numbers or their origin."""
+        """Return plain values that determine the physics; parts count by a hash of numbers or origin."""
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
         if self.origin is not None:
@@ -79,6 +79,6 @@ def to_surface(mesh: Mesh) -> TriangleMesh:
 
 
 def _through_corners(surface: TriangleMesh, parts: tuple[Part, ...]) -> bool:
-    """Whether the surface runs through corners of the convex parts alone, so that the parts tell it."""
+    """Return whether the surface runs through corners of the convex parts alone, so that the parts tell it."""
     corners = {tuple(corner) for part in parts if isinstance(part, ConvexPart) for corner in part.vertices.tolist()}
     return all(tuple(vertex) in corners for vertex in surface.vertices.tolist())

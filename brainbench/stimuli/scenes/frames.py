@@ -1,4 +1,4 @@
-"""When and how forces are read from a simulation: frames, averaging, anti-alias filter, axes and clipping."""
+"""Reading of forces from a simulation: frames, averaging, anti-alias filter, axes and clipping."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ORDER = 4
 
 @dataclass(frozen=True)
 class Frames:
-    """When forces are read, and how a frame is made of readings.
+    """Times at which forces are read, and the rule that makes a frame of readings.
 
     The default reads 110 instantaneous frames, 9 ms apart, the first at 1 ms, as the published pipeline
     does (every ninth sample of a 1 kHz simulation). Whatever vibrates above 1/(2·interval) = 56 Hz then
@@ -53,7 +53,7 @@ class Frames:
     """Cut-off [Hz] of a fourth-order Butterworth filter on the readings (−3 dB; −6 dB with phase ``zero``, which
     applies it twice); a frame is then the filtered force at its time. None for no filter."""
     phase: Phase = "zero"
-    """How the filter runs."""
+    """Direction of the filter."""
     axes: Axes = "world"
     """Axes of force and moment, turned by the follicle's pose at the time of each frame."""
     clip: float | None = None
@@ -105,7 +105,7 @@ class Frames:
         return within.reshape(self.count, self.average, *values.shape[1:])
 
     def config(self) -> dict[str, Any]:
-        """Plain values for hashing and display; what was added later appears only where it is used."""
+        """Return plain values for hashing and display; what was added later appears only where it is used."""
         config = {"first": self.first, "interval": self.interval, "count": self.count, "average": self.average}
         if self.lowpass is not None:
             config |= {"lowpass": self.lowpass, "phase": self.phase}

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError
 from brainbench.stimuli.motion import trajectories
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Spin, Still, Translation, Whisking
-from brainbench.stimuli.scenes.toml_tables import MILLI, TomlTable, listed, number, text, vector
+from brainbench.stimuli.scenes.toml_tables import DEGREE, MILLI, Keys, TomlTable, choice, listed, number, text, vector
 
 if TYPE_CHECKING:
     from brainbench.stimuli.motion.recorded import Recorded
@@ -17,8 +17,26 @@ if TYPE_CHECKING:
 
 Moving = TypeVar("Moving")
 
-_DEGREE = math.pi / 180
 _WHISKINGS = ("sinusoid", "still", "recorded")
+_TRANSLATION: Keys = {
+    "velocity": ("velocity_mm_s", vector(MILLI)),
+    "onset": ("velocity_onset_ms", number(MILLI)),
+}
+_SPIN: Keys = {
+    "velocity": ("spin_deg_s", vector(DEGREE)),
+    "onset": ("spin_onset_ms", number(MILLI)),
+}
+_PATH: Keys = {
+    "times": ("times_ms", listed(number(MILLI))),
+    "displacements": ("path_mm", listed(vector(MILLI))),
+    "rotations": ("path_deg", listed(vector(DEGREE))),
+}
+_SINUSOID: Keys = {
+    "frequency": ("frequency_hz", number()),
+    "protraction": ("protraction_deg", number(DEGREE)),
+    "retraction": ("retraction_deg", number(DEGREE)),
+    "onset": ("onset_ms", number(MILLI)),
+}
 
 
 def read_head_motion(table: TomlTable) -> Still | Translation | trajectories.Path:
@@ -27,7 +45,7 @@ def read_head_motion(table: TomlTable) -> Still | Translation | trajectories.Pat
     Raises:
         UsageError: there are keyframes and a velocity, or keyframes without times.
     """
-    return _only(table, "a velocity or keyframes", _translation(table), _keyframes(table))
+    return _only(table, "a velocity or keyframes", _smooth(table, Translation, _TRANSLATION), _keyframes(table))
 
 
 def read_object_motion(table: TomlTable) -> Still | Translation | Spin | trajectories.Path:
@@ -36,7 +54,8 @@ def read_object_motion(table: TomlTable) -> Still | Translation | Spin | traject
     Raises:
         UsageError: there are several of these, or keyframes without times.
     """
-    return _only(table, "a velocity, a spin or keyframes", _translation(table), _spin(table), _keyframes(table))
+    steady = _smooth(table, Translation, _TRANSLATION), _smooth(table, Spin, _SPIN)
+    return _only(table, "a velocity, a spin or keyframes", *steady, _keyframes(table))
 
 
 def _only(table: TomlTable, choice: str, *motions: Moving | None) -> Moving | Still:
@@ -46,52 +65,28 @@ def _only(table: TomlTable, choice: str, *motions: Moving | None) -> Moving | St
     return given[0] if given else Still()
 
 
-def _translation(table: TomlTable) -> Translation | None:
-    velocity = table.take("velocity_mm_s", vector(MILLI), None)
-    onset = table.take("velocity_onset_ms", number(MILLI), None)
-    if velocity is None:
-        return None
-    return Translation(velocity) if onset is None else Translation(velocity, onset)
-
-
-def _spin(table: TomlTable) -> Spin | None:
-    velocity = table.take("spin_deg_s", vector(_DEGREE), None)
-    onset = table.take("spin_onset_ms", number(MILLI), None)
-    if velocity is None:
-        return None
-    return Spin(velocity) if onset is None else Spin(velocity, onset)
+def _smooth(table: TomlTable, make: Callable[..., Moving], keys: Keys) -> Moving | None:
+    """Return a motion that reaches a velocity; an onset without a velocity moves nothing."""
+    given = table.read(keys)
+    return make(**given) if "velocity" in given else None
 
 
 def _keyframes(table: TomlTable) -> trajectories.Path | None:
-    keys = ("times_ms", "path_mm", "path_deg")
-    times = table.take(keys[0], listed(number(MILLI)), None)
-    places = table.take(keys[1], listed(vector(MILLI)), None)
-    turns = table.take(keys[2], listed(vector(_DEGREE)), None)
-    if times is None:
-        if places is None and turns is None:
-            return None
-        raise UsageError(f"{table.name} needs the key {keys[0]!r} beside its path.")
-    still = ((0.0, 0.0, 0.0),) * len(times)
-    return trajectories.Path(times, still if places is None else places, still if turns is None else turns)
+    given = table.read(_PATH)
+    if not given:
+        return None
+    if "times" not in given:
+        raise UsageError(f"{table.name} needs the key {_PATH['times'][0]!r} beside its path.")
+    still = ((0.0, 0.0, 0.0),) * len(given["times"])
+    return trajectories.Path(**{"displacements": still, "rotations": still, **given})
 
 
 def read_whisking(table: TomlTable, folder: Path) -> Still | Whisking | Recorded:
     """Return what ``[whisking]`` says; paths are relative to ``folder``."""
-    kind = table.take("kind", text, "sinusoid")
-    if kind not in _WHISKINGS:
-        raise unknown_name("kind of whisking", kind, _WHISKINGS)
-    usual = Whisking()
-    name = table.take("rotations", text, usual.rotations.name)
-    if name not in ROTATIONS:
-        raise unknown_name("set of rotations", name, ROTATIONS)
-    whisking = Whisking(
-        frequency=table.take("frequency_hz", number(1.0), usual.frequency),
-        protraction=table.take("protraction_deg", number(_DEGREE), usual.protraction),
-        retraction=table.take("retraction_deg", number(_DEGREE), usual.retraction),
-        onset=table.take("onset_ms", number(MILLI), usual.onset),
-        rotations=ROTATIONS[name],
-    )
-    recorded = _recorded(table, folder, ROTATIONS[name]) if kind == "recorded" else None
+    kind = table.take("kind", choice("kind of whisking", _WHISKINGS), "sinusoid")
+    rotations = table.take("rotations", choice("set of rotations", ROTATIONS), Whisking().rotations)
+    whisking = table.build(Whisking, _SINUSOID, rotations=rotations)
+    recorded = _recorded(table, folder, rotations) if kind == "recorded" else None
     table.finish()
     return recorded or (whisking if kind == "sinusoid" else Still())
 
@@ -100,11 +95,12 @@ def _recorded(table: TomlTable, folder: Path, rotations: Rotations) -> Recorded:
     from brainbench.stimuli.motion.recorded import Recorded, load_initial_angles, load_trajectory
 
     layout = table.take("layout", text, None)
-    rate = table.take("rate_hz", number(1.0), 1000.0)
     initial = table.take("initial_path", text, None)
-    return Recorded(
-        load_trajectory(folder / table.take("path", text), layout=layout, rate=rate),
-        start=table.take("start_deg", number(_DEGREE), 0.0),
+    file: Keys = {"path": ("path", lambda name: folder / text(name)), "rate": ("rate_hz", number())}
+    return table.build(
+        Recorded,
+        {"start": ("start_deg", number(DEGREE))},
+        trajectory=table.build(load_trajectory, file, layout=layout),
         rotations=rotations,
         initial={} if initial is None else load_initial_angles(folder / initial, layout=layout),
     )

@@ -30,14 +30,14 @@ _RAT_SCALE = 2.0
 
 
 def list_recipes() -> tuple[str, ...]:
-    """Names that :func:`get_recipe` knows."""
+    """Return the names that :func:`get_recipe` knows."""
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
     return tuple(sorted([*_scene_files(), *GRIDS, RECORDED]))
 
 
 def is_recipe(source: str) -> bool:
-    """Whether ``source`` names a recipe, with or without a file behind it (``rodgers-recorded FILE``)."""
+    """Return whether ``source`` names a recipe, with or without a file behind it (``rodgers-recorded FILE``)."""
     return source in list_recipes() or source.startswith(f"{RECORDED} ")
 
 
@@ -113,7 +113,7 @@ def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, wh
     from brainbench.stimuli.objects.placed_object import PlacedObject
     from brainbench.stimuli.scenes.scene import Head, Scene
     from brainbench.stimuli.scenes.scene_files import Recipe
-    from brainbench.stimuli.sweeps.grid import default_array
+    from brainbench.stimuli.whiskers.array import WhiskerArray
 
     if trajectory is None:
         if not file:
@@ -125,7 +125,7 @@ def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, wh
     elif file:
         raise UsageError(f"The recipe {RECORDED!r} was given a file and a trajectory; give one of them.")
     scale = _RAT_SCALE if species == "rat" else 1.0
-    array = default_array(species).select(whiskers)
+    array = WhiskerArray.of(species).select(whiskers)
     whisking = Recorded(trajectory, start=_RECORDED_START)
 
     def enlarged(scene: Scene) -> Scene:

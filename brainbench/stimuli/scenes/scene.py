@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.protocol import Job, base_rotation
-from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Whisking
+from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Vector, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.selection import match_whiskers
 
@@ -25,12 +25,10 @@ if TYPE_CHECKING:
     from brainbench.stimuli.motion.recorded import Recorded
     from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray
 
-Vector = tuple[float, float, float]
-
 
 @dataclass(frozen=True)
 class Head:
-    """Where the array stands in the world and how it moves."""
+    """Pose of an array in the world, and its motion."""
 
     position: Vector = (0.0, 0.0, 0.0)
     """World position of the array's origin at t = 0 [m]."""
@@ -44,7 +42,7 @@ class Head:
         return euler_matrix(self.rotation)
 
     def config(self) -> dict[str, Any]:
-        """Plain values that determine the physics."""
+        """Return plain values that determine the physics."""
         return {
             "position": list(self.position),
             "rotation": list(self.rotation),
@@ -160,13 +158,13 @@ class Scene:
         ]
 
     def orientations(self) -> NDArray[np.float64]:
-        """Rotations [time, whisker, 3, 3] from each whisker's base frame to the world at the frame times."""
+        """Return rotations [time, whisker, 3, 3] from each whisker's base frame to the world at the frame times."""
         times = self.frames.times
         bases = [job.follicle.pose(times)[1] for job in self.jobs()]
         return self.axes @ base_rotation(np.stack(bases, axis=1))
 
     def config(self) -> dict[str, Any]:
-        """Plain values that determine the result, for hashing and for the data set's attributes."""
+        """Return plain values that determine the result, for hashing and for the data set's attributes."""
         config = {
             "label": self.label,
             "objects": [item.config() for item in self.objects],

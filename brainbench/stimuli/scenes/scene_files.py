@@ -54,7 +54,6 @@ names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coac
 
 from __future__ import annotations
 
-import math
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -62,16 +61,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.motion_tables import read_head_motion, read_whisking
-from brainbench.stimuli.scenes.object_tables import read_object
+from brainbench.stimuli.scenes.object_tables import PLACE, read_object
 from brainbench.stimuli.scenes.scene import Animal, Head, Scene
-from brainbench.stimuli.scenes.toml_tables import MILLI, TomlTable, mapping, number, tables, text, vector, whole
+from brainbench.stimuli.scenes.toml_tables import MILLI, Keys, TomlTable, mapping, number, tables, text, whole
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
-from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
+from brainbench.stimuli.whiskers.array import WhiskerArray
 
 _NOTHING: Mapping[str, Any] = {}
+_FRAMES: Keys = {
+    "first": ("first_ms", number(MILLI)),
+    "count": ("count", whole),
+    "average": ("average", whole),
+    "lowpass": ("lowpass_hz", number()),
+    "phase": ("phase", text),
+    "axes": ("axes", text),
+    "clip": ("clip_newton", number()),
+}
 
 
 @dataclass(frozen=True)
@@ -167,11 +175,7 @@ def _animal(table: TomlTable, folder: Path) -> Animal:
 
 
 def _array(table: TomlTable) -> WhiskerArray:
-    species = table.take("species", text, "mouse")
-    if species not in SPECIES:
-        raise unknown_name("species", species, SPECIES)
-    make = WhiskerArray.mouse if species == "mouse" else WhiskerArray.rat
-    array = make(side=table.take("side", text, "right"))  # type: ignore[arg-type]
+    array = table.build(WhiskerArray.of, {"species": ("species", text), "side": ("side", text)})
     for pattern, changes in table.take("replace", mapping, _NOTHING).items():
         array = array.replace(pattern, **mapping(changes))
     array = array.select(table.take("whiskers", text, "all"))
@@ -180,34 +184,20 @@ def _array(table: TomlTable) -> WhiskerArray:
 
 
 def _head(table: TomlTable) -> Head:
-    head = Head(
-        position=table.take("position_mm", vector(MILLI), (0.0, 0.0, 0.0)),
-        rotation=table.take("rotation_deg", vector(math.pi / 180), (0.0, 0.0, 0.0)),
-        motion=read_head_motion(table),
-    )
+    head = table.build(Head, PLACE, motion=read_head_motion(table))
     table.finish()
     return head
 
 
 def _frames(table: TomlTable) -> Frames:
-    usual = Frames()
-    interval = table.take("interval_ms", number(MILLI), None)
-    rate = table.take("rate_hz", number(1.0), None)
-    if interval is not None and rate is not None:
+    given = table.read({"interval": ("interval_ms", number(MILLI)), "rate": ("rate_hz", number())})
+    if len(given) > 1:
         raise UsageError("[frames] takes interval_ms or rate_hz, not both.")
-    if rate is not None:
+    if "rate" in given:
+        rate = given.pop("rate")
         if rate <= 0:
             raise UsageError(f"'rate_hz' of [frames] must be positive; received {rate:g}.")
-        interval = 1 / rate
-    frames = Frames(
-        first=table.take("first_ms", number(MILLI), usual.first),
-        interval=usual.interval if interval is None else interval,
-        count=table.take("count", whole, usual.count),
-        average=table.take("average", whole, usual.average),
-        lowpass=table.take("lowpass_hz", number(1.0), usual.lowpass),
-        phase=table.take("phase", text, usual.phase),
-        axes=table.take("axes", text, usual.axes),
-        clip=table.take("clip_newton", number(1.0), usual.clip),
-    )
+        given["interval"] = 1 / rate
+    frames = table.build(Frames, _FRAMES, **given)
     table.finish()
     return frames

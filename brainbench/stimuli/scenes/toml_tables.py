@@ -1,16 +1,25 @@
-"""Tables of a TOML file from which known keys are taken, each checked and converted; the rest is an error."""
+"""Tables of a TOML file, whose known keys are checked, converted and built into objects; other keys are an error."""
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, TypeVar
 
 from brainbench.core.errors import UsageError, unknown_name
 
 MILLI = 1e-3
 """Metres in a millimetre, seconds in a millisecond."""
+DEGREE = math.pi / 180
+"""Radians in a degree."""
 
+Convert = Callable[[Any], Any]
+"""Converter of a value to SI units; a value of another kind is a TypeError that says what it must be."""
+Keys = Mapping[str, tuple[str, Convert]]
+"""By parameter of what is built: its key in the file, and the converter of its value."""
+
+Built = TypeVar("Built")
 _REQUIRED = object()
 
 
@@ -22,7 +31,7 @@ class TomlTable:
         self._rest = dict(data)
         self._known: list[str] = []
 
-    def take(self, key: str, convert: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
+    def take(self, key: str, convert: Convert, default: Any = _REQUIRED) -> Any:
         """Return the converted value of a key, or the default without it.
 
         Raises:
@@ -36,8 +45,32 @@ class TomlTable:
         value = self._rest.pop(key)
         try:
             return convert(value)
-        except (TypeError, ValueError) as error:
+        except TypeError as error:
             raise UsageError(f"{key!r} of {self.name} must be {error}; received {value!r}.") from error
+
+    def read(self, keys: Keys) -> dict[str, Any]:
+        """Return the converted values of the keys that the table has, by parameter."""
+        missing = object()
+        values = {name: self.take(key, convert, missing) for name, (key, convert) in keys.items()}
+        return {name: value for name, value in values.items() if value is not missing}
+
+    def build(self, make: Callable[..., Built], keys: Keys, **others: Any) -> Built:
+        """Call ``make`` with the values of some keys; a parameter whose key is missing keeps its default.
+
+        Args:
+            make: a dataclass or a function.
+            keys: parameters that the table may set.
+            others: parameters that it does not set.
+
+        Raises:
+            UsageError: the key of a parameter without default is missing, or a value is of another kind.
+        """
+        parameters = inspect.signature(make).parameters
+        values = self.read(keys)
+        for name, (key, _) in keys.items():
+            if name not in values and parameters[name].default is inspect.Parameter.empty:
+                raise UsageError(f"{self.name} needs the key {key!r}.")
+        return make(**values, **others)
 
     def table(self, key: str) -> TomlTable:
         """Return a table within this one, empty when there is none."""
@@ -60,6 +93,17 @@ def text(value: Any) -> str:
     return value
 
 
+def choice(kind: str, options: Collection[str]) -> Convert:
+    """Return a converter of texts that takes one of ``options``, and its value where these are a mapping."""
+
+    def convert(value: Any) -> Any:
+        if text(value) not in options:
+            raise unknown_name(kind, value, options)
+        return options[value] if isinstance(options, Mapping) else value
+
+    return convert
+
+
 def whole(value: Any) -> int:
     """Return a whole number."""
     if not isinstance(value, int) or isinstance(value, bool):
@@ -67,7 +111,7 @@ def whole(value: Any) -> int:
     return value
 
 
-def number(factor: float) -> Callable[[Any], float]:
+def number(factor: float = 1.0) -> Callable[[Any], float]:
     """Return a converter of finite numbers, which multiplies by ``factor``."""
 
     def convert(value: Any) -> float:
@@ -78,7 +122,7 @@ def number(factor: float) -> Callable[[Any], float]:
     return convert
 
 
-def listed(item: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, ...]]:
+def listed(item: Convert) -> Callable[[Any], tuple[Any, ...]]:
     """Return a converter of lists of ``item``."""
 
     def convert(value: Any) -> tuple[Any, ...]:
@@ -87,11 +131,6 @@ def listed(item: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, ...]]:
         return tuple(map(item, value))
 
     return convert
-
-
-def length(value: Any) -> float:
-    """Return metres of a number in millimetres."""
-    return number(MILLI)(value)
 
 
 def vector(factor: float) -> Callable[[Any], tuple[float, float, float]]:

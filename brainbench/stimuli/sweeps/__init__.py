@@ -1,5 +1,28 @@
-"""Data sets of many sweeps: a plan of shards, shards written by a pool or a cluster, and a manifest of all.
+"""Data sets of many sweeps: objects that brush past the whiskers under the conditions of a grid.
 
-A shard is one HDF5 file of some sweeps (layout: ``docs/datasets.md``). Shards are independent of one another: each is
-written under a temporary name and renamed, so a run that was killed goes on with the shards that are missing.
+A ``grid`` and objects are ``sweep_scenes``; a ``plan`` cuts them into shards by ``split``; ``generation`` lets
+``running`` make the missing shards (``simulation``, ``shards``: one HDF5 file each, layout in ``docs/datasets.md``) and
+writes the ``manifest``. Shards are independent and renamed when complete, so a run that was killed goes on.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.sweeps.generation import generate
+    from brainbench.stimuli.sweeps.grid import Span, Sweep, SweepGrid
+    from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+    from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+
+__all__ = ["GRIDS", "GenerationPlan", "Settings", "Span", "Sweep", "SweepGrid", "SweepScenes", "generate"]
+
+_MODULES = {
+    ".generation": ("generate",),
+    ".grid": ("Span", "Sweep", "SweepGrid"),
+    ".plan": ("GenerationPlan", "Settings"),
+    ".sweep_scenes": ("GRIDS", "SweepScenes"),
+}
+__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, to_plain, write_json
 from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_whole, make_manifest
 
 if TYPE_CHECKING:
@@ -57,8 +58,6 @@ def generate(
         DataError: the disk is too small, or a worker or shard failed; finished shards are kept.
         MissingDependencyError: a scheduler is given and Dask is not installed.
     """
-    from brainbench.stimuli.sweeps import local_pool
-
     if workers is not None and workers < 1:
         raise UsageError(f"workers must be at least 1; received {workers}.")
     if getattr(multiprocessing.current_process(), "_inheriting", False):
@@ -78,11 +77,9 @@ def generate(
         if len(missing) < len(plan.shards):
             _LOG.info("%d of %d shards are there already", len(plan.shards) - len(missing), len(plan.shards))
         if scheduler is not None:
-            from brainbench.stimuli.sweeps.cluster import run_on_cluster
-
-            run_on_cluster(missing, folder, scheduler, report)
+            running.run_on_cluster(missing, folder, scheduler, report)
         elif missing:
-            local_pool.run_here(missing, folder, workers, report)
+            running.run_here(missing, folder, workers, report)
         _clean(folder)
         manifest = make_manifest(plan, folder)
         write_json(folder / MANIFEST, manifest)

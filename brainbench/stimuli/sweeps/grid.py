@@ -16,9 +16,9 @@ import numpy as np
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
@@ -74,7 +74,7 @@ class Sweep:
     size: float
     """Bounding-box diagonal of the object before it is turned [m]."""
     draw: int = 0
-    """Which draw of the sampled quantities this sweep belongs to."""
+    """Number of the draw of the sampled quantities that this sweep belongs to."""
 
     @property
     def label(self) -> str:
@@ -110,13 +110,13 @@ class SweepGrid:
     turns: tuple[float, ...] = (0.0,)
     """Angles [rad] added to each rotation."""
     draws: int = 1
-    """How often the spans are sampled."""
+    """Number of times that the spans are sampled."""
     heights_per_draw: int | None = None
-    """How many of the listed heights each draw uses, in rotation, so that all are used alike; None for all."""
+    """Number of the listed heights that each draw uses, in rotation, so that all are used alike; None for all."""
     seed: int = 0
     """Seed of the draws; each object has draws of its own, named by seed and object name."""
     start: float = 0.016
-    """Where the object starts along y [m]; see ``placing``."""
+    """Start of the object along y [m]; see ``placing``."""
     placing: Literal["clear", "released"] = "clear"
     """``clear``: the face that leads has y = ``start`` at t = 0, in front of the whiskers. ``released``: the origin
     lies at start + (lowest y of the turned object), as the published simulator computes it; large objects then
@@ -126,10 +126,10 @@ class SweepGrid:
     object; the relative motion is the same, with a smooth start of 10 ms."""
     species: str = "mouse"
     head: Head = field(default_factory=Head)
-    """Where the array stands; its motion must be :class:`Still`."""
+    """Pose of the array; its motion must be :class:`Still`."""
     frames: Frames = field(default_factory=Frames)
     published: str = ""
-    """What was published about this grid, printed beside our counts."""
+    """Published numbers of this grid, printed beside our counts."""
 
     def __post_init__(self) -> None:
         for name in ("speed", "height", "rotation", "distance", "size"):
@@ -201,7 +201,7 @@ class SweepGrid:
             scaled, (sweep.distance - float(low[0]), float(y), sweep.height), angles, backward if moves else Still()
         )
         head = self.head if moves else Head(self.head.position, self.head.rotation, forward)
-        chosen = default_array(self.species) if array is None else array
+        chosen = WhiskerArray.of(self.species) if array is None else array
         name = f"{solid.name}/{sweep.label}" if label is None else label
         return Scene(name, chosen, (placed,), Still(), head, self.frames)
 
@@ -213,14 +213,6 @@ class SweepGrid:
         return tuple(values[(first + i) % len(values)] for i in range(self.heights_per_draw))
 
 
-def default_array(species: str) -> WhiskerArray:
-    """Return the right side of a species' array."""
-    makers = {"mouse": WhiskerArray.mouse, "rat": WhiskerArray.rat}
-    if species not in makers:
-        raise unknown_name("species", species, makers)
-    return makers[species]()
-
-
 def _choices(values: Values) -> int:
     return 1 if isinstance(values, Span) else len(values)
 
@@ -230,7 +222,7 @@ def _values(values: Values, generator: np.random.Generator) -> tuple[float, ...]
 
 
 def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
+    """Return lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
     if solid.mesh is not None:
         return solid.mesh.transformed(rotation).bounds
     if solid.surface is not None:

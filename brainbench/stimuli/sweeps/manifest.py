@@ -24,7 +24,7 @@ _COUNTS = ("steps", "steps_in_full", "retried", "unstable", "unusable")
 
 
 def is_whole(path: Path, task: ShardTask) -> bool:
-    """Whether the file of a shard is there and complete.
+    """Return whether the file of a shard is there and complete.
 
     Raises:
         DataError: it is a shard of another data set.

@@ -1,4 +1,4 @@
-"""What a data set will hold: which sweeps, in which split, in which shard. Nothing is built or simulated."""
+"""Plan of a data set: its sweeps, their splits and their shards. Nothing is built or simulated."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash, to_plain
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.sweeps.grid import default_array
 from brainbench.stimuli.sweeps.split import SPLITS, SplitBy, split_objects, split_sweeps
+from brainbench.stimuli.whiskers.array import WhiskerArray
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,7 +35,7 @@ GPU_SHARD = 2048
 
 @dataclass(frozen=True)
 class Settings:
-    """How a data set is made.
+    """Options of a data set of sweeps.
 
     Raises:
         UsageError: a value lies outside its range.
@@ -136,7 +136,7 @@ class GenerationPlan:
     @cached_property
     def array(self) -> WhiskerArray:
         """The whiskers."""
-        return default_array(self.grid.species).select(self.whiskers)
+        return WhiskerArray.of(self.grid.species).select(self.whiskers)
 
     @cached_property
     def classes(self) -> tuple[str, ...]:

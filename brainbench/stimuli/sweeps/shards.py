@@ -17,9 +17,10 @@ from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
 from brainbench.stimuli.objects.solid import Solid
-from brainbench.stimuli.sweeps.grid import Sweep, default_array
+from brainbench.stimuli.sweeps.grid import Sweep
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.whiskers.array import WhiskerArray
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,7 +38,7 @@ _CONDITIONS = tuple(item.name for item in fields(Sweep))
 
 @dataclass(frozen=True, eq=False)
 class ShardContent:
-    """What a shard's file will hold."""
+    """Content of a shard's file."""
 
     task: ShardTask
     arrays: Mapping[str, NDArray[Any]]
@@ -47,12 +48,12 @@ class ShardContent:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What stands ready before a shard is simulated; made by another process while the GPU works."""
+    """Objects and tables of a shard before it is simulated; made by another process while the GPU works."""
 
     solids: tuple[Solid | None, ...]
     """The objects of the shard; None for one that cannot be used."""
     reasons: tuple[str, ...]
-    """Why an object cannot be used; empty for the others."""
+    """Reason for which an object cannot be used; empty for the others."""
     tables: Mapping[str, NDArray[Any]]
     """The arrays that do not depend on the simulation."""
 
@@ -157,7 +158,7 @@ def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
 
 def _tables(task: ShardTask, hashes: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Return the names behind the numbers: times, whiskers, channels, classes and objects."""
-    mounts = list(default_array(task.grid.species).select(task.whiskers))
+    mounts = list(WhiskerArray.of(task.grid.species).select(task.whiskers))
     number = {label: index for index, label in enumerate(task.classes)}
     return {
         "time": task.grid.frames.times,
@@ -199,7 +200,7 @@ def _conditions(task: ShardTask) -> dict[str, NDArray[Any]]:
 
 
 def _texts(values: Any) -> NDArray[np.bytes_]:
-    """Texts as UTF-8 of a fixed length, which has the same bytes in every file."""
+    """Return texts as UTF-8 of a fixed length, which has the same bytes in every file."""
     encoded = [str(value).encode() for value in values]
     return np.array(encoded, dtype=f"S{max(1, *map(len, encoded))}")
 

@@ -1,4 +1,4 @@
-"""Which sweeps are for training, validation and testing: 80, 10 and 10 % of each class, by object or by sweep."""
+"""Splits of sweeps into training, validation and testing: 80, 10 and 10 % of each class, by object or by sweep."""
 
 from __future__ import annotations
 

@@ -13,11 +13,12 @@ from typing import Any, cast, overload
 import numpy as np
 
 from brainbench.core.errors import UsageError, listing
-from brainbench.stimuli.objects.placement import euler_matrix
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
-from brainbench.stimuli.sweeps.grid import Span, Sweep, SweepGrid, default_array
+from brainbench.stimuli.sweeps.grid import Span, Sweep, SweepGrid
+from brainbench.stimuli.whiskers.array import WhiskerArray
 
 
 class SweepScenes(Sequence[Scene]):
@@ -48,7 +49,7 @@ class SweepScenes(Sequence[Scene]):
         if not named:
             raise UsageError("Sweeps need at least one object to move past the whiskers.")
         self.grid = grid
-        self.array = default_array(grid.species).select(whiskers)
+        self.array = WhiskerArray.of(grid.species).select(whiskers)
         self._objects = named
         self._names = tuple(self._objects)
         self._last: tuple[str, Solid] | None = None

@@ -10,23 +10,10 @@ if TYPE_CHECKING:
     from brainbench.stimuli.validation import references
     from brainbench.stimuli.validation.bench_tests import BenchTest, peg, point_load, ringdown, slip_off
 
-__all__ = [
-    "BenchTest",
-    "peg",
-    "point_load",
-    "references",
-    "ringdown",
-    "slip_off",
-]
+__all__ = ["BenchTest", "peg", "point_load", "references", "ringdown", "slip_off"]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    {
-        "BenchTest": ".bench_tests",
-        "peg": ".bench_tests",
-        "point_load": ".bench_tests",
-        "references": ".references.",
-        "ringdown": ".bench_tests",
-        "slip_off": ".bench_tests",
-    },
-)
+_MODULES = {
+    ".bench_tests": ("BenchTest", "peg", "point_load", "ringdown", "slip_off"),
+    ".references.": ("references",),
+}
+__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

@@ -8,6 +8,7 @@ bending in the x-y plane. Wrenches are the action of the whisker on its base, ab
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -24,7 +26,7 @@ from brainbench.stimuli.whiskers.chain import build_chain
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from brainbench.stimuli.engines.protocol import Trace
+    from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
     from brainbench.stimuli.objects.obstacle import RigidMotion
     from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -135,10 +137,8 @@ def point_load(
     if force == 0 or not math.isfinite(force):
         raise UsageError(f"force must be a finite number of newtons other than zero; received {force!r}.")
     expected = references.point_load_deflection(whisker, force, at)
-    fidelity = _fidelity(fidelity)
-    critical = replace(whisker, damping_ratio=1.0)
-    duration = _settling_time(whisker)
-    job = Job(critical, StillFollicle(), (), np.array([duration]), loads=(Load(at, (0.0, force, 0.0)),))
+    fidelity = Fidelity.of(fidelity)
+    job = replace(_at_rest(whisker, np.array([_settling_time(whisker)])), loads=(Load(at, (0.0, force, 0.0)),))
     trace = _run(backend, job, fidelity)
     assert trace.link_positions is not None
     links = trace.link_positions.shape[1] - 1
@@ -178,23 +178,15 @@ def peg(
     if offset == 0:
         raise UsageError("The peg test needs an offset other than zero.")
     contact = references.elastica(whisker, at, offset)
-    fidelity = _fidelity(fidelity)
+    fidelity = Fidelity.of(fidelity)
     end = np.array(references.peg_centre(whisker, contact, peg_radius))
     # Straight below the end point, touching the undeformed rod.
     start = np.array([end[0], -math.copysign(peg_radius + float(whisker.radius(end[0])), offset)])
     settling = _settling_time(whisker)
     duration = max(0.1, 4 * settling)
-
-    def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        u = np.clip(times / duration, 0.0, 1.0)
-        position = np.zeros((len(times), 3))
-        position[:, :2] = start + (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * (end - start)
-        return position, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
-
-    # Critical damping changes only how soon the end state is reached.
-    critical = replace(whisker, damping_ratio=1.0)
+    motion = _sliding(lambda times: start + smooth_step(times, duration)[:, None] * (end - start))
     rod = _peg_obstacle(whisker, peg_radius, motion)
-    trace = _run(backend, Job(critical, StillFollicle(), (rod,), np.array([duration + settling])), fidelity)
+    trace = _run(backend, _at_rest(whisker, np.array([duration + settling]), rod), fidelity)
     return BenchTest(trace.wrench[-1], contact.wrench, float(trace.contact_arc[-1]), trace)
 
 
@@ -218,7 +210,7 @@ def slip_off(
         DataError: the simulation was unstable, or the whisker was still held an eighth beyond the reference depth.
     """
     _check_peg(whisker, peg_radius)
-    fidelity = _fidelity(fidelity)
+    fidelity = Fidelity.of(fidelity)
     touch = -(peg_radius + float(whisker.radius(at)))
     expected = references.slip_off_offset(whisker, at, peg_radius=peg_radius) - touch
     settling = _settling_time(whisker)
@@ -228,16 +220,9 @@ def slip_off(
     def depth(times: NDArray[np.float64]) -> NDArray[np.float64]:
         return expected * np.interp(times, [0.0, approach, duration], [0.0, 0.94, 1.12])
 
-    def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        position = np.zeros((len(times), 3))
-        position[:, 0] = at
-        position[:, 1] = touch + depth(times)
-        return position, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
-
     times = np.linspace(0, duration, 2001)[1:]
-    critical = replace(whisker, damping_ratio=1.0)
-    rod = _pulley(whisker, peg_radius, motion)
-    trace = _run(backend, Job(critical, StillFollicle(), (rod,), times), fidelity)
+    rod = _pulley(whisker, peg_radius, _sliding(lambda t: np.column_stack([np.full(len(t), at), touch + depth(t)])))
+    trace = _run(backend, _at_rest(whisker, times, rod), fidelity)
     held = np.flatnonzero(trace.contact)
     if not len(held) or held[-1] == len(times) - 1:
         raise DataError(
@@ -279,7 +264,7 @@ def ringdown(
         )
     if not 1 <= modes <= 5:
         raise UsageError(f"modes of a ring-down must lie between 1 and 5; received {modes!r}.")
-    fidelity = _fidelity(fidelity)
+    fidelity = Fidelity.of(fidelity)
     references_hz = references.natural_frequencies(whisker, modes)
     expected = float(references_hz[0])
     force = deflection * whisker.arc_length / references.point_load_deflection(whisker, 1.0, whisker.arc_length)
@@ -316,7 +301,7 @@ def ringdown(
 def _ring_mode(
     whisker: Whisker, mode: int, expected: NDArray, backend: str, fidelity: Fidelity, own_step: bool
 ) -> tuple[float, float]:
-    """Frequency (Hz) and damping ratio of one mode (0 = first), rung alone by a constant load in its shape."""
+    """Return frequency (Hz) and damping ratio of one mode (0 = first), rung alone by a constant load in its shape."""
     ratio, period = 0.05, 1 / float(expected[mode])
     step = fidelity.step(float(expected[0])) if own_step else min(fidelity.time_step, period / 100)
     if period < 6 * step:
@@ -344,6 +329,20 @@ def _ring_mode(
     return _fit_decay(times, tip, 1 / period, ratio)
 
 
+def _at_rest(whisker: Whisker, times: NDArray[np.float64], *obstacles: Obstacle) -> Job:
+    """Return the job of a static test: critical damping changes only how soon the end state is reached."""
+    return Job(replace(whisker, damping_ratio=1.0), StillFollicle(), obstacles, times)
+
+
+def _sliding(place: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> RigidMotion:
+    """Return the motion of a body that does not turn through points [n, 2] (m) of the plane of bending."""
+
+    def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return np.pad(place(times), ((0, 0), (0, 1))), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+
+    return motion
+
+
 def _peg_obstacle(whisker: Whisker, radius: float, motion: RigidMotion) -> Obstacle:
     """Return a frictionless round rod along z, longer than the whisker."""
     half = whisker.arc_length
@@ -366,7 +365,7 @@ def _check_peg(whisker: Whisker, peg_radius: float) -> None:
 
 
 def _fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) -> tuple[float, float]:
-    """Undamped frequency (Hz) and damping ratio of a decaying sinusoid."""
+    """Return the undamped frequency (Hz) and damping ratio of a decaying sinusoid."""
     from scipy.optimize import curve_fit
 
     scale = float(np.abs(signal).max())
@@ -386,16 +385,24 @@ def _fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) 
 
 
 def _settling_time(whisker: Whisker) -> float:
-    """Time (s) in which the first mode decays far below 1e-6 at critical damping."""
+    """Return the time (s) in which the first mode decays far below 1e-6 at critical damping."""
     return 6.0 / float(references.natural_frequencies(whisker, 1)[0])
 
 
-def _fidelity(fidelity: Fidelity | str) -> Fidelity:
-    return Fidelity.parse(fidelity) if isinstance(fidelity, str) else fidelity
-
-
 def _run(backend: str, job: Job, fidelity: Fidelity) -> Trace:
-    trace = get_engine(backend).run([job], fidelity, workers=1, record_shape=True)[0]
-    if trace.status != "ok":
-        raise DataError(f"The simulation was unstable: {trace.reason}.")
-    return trace
+    return run_stable(get_engine(backend), [job], fidelity, record_shape=True)[0]
+
+
+def run_stable(
+    engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool = False
+) -> list[Trace]:
+    """Simulate jobs on one thread.
+
+    Raises:
+        DataError: one of them was unstable.
+    """
+    traces = engine.run(jobs, fidelity, workers=1, record_shape=record_shape)
+    for trace in traces:
+        if trace.status != "ok":
+            raise DataError(f"The simulation was unstable: {trace.reason}.")
+    return traces

@@ -47,7 +47,7 @@ class Contact:
 
 
 def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
-    """Deflection [m] under a transverse point load F at arc length a of a straight cone, small bending.
+    """Return the deflection [m] under a transverse point load F at arc length a of a straight cone, small bending.
 
     δ = F a³/(3 E I_b) · r_b/r(a), exact for a linear taper.
     """
@@ -58,7 +58,7 @@ def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
 
 
 def point_load_slope(whisker: Whisker, force: float, at: float) -> float:
-    """Slope [rad] at a transverse point load F at arc length a of a straight cone, small bending.
+    """Return the slope [rad] at a transverse point load F at arc length a of a straight cone, small bending.
 
     F Lc²/(E I_b) · (1 − u)²(1 + 2u)/(6u²) with u = r(a)/r_b and Lc = L r_b/(r_b − r_t); its limit
     F a²/(2 E I) for a cylinder.
@@ -72,7 +72,7 @@ def point_load_slope(whisker: Whisker, force: float, at: float) -> float:
 
 
 def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]:
-    """Lowest bending frequencies [count] (Hz), base clamped, tip free, any taper and density gradient.
+    """Return the lowest bending frequencies [count] (Hz), base clamped, tip free, any taper and density gradient.
 
     Euler-Bernoulli finite elements (cubic Hermite, 4-point quadrature of the exact E I(s) and mass).
     For uniform density f_n = λ_n r_b √(E/ρ)/(4π L²), with λ_n depending on r_t/r_b alone.
@@ -108,7 +108,7 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
 
 @lru_cache(maxsize=256)
 def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
-    """Large bending by a frictionless point peg at the point (``at``, ``offset``) of the plane [m].
+    """Return the equilibrium of large bending by a frictionless point peg at the point (``at``, ``offset``) [m].
 
     Solves x' = cos θ, y' = sin θ, E I(s)(θ' − κ₀(s)) = (a − x) Fy − (d − y) Fx with F normal to the rod at
     the contact, on the branch that starts from the undeformed rod. The peg pushes towards +y when
@@ -123,7 +123,7 @@ def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
 
 
 def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radius: float, *, side: int = 1) -> Contact:
-    """Large bending by a frictionless round peg of radius ``peg_radius`` [m] with its axis at ``centre`` [m].
+    """Return the equilibrium with a frictionless round peg of radius ``peg_radius`` at ``centre`` [m].
 
     The rod's own radius counts: its centre line passes one radius sum from the axis. The peg pushes
     towards +y for ``side`` 1 and towards −y for −1.
@@ -136,7 +136,7 @@ def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radiu
 
 
 def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[float, float]:
-    """Axis [m] of the round peg of radius ``peg_radius`` [m] that holds ``contact``.
+    """Return the axis [m] of the round peg of radius ``peg_radius`` [m] that holds ``contact``.
 
     It lies one peg radius plus the local rod radius from the centre line, along the rod's normal.
     """
@@ -145,7 +145,7 @@ def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[f
 
 
 def slip_off_offset(whisker: Whisker, at: float, *, side: int = 1, peg_radius: float | None = None) -> float:
-    """Offset [m] at which a frictionless peg at distance ``at`` [m] loses the whisker.
+    """Return the offset [m] at which a frictionless peg at distance ``at`` [m] loses the whisker.
 
     Beyond it no equilibrium exists: the contact has run to the tip, or the rod yields without limit. The offset
     is that of the centre-line point at the contact of a point peg, or of the axis of a round peg of ``peg_radius`` [m].
@@ -236,7 +236,7 @@ class _Branch:
         return self.at if abs(u) < 1e-9 else (u * math.sqrt(1 + u * u) + math.asinh(u)) / (4 * self.curvature)
 
     def _settle(self, slope: float, guess: NDArray) -> NDArray[np.float64]:
-        """Newton's method for (force, arc) at one contact slope; NaN when it finds none."""
+        """Return (force, arc) at one contact slope by Newton's method; NaN when it finds none."""
         force_scale = float(self.whisker.bending_stiffness(0.0)) / self.at**2
         scale = np.array([force_scale, self.at])
         z = guess / scale
@@ -258,7 +258,7 @@ class _Branch:
         return np.array([angle, (x - self.at + self._gap(arc) * math.sin(slope)) / self.at])
 
     def _height(self, slope: float, settled: NDArray) -> float:
-        """Offset of the peg that belongs to an equilibrium."""
+        """Return the offset of the peg that belongs to an equilibrium."""
         if not np.isfinite(settled).all():
             return math.nan
         return self._integrate(slope, *settled)[2] - self._gap(settled[1]) * math.cos(slope)
@@ -278,7 +278,7 @@ class _Branch:
         )
 
     def _integrate(self, slope: float, force: float, arc: float) -> tuple[float, float, float, float]:
-        """Base angle, contact point (x, y) and base moment, by Runge-Kutta steps from the contact to the base."""
+        """Return base angle, contact point (x, y) and base moment: Runge-Kutta steps from contact to base."""
         half = np.linspace(arc, 0.0, 2 * _STEPS + 1)
         flexibility = 1 / np.maximum(self.whisker.bending_stiffness(half), 1e-300)
         rest = self._rest_curvature(half)
@@ -301,7 +301,7 @@ class _Branch:
         return angle, x, y, moment
 
     def _rest_curvature(self, s: NDArray) -> NDArray[np.float64]:
-        """Curvature of the rest shape [1/m]."""
+        """Return the curvature of the rest shape [1/m]."""
         return 2 * self.curvature * np.cos(self.whisker.tangent_angle(np.abs(s))) ** 3
 
 

@@ -46,6 +46,11 @@ class MountedWhisker:
     whisker: Whisker
 
     @property
+    def full_name(self) -> str:
+        """Side and name, such as ``RC2``."""
+        return self.side[0].upper() + self.name
+
+    @property
     def cell(self) -> int:
         """Flat index row·7 + col in the 5 × 7 grid."""
         return self.row * GRID_SHAPE[1] + self.col
@@ -70,6 +75,24 @@ class WhiskerArray:
     citation: str = ""
 
     @classmethod
+    def of(
+        cls, species: str = "mouse", *, side: Side = "right", whiskers: str = "all", source: Source = "average"
+    ) -> WhiskerArray:
+        """Return the array of one of :data:`SPECIES`; the arguments are those of :meth:`mouse` and :meth:`rat`."""
+        if species not in SPECIES:
+            raise unknown_name("species", species, SPECIES)
+        if source not in SOURCES:
+            raise unknown_name("source of an array", source, SOURCES)
+        if source == "model" and "model" not in _read(species):
+            raise UsageError(
+                f"There are no model equations of the {species} here: those of Bresee et al. (2023) are in no source "
+                "that we could read, and the released mouse scripts hold the rat's; use source='average', or the rat's "
+                "model."
+            )
+        array = _published(species) if source == "average" else _modelled(species)
+        return array.on_side(side).select(whiskers)
+
+    @classmethod
     def mouse(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
         """Return the average mouse (Bresee et al. 2023): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E0–E5.
 
@@ -81,7 +104,7 @@ class WhiskerArray:
         Raises:
             UsageError: a name is unknown, or the model equations of the mouse are asked for.
         """
-        return _array("mouse", source).on_side(side).select(whiskers)
+        return cls.of("mouse", side=side, whiskers=whiskers, source=source)
 
     @classmethod
     def rat(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
@@ -96,7 +119,7 @@ class WhiskerArray:
         Raises:
             UsageError: a name is unknown.
         """
-        return _array("rat", source).on_side(side).select(whiskers)
+        return cls.of("rat", side=side, whiskers=whiskers, source=source)
 
     def __iter__(self) -> Iterator[MountedWhisker]:
         return iter(self.mounts)
@@ -111,7 +134,7 @@ class WhiskerArray:
     def names(self) -> tuple[str, ...]:
         """Unique names in order: ``C2``, or ``RC2`` and ``LC2`` when the array has both sides."""
         both = len({mount.side for mount in self.mounts}) > 1
-        return tuple((mount.side[0].upper() if both else "") + mount.name for mount in self.mounts)
+        return tuple(mount.full_name if both else mount.name for mount in self.mounts)
 
     @property
     def side(self) -> Side:
@@ -206,19 +229,6 @@ def published_whisker(arc_length: float, curvature: float, row: int, col: int, *
     )
 
 
-def _array(species: str, source: str) -> WhiskerArray:
-    if source not in SOURCES:
-        raise unknown_name("source of an array", source, SOURCES)
-    if source == "average":
-        return _published(species)
-    if "model" not in _read(species):
-        raise UsageError(
-            f"There are no model equations of the {species} here: those of Bresee et al. (2023) are in no source that "
-            "we could read, and the released mouse scripts hold the rat's; use source='average', or the rat's model."
-        )
-    return _modelled(species)
-
-
 @cache
 def _read(species: str) -> dict[str, Any]:
     text = resources.files("brainbench.stimuli").joinpath("data", f"{species}.json").read_text(encoding="utf-8")
@@ -282,7 +292,7 @@ def _mount(entry: dict[str, Any], species: str) -> MountedWhisker:
 
 
 def _radii(arc_length: float, row: int, col: int, rule: dict[str, Any]) -> tuple[float, float]:
-    """Base and tip radius [mm] by the rat equations of Belli et al. (2017); their row counts from 1."""
+    """Return the base and tip radius [mm] by the rat equations of Belli et al. (2017); their row counts from 1."""
     base = rule["base_diameter"]
     slope = rule["radius_slope"]
     diameter = base["constant"] + base["arc_length"] * arc_length + base["row"] * (row + 1) + base["column"] * col

@@ -56,7 +56,7 @@ class Chain:
         return len(self.lengths)
 
     def frequencies(self, count: int = 1) -> NDArray[np.float64]:
-        """Lowest natural angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
+        """Return the lowest angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
         from scipy.linalg import eigh
 
         last = min(count, self.links) - 1
@@ -70,7 +70,7 @@ class Chain:
         return 1 / np.sqrt(inverse[::-1])
 
     def mode_shape(self, mode: int) -> NDArray[np.float64]:
-        """Bend of each joint [N] (rad, largest 1) in one undamped mode of small planar motion, 0 for the first."""
+        """Return the bend of each joint [N] (rad, largest 1) in one undamped mode of small planar motion, 0 = first."""
         from scipy.linalg import eigh
 
         index = self.links - 1 - mode
@@ -78,7 +78,7 @@ class Chain:
         return shapes[:, 0] / np.abs(shapes[:, 0]).max()
 
     def damping(self, time_step: float) -> NDArray[np.float64]:
-        """Damping of each hinge [N] (N·m·s/rad) that gives the first mode the whisker's damping ratio.
+        """Return the damping of each hinge [N] (N·m·s/rad) that gives the first mode the whisker's damping ratio.
 
         A linearly implicit (backward Euler) step of length ``time_step`` (s) adds the damping of one
         step: stiffness-proportional damping β k behaves as (β + dt) k. So β = max(2 ζ/ω₁ − dt, 0).
@@ -87,11 +87,11 @@ class Chain:
         return max(beta, 0.0) * self.stiffness
 
     def achieved_damping_ratio(self, time_step: float) -> float:
-        """Damping ratio of the first mode with this step; above the whisker's own when the step is too long."""
+        """Return the damping ratio of the first mode with this step; too long a step raises it above the whisker's."""
         return max(self.whisker.damping_ratio, float(self.frequencies()[0]) * time_step / 2)
 
     def _planar_mass(self) -> NDArray[np.float64]:
-        """Joint-space inertia [N, N] of the straightened chain for small rotations about z."""
+        """Return the joint-space inertia [N, N] of the straightened chain for small rotations about z."""
         joints = np.concatenate([[0.0], np.cumsum(self.lengths)[:-1]])
         centres = joints + self.centres
         # arm[i, j]: lever of joint j at the centre of mass of link i, which it moves only when j ≤ i.
@@ -130,7 +130,7 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
 
 
 def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
-    """Compliance of each joint [N] (rad/(N·m)): product integration of M²/(E I) with M² quadratic around each cell."""
+    """Return the compliance of each joint [N] (rad/(N·m)): the integral of M²/(E I), M² quadratic around each cell."""
     cell = whisker.arc_length / links
     total = np.zeros(links + 1)
     for i in range(links + 1):
@@ -155,7 +155,7 @@ def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
 
 
 def _frusta(whisker: Whisker, nodes: NDArray, lengths: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Mass [N], centre of mass [N] and inertia [N, 2] of conical frusta whose density varies linearly.
+    """Return the mass [N], centre of mass [N] and inertia [N, 2] of conical frusta whose density varies linearly.
 
     The mass of each arc is kept whole and spread along its chord.
     """

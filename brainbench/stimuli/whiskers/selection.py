@@ -36,7 +36,7 @@ def match_whiskers(pattern: str, names: Sequence[str], rows: Sequence[int], cols
 
 
 def _match(term: str, names: list[str], short: list[str], cells: list[tuple[int, int]]) -> list[int]:
-    """Indices that one term names."""
+    """Return the indices that one term names."""
     if term.lower() == "all":
         return list(range(len(names)))
     span = _RANGE.fullmatch(term)

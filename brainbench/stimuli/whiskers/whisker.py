@@ -82,29 +82,29 @@ class Whisker:
         return float(polynomial.polyval(1.0, shape)) * self.arc_length
 
     def radius(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Radius [m] at arc length ``s`` [m]."""
+        """Return the radius [m] at arc length ``s`` [m]."""
         return self.base_radius + (self.tip_radius - self.base_radius) * self._fraction(s)
 
     def second_moment(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Second moment of area π r⁴/4 [m⁴] at arc length ``s`` [m]."""
+        """Return the second moment of area π r⁴/4 [m⁴] at arc length ``s`` [m]."""
         return np.pi * self.radius(s) ** 4 / 4
 
     def bending_stiffness(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Flexural rigidity E I [N·m²] at arc length ``s`` [m]."""
+        """Return the flexural rigidity E I [N·m²] at arc length ``s`` [m]."""
         return self.young_modulus * self.second_moment(s)
 
     def linear_density(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Mass per length ρ π r² [kg/m] at arc length ``s`` [m]."""
+        """Return the mass per length ρ π r² [kg/m] at arc length ``s`` [m]."""
         base, tip = self.densities
         return (base + (tip - base) * self._fraction(s)) * np.pi * self.radius(s) ** 2
 
     def centre_line(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Rest positions (x, y) [..., 2] in the base frame [m] at arc length ``s`` [m]."""
+        """Return the rest positions (x, y) [..., 2] in the base frame [m] at arc length ``s`` [m]."""
         x = self._abscissa(s)
         return np.stack([x, self.curvature * x**2], axis=-1)
 
     def tangent_angle(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Angle of the rest centre line against +x [rad] at arc length ``s`` [m]."""
+        """Return the angle of the rest centre line against +x [rad] at arc length ``s`` [m]."""
         return np.arctan(2 * self.curvature * self._abscissa(s))
 
     def _abscissa(self, s: ArrayLike) -> NDArray[np.float64]:
@@ -127,7 +127,7 @@ class Whisker:
         return np.asarray(s, dtype=float) / self.arc_length
 
     def _area_series(self) -> list[float]:
-        """Coefficients of π r² in powers of s/L."""
+        """Return the coefficients of π r² in powers of s/L."""
         slope = self.tip_radius - self.base_radius
         return [np.pi * self.base_radius**2, 2 * np.pi * self.base_radius * slope, np.pi * slope**2]
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.objects.obstacle import (
     Box,
     Capsule,
@@ -14,7 +15,6 @@ from brainbench.stimuli.objects.obstacle import (
     Obstacle,
     Sphere,
     TriangleMesh,
-    rotation_matrix,
 )
 
 TURN = (math.cos(math.pi / 8), 0.0, 0.0, math.sin(math.pi / 8))
@@ -55,7 +55,7 @@ def test_the_boxes_of_a_surface_hold_each_of_its_triangles_and_are_at_most_sixty
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
     quarter = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
-    np.testing.assert_allclose(rotation_matrix(quarter) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(to_matrices(quarter) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.rotations import euler_matrix, to_matrices
 from brainbench.geometry import DecompositionSettings, Mesh, load_mesh
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -16,9 +17,8 @@ from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Path, Spin, Translation
 from brainbench.stimuli.objects import procedural
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid, shape_solids
-from brainbench.stimuli.objects.obstacle import TriangleMesh, rotation_matrix
+from brainbench.stimuli.objects.obstacle import TriangleMesh
 from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.objects.primitives import RODGERS_CONTROL, box, capsule, cylinder, rodgers_solid, sphere
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -116,7 +116,7 @@ def test_euler_angles_turn_about_fixed_x_then_y_then_z():
 def test_a_turned_box_has_the_corners_of_the_turned_corners():
     placed = PlacedObject(box((2e-3, 4e-3, 6e-3)), rotation=(0.0, 0.0, 0.4))
     part = placed.obstacle().parts[0]
-    np.testing.assert_allclose(rotation_matrix(part.quaternion), euler_matrix((0, 0, 0.4)), atol=1e-12)
+    np.testing.assert_allclose(to_matrices(part.quaternion), euler_matrix((0, 0, 0.4)), atol=1e-12)
 
 
 def test_a_moving_object_is_carried_in_the_frame_it_is_seen_from():
@@ -148,7 +148,7 @@ def test_each_point_of_a_moving_object_goes_where_rigid_kinematics_sends_it(moti
     frame, place, origin = euler_matrix(axes), np.array(place), np.array(origin)
     obstacle = placed.obstacle((frame, origin))
     position, quaternion = obstacle.motion(times)
-    seen = np.einsum("tij,vj->tvi", rotation_matrix(quaternion), obstacle.parts[1].vertices) + position[:, None]
+    seen = np.einsum("tij,vj->tvi", to_matrices(quaternion), obstacle.parts[1].vertices) + position[:, None]
     turned = motion.turn(times) if hasattr(motion, "turn") else np.tile(np.eye(3), (4, 1, 1))
     own = placed.solid.parts[1].vertices @ euler_matrix(turn).T
     world = np.einsum("tij,vj->tvi", turned, own) + place + motion.displacement(times)[:, None]

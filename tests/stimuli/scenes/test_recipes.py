@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.recorded import Trajectory
-from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.objects.primitives import box, rodgers_solid
 from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, list_recipes
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.placement import euler_matrix
 from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
-from brainbench.stimuli.sweeps import cluster
+from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import files_of, killed_plan, small_plan
 
@@ -43,7 +43,7 @@ def test_a_cluster_only_makes_what_is_missing(threads, tmp_path):
 
 
 def test_workers_that_write_to_a_disk_of_their_own_are_noticed(threads, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "make_shard", _write_elsewhere)
+    monkeypatch.setattr(running, "make_shard", _write_elsewhere)
     with pytest.raises(DataError, match=r"wrote \w+-00000.h5, but not here: .* must be a folder that .* all workers"):
         generate(small_plan(("brick:2",), split="object", limit=1), tmp_path, scheduler=threads.scheduler_address)
 
@@ -79,7 +79,7 @@ def test_a_worker_killed_during_the_run_costs_nothing(tmp_path):
 
 
 def test_no_scheduler_at_the_address_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT", 0.5)
+    monkeypatch.setattr(running, "TIMEOUT", 0.5)
     with pytest.raises(UsageError, match="No Dask scheduler answers at 'tcp:"):
         generate(small_plan(), tmp_path, scheduler="tcp://127.0.0.1:9")
 
@@ -91,6 +91,6 @@ def test_without_dask_the_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_a_local_run_loads_no_dask():
-    code = "import sys, brainbench.stimuli.sweeps.generation, brainbench.stimuli.sweeps.cluster\n"
+    code = "import sys, brainbench.stimuli.sweeps.generation, brainbench.stimuli.sweeps.running\n"
     code += "assert not {'dask', 'distributed', 'h5py'} & set(sys.modules), sys.modules.keys()"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,7 +7,7 @@ from collections import namedtuple
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.stimuli.sweeps import local_pool
+from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import files_of, small_plan
 
@@ -70,10 +70,10 @@ def test_a_shard_cut_off_by_a_power_cut_is_made_again(plan, unbroken, tmp_path):
 
 
 def test_the_pipeline_behind_a_gpu_writes_the_same_bytes(plan, unbroken, tmp_path, monkeypatch):
-    monkeypatch.setattr(local_pool, "_pool", _threads)
+    monkeypatch.setattr(running, "_pool", _threads)
     shutil.copy(unbroken / "config.json", tmp_path)
     done = []
-    local_pool.run_pipelined(plan.shards, tmp_path, 2, done.append)
+    running.run_pipelined(plan.shards, tmp_path, 2, done.append)
     assert sum(done) == 32
     expected = {name: data for name, data in files_of(unbroken).items() if name != "manifest.json"}
     assert files_of(tmp_path) == expected

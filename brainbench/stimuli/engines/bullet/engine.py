@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld, engine
 from brainbench.stimuli.engines.mujoco.drive import drive_scalars
@@ -41,7 +42,6 @@ from brainbench.stimuli.engines.trust import (
     too_strong,
 )
 from brainbench.stimuli.engines.units import MICRO, MILLI
-from brainbench.stimuli.objects.obstacle import rotation_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -163,7 +163,7 @@ class _Run:
         still = np.zeros((len(self.times), 3)), np.tile([1.0, 0, 0, 0], (len(self.times), 1))
         poses = [still if item.motion is None else item.motion(self.times) for item in reach.obstacles]
         self.poses = [(np.asarray(where, dtype=float) * MILLI, np.asarray(turn, dtype=float)) for where, turn in poses]
-        self.turns = [rotation_matrix(turn) for _, turn in self.poses]
+        self.turns = [to_matrices(turn) for _, turn in self.poses]
         self.travels = [item.motion is not None for item in reach.obstacles]
 
     def integrate(self) -> None:

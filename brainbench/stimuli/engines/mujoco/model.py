@@ -15,12 +15,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from brainbench.core.errors import MissingDependencyError
+from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE, PrescribedMotion, drive_free, drive_scalars
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
 from brainbench.stimuli.engines.trust import step_travel
 from brainbench.stimuli.engines.units import MICRO, MILLI
-from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Sphere, rotation_matrix
+from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Sphere
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -284,7 +285,7 @@ def _add_obstacle_joints(body: Element, position: NDArray, quaternion: NDArray, 
     moving = np.flatnonzero(np.ptp(position, axis=0) > 0)
     if not len(moving):
         return []
-    to_body = rotation_matrix(quaternion[0]).T
+    to_body = to_matrices(quaternion[0]).T
     for axis in moving:
         _add(body, "joint", type="slide", axis=to_body[:, axis], armature=ARMATURE)
     _add(body, "inertial", pos="0 0 0", **_NOTHING)

@@ -105,7 +105,7 @@ def follicle_knots(follicle: Follicle, start: float, stop: float) -> tuple[NDArr
 
 def body_knots(obstacle: Obstacle, start: float, stop: float) -> tuple[NDArray[np.float64], float]:
     """Return the knots [n, 16] of an obstacle between two times (s), and their spacing (ms)."""
-    from brainbench.stimuli.objects.obstacle import rotation_matrix
+    from brainbench.core.rotations import to_matrices
 
     if obstacle.motion is None:
         return still_knots(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), KNOT * MILLI
@@ -113,7 +113,7 @@ def body_knots(obstacle: Obstacle, start: float, stop: float) -> tuple[NDArray[n
     around = []
     for side in (-_SIDE, 0.0, _SIDE):
         place, turn = obstacle.motion(np.maximum(times + side, 0.0) if start >= 0 else times + side)
-        around.append((np.asarray(place, dtype=float), rotation_matrix(np.asarray(turn, dtype=float))))
+        around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))))
     knots = _knots(around, times, start)
     straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max(initial=0) < 1e-9 and not knots[:, 10:13].any()
     return (knots[:1], spacing) if straight else (knots, spacing)

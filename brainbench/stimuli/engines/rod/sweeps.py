@@ -17,7 +17,7 @@ import numpy as np
 
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import from_matrices
+from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
@@ -26,7 +26,6 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.trust import run_with_retries
 from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.objects.placement import euler_matrix
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,7 +1,7 @@
 """Procedural shapes: families draw proportions from a seed and combine bodies into closed meshes with a class label.
 
 :mod:`.bodies` has the building blocks, one module each the families that are turned, swept, extruded, rounded or
-assembled, and :mod:`.families` makes a member of any of them.
+assembled (every public function of theirs is a family), and :mod:`.families` makes a member of any of them.
 """
 
 from brainbench.stimuli.objects.procedural.families import DETAIL, Shape, describe_family, list_families, make

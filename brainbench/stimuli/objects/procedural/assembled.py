@@ -157,26 +157,3 @@ def basket(draw: ShapeSampler, detail: int) -> Body:
     angle = np.linspace(0, np.pi, max(16, around(detail) // 2))
     arc = np.column_stack([x * np.cos(angle), 0 * angle, tall / 2 - 0.02 + handle * np.sin(angle)])
     return tub + end.moved(y=y) + end.moved(y=-y) + tube(arc, 0.034, 10, closed=False)
-
-
-FAMILIES = {
-    family.__name__: family
-    for family in (
-        table,
-        chair,
-        stairs,
-        arch,
-        frame,
-        perforated,
-        pyramid,
-        wedge,
-        cone,
-        cylinder,
-        brick,
-        hammer,
-        bolt,
-        jack,
-        house,
-        basket,
-    )
-}

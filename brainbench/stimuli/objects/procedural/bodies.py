@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.rotations import euler_matrix
+
 if TYPE_CHECKING:
     from manifold3d import Manifold
     from numpy.typing import ArrayLike, NDArray
@@ -72,14 +74,7 @@ class Body:
 
     def turned(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Body:
         """Rotate by degrees about the fixed x, then y, then z axis."""
-        matrix = np.eye(3)
-        for axis, angle in enumerate((x, y, z)):
-            c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-            one = np.eye(3)
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            one[i, i], one[i, j], one[j, i], one[j, j] = c, -s, s, c
-            matrix = one @ matrix
-        return self._mapped(matrix)
+        return self._mapped(euler_matrix(np.radians((x, y, z))))
 
     def stretched(self, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Body:
         """Scale by positive factors along the axes."""
@@ -180,7 +175,7 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int, *, closed: bool, aspect
     count = len(line)
     tangent = np.roll(line, -1, 0) - np.roll(line, 1, 0) if closed else np.gradient(line, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    normal = _transported(tangent, closed)
+    normal = transported_normals(tangent, closed=closed)
     side = np.cross(tangent, normal)
     angle = 2 * np.pi * np.arange(sides) / sides
     radii = np.broadcast_to(np.asarray(radius, dtype=float), count)[:, None, None]
@@ -260,8 +255,11 @@ def _is_convex(corners: NDArray[np.float64]) -> bool:
     return bool((edge[:, 0] * ahead[:, 1] - edge[:, 1] * ahead[:, 0] >= -1e-12).all())
 
 
-def _transported(tangent: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
-    """Normals [n, 3] carried along the path without twist; on a closed path the mismatch is spread evenly."""
+def transported_normals(tangent: NDArray[np.float64], *, closed: bool = False) -> NDArray[np.float64]:
+    """Return unit normals [n, 3] of a path with unit tangents [n, 3] that turn about it as little as possible.
+
+    On a closed path the angle by which the last would miss the first is spread evenly.
+    """
     start = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
     normals = [start / np.linalg.norm(start)]
     for here in [*tangent[1:], *([tangent[0]] if closed else [])]:

@@ -114,8 +114,3 @@ def polygon(draw: ShapeSampler, detail: int) -> Body:
     """Upright prism of three to eight sides."""
     sides, height = draw.whole("sides", 3, 8), draw("height", 0.8, 2.2)
     return prism(_polar(np.ones(sides), 2 * np.pi * np.arange(sides) / sides), height)
-
-
-FAMILIES = {
-    family.__name__: family for family in (star, gear, flower, cross, arrow, crescent, heart, letter, twist, polygon)
-}

@@ -12,6 +12,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import FunctionType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,12 +30,12 @@ DETAIL = (2_000, 20_000)
 """Fewest and most triangles of a shape."""
 
 _FAMILIES: dict[str, Callable[[ShapeSampler, int], Body]] = {
-    **round.FAMILIES,
-    **turned.FAMILIES,
-    **swept.FAMILIES,
-    **extruded.FAMILIES,
-    **assembled.FAMILIES,
+    name: item
+    for module in (round, turned, swept, extruded, assembled)
+    for name, item in vars(module).items()
+    if isinstance(item, FunctionType) and item.__module__ == module.__name__ and not name.startswith("_")
 }
+"""Builders by name: every public function of these modules is a family."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,8 +92,3 @@ def orange(draw: ShapeSampler, detail: int) -> Body:
     # The two half-spaces overlap in what stays when the wedge is less than a half.
     halves = [sphere ^ below.solid, sphere ^ above.solid]
     return Body(halves[0] + halves[1], [points_of(half) for half in halves]).stretched(z=flat)
-
-
-FAMILIES = {
-    family.__name__: family for family in (ellipsoid, superquadric, bumpy, pebble, urchin, lens, carved, orange)
-}

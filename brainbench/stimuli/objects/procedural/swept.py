@@ -102,6 +102,3 @@ def dumbbell(draw: ShapeSampler, detail: int) -> Body:
     size, bar, length = draw("ball", 0.2, 0.38), draw("bar", 0.06, 0.13), draw("length", 0.75, 1.3)
     sphere = convex(ball(detail // 3)).stretched(size, size, size)
     return rod(bar, length, 32) + sphere.moved(z=length / 2) + sphere.moved(z=-length / 2)
-
-
-FAMILIES = {family.__name__: family for family in (torus, ring, knot, spring, horseshoe, hook, horn, dumbbell)}

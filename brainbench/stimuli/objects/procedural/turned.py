@@ -133,9 +133,3 @@ def bell(draw: ShapeSampler, detail: int) -> Body:
     waist = crown + 0.25 * (rim - crown)
     line = _outline([0, 0.08, flare * height, height], [0.6 * crown, crown, waist, rim], _rings(detail))
     return lathe(line, around(detail), wall=0.05, floor=line[2, 1])
-
-
-FAMILIES = {
-    family.__name__: family
-    for family in (vase, bottle, cup, mug, bowl, goblet, spool, hourglass, mushroom, dome, top, bell)
-}

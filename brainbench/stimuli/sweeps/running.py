@@ -1,4 +1,4 @@
-"""Run shards on this machine."""
+"""Run shards: on a pool of processes, through a GPU, or on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from brainbench.core.devices import usable_processors
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.stimuli.sweeps.shards import Prepared, make_shard, prepare_shard, simulate_shard, write_shard
 
 if TYPE_CHECKING:
@@ -28,6 +28,10 @@ WRITERS = 4
 """Threads that write shards behind a GPU: one hashes about 1 GB/s."""
 AHEAD = 4
 """Shards at least that are prepared ahead of the simulation; as many as there are processes to do it, if more."""
+TIMEOUT = 30
+"""Seconds that the scheduler of a cluster may take to answer."""
+QUEUED = 4
+"""Shards that wait at the scheduler for each thread of the cluster."""
 
 
 def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done: Done) -> None:
@@ -51,6 +55,64 @@ def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done
             "it works outside of: if __name__ == '__main__':. The finished shards are kept: run the same again, with "
             "fewer workers if this recurs."
         ) from error
+
+
+def run_on_cluster(tasks: Sequence[ShardTask], folder: Path, scheduler: str, done: Done) -> None:
+    """Make shards on a cluster, whose workers see the folder under the same path, one thread each.
+
+    A shard whose worker dies is made by another one: nothing is there before it is complete.
+
+    Raises:
+        MissingDependencyError: Dask is not installed.
+        UsageError: no scheduler answers at this address, or it has no workers.
+        DataError: a shard failed, or the workers write to a disk of their own.
+    """
+    try:
+        from distributed import Client, as_completed
+        from distributed.scheduler import KilledWorker
+    except ImportError as error:
+        raise missing_dependency("distributed", extra="cluster", purpose="A --scheduler") from error
+    try:
+        client: Any = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UsageError(f"No Dask scheduler answers at {scheduler!r} ({error}); start one: dask scheduler.") from error
+    with client:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise UsageError(
+                f"The Dask scheduler at {scheduler!r} has no workers; start some: dask worker {scheduler}."
+            )
+        waiting = iter(tasks)
+        futures = as_completed(loop=client.loop)
+        running: dict[str, ShardTask] = {}
+
+        def submit() -> None:
+            task = next(waiting, None)
+            if task is not None:
+                # Named by what it makes: an equal task of a client that was killed is not made twice.
+                key = f"{folder / task.name}-{task.config_hash}"
+                future = client.submit(make_shard, task, str(folder), 1, key=key)
+                running[future.key] = task
+                futures.add(future)
+
+        for _ in range(QUEUED * threads):
+            submit()
+        for future in futures:
+            task = running.pop(future.key)
+            try:
+                sweeps = future.result()
+            except KilledWorker as error:
+                raise DataError(
+                    f"Several workers died while they made {task.name}, perhaps for want of memory; the finished "
+                    "shards are kept: run the same command again with more memory per worker."
+                ) from error
+            if not (folder / task.name).is_file():
+                raise DataError(
+                    f"A worker wrote {task.name}, but not here: {str(folder)!r} must be a folder that this machine and "
+                    "all workers share."
+                )
+            done(sweeps)
+            submit()
 
 
 def _run_pool(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
