@@ -19,7 +19,6 @@ from functools import cached_property
 from brainbench.core.files import content_hash
 from brainbench.core.records import Interval, ModelCard, Score, Status
 from brainbench.core.statistics import is_finite, t_interval
-from leaderboards import provenance
 from leaderboards.ranking import Board, RankedRecord, animals_of, rank_ranges
 from leaderboards.store import record_name
 
@@ -114,9 +113,7 @@ def entries_of(board: Board, remarks: Mapping[str, Sequence[str]] | None = None)
     groups: dict[tuple[object, ...], list[RankedRecord]] = defaultdict(list)
     taken: dict[tuple[object, ...], int] = defaultdict(int)
     # Of the same model and seed the newest is the entry's; older ones stay visible as entries of their own.
-    newest_first = sorted(
-        board.rows, key=lambda row: (provenance.made_at(row.record.score), row.identity), reverse=True
-    )
+    newest_first = sorted(board.rows, key=lambda row: (row.record.score.provenance.time, row.identity), reverse=True)
     for row in newest_first:
         kind = _kind(row)
         seed = row.record.card.seed if row.record.card else None

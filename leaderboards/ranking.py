@@ -24,7 +24,6 @@ import numpy as np
 
 from brainbench.core.records import Interval, ResultRecord, Score
 from brainbench.core.statistics import is_finite, t_interval
-from leaderboards import provenance
 from leaderboards.store import record_name
 
 if TYPE_CHECKING:
@@ -105,8 +104,8 @@ def rank(records: Iterable[ResultRecord]) -> list[Board]:
     groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
     for record in records:
         score = record.score
-        brain, shown = provenance.recordings_hash(score), provenance.stimuli_hash(score)
-        groups[brain, shown, score.stimuli, provenance.time_rule(score), score.estimator, score.metric].append(record)
+        brain, shown = score.provenance.recordings_hash, score.provenance.stimuli_hash
+        groups[brain, shown, score.stimuli, score.provenance.time_rule, score.estimator, score.metric].append(record)
     boards = [_board(key, group) for key, group in groups.items()]
     return sorted(boards, key=lambda board: (-len(board.rows), board.recordings, board.estimator, board.metric))
 
@@ -215,9 +214,9 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
         rows.append(RankedRecord(record, record_name(record), first, last, reason, notes))
     rows.sort(key=_order)
     return Board(
-        recordings=_most_common(provenance.recordings_name(record.score) for record in records),
+        recordings=_most_common(record.score.provenance.recordings_name for record in records),
         recordings_hash=recordings_hash,
-        stimuli=_most_common(provenance.stimuli_name(record.score) for record in records),
+        stimuli=_most_common(record.score.provenance.stimuli_name for record in records),
         stimuli_hash=stimuli_hash,
         conditions=conditions,
         time=time,

@@ -10,7 +10,6 @@ from typing import Any
 
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from brainbench.core.statistics import is_finite
-from leaderboards import provenance
 from leaderboards.ranking import PAIRED_ANIMALS, paired_difference
 
 STATUS = {
@@ -127,14 +126,14 @@ def methods(record: ResultRecord) -> str:
     """Return a paragraph for a paper's methods section, made only of what the record states."""
     score = record.score
     text = (
-        f"The model {score.name} was compared with {provenance.recordings_name(score)} "
+        f"The model {score.name} was compared with {score.provenance.recordings_name} "
         f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
         "by representational similarity analysis"
     )
     text += f" ({score.metric})" if score.metric else ""
     text += f", with noise correction by the estimator '{score.estimator}'."
-    if provenance.time_rule(score):
-        text += f" Time axis: {provenance.time_rule(score)}."
+    if score.provenance.time_rule:
+        text += f" Time axis: {score.provenance.time_rule}."
     if score.layer_rule:
         text += f" Layer: {score.layer_rule}."
     if score.interval:
@@ -176,7 +175,7 @@ def loading(record: ResultRecord) -> str:
     if card is None or card.family in ("features computed elsewhere", ""):
         return f"# {name}: activations that were computed elsewhere; the record names no model to load."
     if card.family == "user module":
-        path = provenance.settings(record.score).get("model")
+        path = record.score.provenance.settings.get("model")
         shown = path if isinstance(path, str) else name
         made = f"model = load_user_model({shown!r}, seed={card.seed or 0})"
         return f"from brainbench.models.user_models import load_user_model\n\n{made}"

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from brainbench import __version__
 from brainbench.core.records import ResultRecord
-from leaderboards import provenance
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def references(records: Iterable[ResultRecord]) -> list[Reference]:
         if score.ceiling is not None:
             keys.append("nili2014")
         keys += [key for word, key in _METRICS.items() if word in score.metric.lower()]
-        if "rodgers" in f"{provenance.stimuli_name(score)} {provenance.recordings_name(score)}".lower():
+        if "rodgers" in f"{score.provenance.stimuli_name} {score.provenance.recordings_name}".lower():
             keys.append("rodgers2022")
         if card is not None:
             keys += [key for words, key in _ARCHITECTURES.items() if words in (card.citation or "")]

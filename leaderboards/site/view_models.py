@@ -10,7 +10,7 @@ from typing import Any
 
 from brainbench.core.records import LayerScore, ResultRecord, Score
 from brainbench.core.statistics import is_finite
-from leaderboards import provenance, text
+from leaderboards import text
 from leaderboards.figures.architecture import diagram
 from leaderboards.figures.marks import Axis, Mark, axis_of, rdm_picture, score_axis
 from leaderboards.site.page import drawn
@@ -69,7 +69,7 @@ def report_view(record: ResultRecord) -> dict[str, Any]:
     return {
         "title": f"{score.name}: brainbench score",
         "record": record,
-        "recordings": provenance.recordings_name(score),
+        "recordings": score.provenance.recordings_name,
         "axis": axis,
         "raw_axis": raw_axis,
         "band": _band(record.animal_to_animal),
@@ -83,7 +83,7 @@ def report_view(record: ResultRecord) -> dict[str, Any]:
         "layer_reference": score.value if score.status != "undefined" and score.layers else None,
         "animals": [(subject, axis.mark(subject.value)) for subject in score.subjects],
         "methods": text.methods(record),
-        "command": provenance.command(score),
+        "command": score.provenance.command,
         "card": text.card_rows(record.card) if record.card else [],
         "provenance": text.provenance_rows(score.provenance),
         "file_name": record_name(record),
@@ -93,7 +93,7 @@ def report_view(record: ResultRecord) -> dict[str, Any]:
 
 def _layer_rows(score: Score, axis: Axis) -> list[_LayerRow]:
     rows = []
-    tests = provenance.layer_p(score)
+    tests = score.provenance.layer_p
     for layer in score.layers:
         notes = ["chosen on held-out data"] if layer.layer == score.layer else []
         best = layer.layer == score.best_layer
