@@ -148,7 +148,7 @@ def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str,
             name = row.record.score.name
             shown = f"{name} (seed {seed})" if seed is not None else name
             key = (name, seed, board.recordings, board.metric, board.estimator, board.time)
-            found[key][row.identity] = _Placed(row.record, label, shown, row.rank)
+            found[key][row.record.identity] = _Placed(row.record, label, shown, row.rank)
     return found
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
@@ -426,6 +427,17 @@ class ResultRecord:
     def identity(self) -> str:
         """Content hash of the result without time and machine: equal inputs give equal names."""
         return record_identity(to_plain(self))
+
+    @property
+    def file_name(self) -> str:
+        """Name of the record's file: slug of the model's name, two hyphens, content hash.
+
+        >>> ResultRecord(Score("Zhuang Intersection/LN", 0.5, "ok")).file_name[:24]
+        'zhuang-intersection-ln--'
+        """
+        ascii_name = unicodedata.normalize("NFKD", self.score.name).encode("ascii", "ignore").decode().lower()
+        slug = re.sub(r"[^a-z0-9.+]+", "-", ascii_name).strip("-.")[:80].rstrip("-.")
+        return f"{slug or 'model'}--{self.identity}.json"
 
     def _repr_html_(self) -> str:
         """Show the score and its baselines in a notebook."""
