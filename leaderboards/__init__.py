@@ -1,17 +1,21 @@
 """Result records, the static site of a leaderboard, and reports.
 
-A record is one JSON file per score, named by its content (:mod:`leaderboards.store`), described by
-the JSON Schema in ``record.schema.json`` (:mod:`leaderboards.schema`). :mod:`leaderboards.ranking`
-decides what may be compared with what, :mod:`leaderboards.entries` folds seeds together,
-:mod:`leaderboards.site.site` writes the site and :mod:`leaderboards.report.score_report` reports;
-:mod:`leaderboards.audit` finds stale and contradicting records, :mod:`leaderboards.changes` compares
-records and builds. This package reads records, never models: scoring is the command line's business.
+A record is one JSON file per score, named by its content (:mod:`leaderboards.store`), described by the JSON Schema in
+``record.schema.json``. :mod:`leaderboards.ranking` decides what may be compared with what,
+:mod:`leaderboards.entries` folds seeds together, :mod:`leaderboards.figures` draws, :mod:`leaderboards.site` writes
+pages and :mod:`leaderboards.report` papers; :mod:`leaderboards.audit` finds stale and contradicting records,
+:mod:`leaderboards.changes` compares builds. This package reads records, never models.
 """
 
-from leaderboards.ranking import Board, RankedRecord, rank
-from leaderboards.report.score_report import write_report
-from leaderboards.site.site import build_leaderboard
-from leaderboards.store import StoredRecord, read_record, read_records, record_name, write_record
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from leaderboards.ranking import Board, RankedRecord, rank
+    from leaderboards.site.build import build_leaderboard
+    from leaderboards.site.score_page import write_report
+    from leaderboards.store import StoredRecord, read_record, read_records, write_record
 
 __all__ = [
     "Board",
@@ -21,7 +25,14 @@ __all__ = [
     "rank",
     "read_record",
     "read_records",
-    "record_name",
     "write_record",
     "write_report",
 ]
+
+_EXPORTS = {
+    **dict.fromkeys(("Board", "RankedRecord", "rank"), ".ranking"),
+    **dict.fromkeys(("StoredRecord", "read_record", "read_records", "write_record"), ".store"),
+    "build_leaderboard": ".site.build",
+    "write_report": ".site.score_page",
+}
+__getattr__, __dir__ = lazy_exports(__name__, _EXPORTS)

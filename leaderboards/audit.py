@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable
+from itertools import permutations
 from typing import Any
 
 from brainbench import __version__
 from brainbench.core.records import ESTIMATOR_VERSION, RECORD_SCHEMA, ResultRecord
-from leaderboards import provenance
 from leaderboards.store import StoredRecord
 
 TOLERANCE = 1e-3
@@ -26,14 +26,15 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
 
     Every sentence begins with ``stale:`` or ``conflict:``.
     """
-    usable = [item for item in stored if item.record is not None]
+    usable = [(item.record, item.schema) for item in stored if item.record is not None]
     found: dict[str, list[str]] = defaultdict(list)
-    newest = _newest_stimuli(usable)
-    for item in usable:
-        if item.record is not None:
-            found[item.record.identity] += [f"stale: {reason}" for reason in _stale(item.record, item.schema, newest)]
-    for first, second in _conflicts([item.record for item in usable if item.record is not None]):
-        for one, other in ((first, second), (second, first)):
+    newest = _newest_stimuli([record for record, _ in usable])
+    groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
+    for record, schema in usable:
+        found[record.identity] += [f"stale: {reason}" for reason in _stale(record, schema, newest)]
+        groups[computation(record)].append(record)
+    for one, other in (pair for group in groups.values() for pair in permutations(group, 2)):
+        if not _agree(one, other):
             found[one.identity].append(
                 f"conflict: the same computation gave {_value(one)} here and {_value(other)} in the record "
                 f"{other.identity}; find out which with: brainbench leaderboard verify"
@@ -44,28 +45,27 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
 def conflicting(record: ResultRecord, others: Iterable[ResultRecord]) -> list[ResultRecord]:
     """Return those of ``others`` that state the same computation as ``record`` and other numbers."""
     key = computation(record)
-    return [
-        other
-        for other in others
-        if other.identity != record.identity and computation(other) == key and not _agree(record, other)
-    ]
+    rivals = [other for other in others if computation(other) == key and not _agree(record, other)]
+    return [other for other in rivals if other.identity != record.identity]
 
 
 def computation(record: ResultRecord) -> tuple[Any, ...]:
     """Return what was computed from what, as a key: equal keys must have equal numbers."""
-    score, card = record.score, record.card
-    settings = provenance.settings(score)
+    score, card, origin = record.score, record.card, record.score.provenance
     return (
-        provenance.recordings_hash(score),
-        provenance.stimuli_hash(score),
+        origin.recordings_hash,
+        origin.stimuli_hash,
         score.stimuli,
         score.estimator,
         score.metric,
         score.name,
         card.weights if card else None,
-        provenance.version(score),
-        *(str(settings.get(name)) for name in ("time", "seed", "layers", "normalize", "whiskers", "estimator_version")),
-        *(str(provenance.recordings_part(score, name)) for name in ("window", "selection")),
+        origin.version,
+        *(
+            str(origin.settings.get(name))
+            for name in ("time", "seed", "layers", "normalize", "whiskers", "estimator_version")
+        ),
+        *(str(origin.recordings.get(name)) for name in ("window", "selection")),
     )
 
 
@@ -89,56 +89,40 @@ def _numbers(version: str) -> tuple[int, ...] | None:
 
 def _stale(record: ResultRecord, schema: int, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
     score = record.score
-    settings = provenance.settings(score)
+    settings = score.provenance.settings
     reasons = []
     if schema < RECORD_SCHEMA:
         reasons.append(f"the file has the layout of version {schema}, now {RECORD_SCHEMA}")
-    version = provenance.version(score)
+    version = score.provenance.version
     if older(version, __version__):
         reasons.append(f"made by brainbench {version}, this is {__version__}")
     estimator = settings.get("estimator_version")
     if score.estimator == "default" and isinstance(estimator, int) and estimator < ESTIMATOR_VERSION:
         reasons.append(f"version {estimator} of the default estimator, now {ESTIMATOR_VERSION}")
-    latest = newest.get(_shown(record), ("", ""))[1]
-    if latest and latest != provenance.stimuli_hash(score):
+    latest = newest.get(_wording(record), ("", ""))[1]
+    if latest and latest != score.provenance.stimuli_hash:
         reasons.append(
-            f"its stimuli ({provenance.stimuli_hash(score)}) were made by another engine or an earlier definition of "
+            f"its stimuli ({score.provenance.stimuli_hash}) were made by another engine or an earlier definition of "
             f"fidelity {settings.get('fidelity')!r} than the newest records' ({latest})"
         )
     return reasons
 
 
-def _shown(record: ResultRecord) -> tuple[Any, ...]:
-    """Return by which words the stimuli were asked for: the same words may mean others in another version."""
-    settings = provenance.settings(record.score)
-    named = tuple(str(settings.get(name)) for name in ("stimuli", "whiskers", "fidelity"))
-    return (provenance.stimuli_name(record.score), *named)
+def _wording(record: ResultRecord) -> tuple[Any, ...]:
+    """Return the words by which the stimuli were asked for: they may mean others in another version."""
+    origin = record.score.provenance
+    return (origin.stimuli_name, *(str(origin.settings.get(name)) for name in ("stimuli", "whiskers", "fidelity")))
 
 
-def _newest_stimuli(stored: list[StoredRecord]) -> dict[tuple[Any, ...], tuple[str, str]]:
+def _newest_stimuli(records: list[ResultRecord]) -> dict[tuple[Any, ...], tuple[str, str]]:
     """Return for each wording of the stimuli the time and the hash of the newest record."""
     newest: dict[tuple[Any, ...], tuple[str, str]] = {}
-    for item in stored:
-        if item.record is None or not (shown := provenance.stimuli_hash(item.record.score)):
-            continue
-        if not provenance.settings(item.record.score).get("fidelity"):
-            continue
-        key = _shown(item.record)
-        newest[key] = max(newest.get(key, ("", "")), (provenance.made_at(item.record.score), shown))
-    return newest
-
-
-def _conflicts(records: list[ResultRecord]) -> list[tuple[ResultRecord, ResultRecord]]:
-    groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
     for record in records:
-        groups[computation(record)].append(record)
-    return [
-        (group[i], group[j])
-        for group in groups.values()
-        for i in range(len(group))
-        for j in range(i + 1, len(group))
-        if not _agree(group[i], group[j])
-    ]
+        origin = record.score.provenance
+        if origin.stimuli_hash and origin.settings.get("fidelity"):
+            key = _wording(record)
+            newest[key] = max(newest.get(key, ("", "")), (origin.time, origin.stimuli_hash))
+    return newest
 
 
 def _agree(one: ResultRecord, other: ResultRecord) -> bool:

@@ -15,13 +15,13 @@ from typing import Any, Literal
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_plain
 from brainbench.core.records import ResultRecord, Score
-from leaderboards import provenance
 from leaderboards.audit import TOLERANCE
 from leaderboards.ranking import rank
 from leaderboards.store import StoredRecord, read_records
 
 RECORDS_ZIP = Path("data", "records.zip")
 """Where a built site keeps the records it was made from."""
+_CAUSES = ("recordings", "stimuli", "brainbench version", "card.weights", "score.layer")
 
 
 @dataclass(frozen=True)
@@ -60,26 +60,20 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
     status of the scores. Numbers count as equal within ``tolerance``. What only says when, where and with which
     packages is not compared, nor the content hash of simulated stimuli whose configuration is the same.
     """
-    found = []
-    for what, of in (
-        ("recordings", provenance.recordings_hash),
-        ("stimuli", provenance.stimuli_hash),
-        ("brainbench version", provenance.version),
-    ):
-        before, after = of(record.score), of(again.score)
-        if before != after:
-            found.append(Difference(what, before, after))
+    one, other = record.score.provenance, again.score.provenance
+    inputs: list[tuple[str, Any, Any]] = [
+        ("recordings", one.recordings_hash, other.recordings_hash),
+        ("stimuli", one.stimuli_hash, other.stimuli_hash),
+        ("brainbench version", one.version, other.version),
+    ]
     if record.card and again.card:
-        for name in ("weights", "parameters"):
-            before, after = getattr(record.card, name), getattr(again.card, name)
-            if before != after:
-                found.append(Difference(f"card.{name}", before, after))
+        inputs.append(("card.weights", record.card.weights, again.card.weights))
+        inputs.append(("card.parameters", record.card.parameters, again.card.parameters))
     before, after = dict(_statements(record)), dict(_statements(again))
-    for name in dict.fromkeys([*before, *after]):
-        one, other = before.get(name), after.get(name)
-        if not _equal(one, other, tolerance):
-            found.append(Difference(name, one, other))
-    return found
+    numbers = [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
+    return [Difference(*item) for item in inputs if item[1] != item[2]] + [
+        Difference(*item) for item in numbers if not _equal(*item[1:], tolerance)
+    ]
 
 
 def open_build(source: str | os.PathLike[str]) -> list[StoredRecord]:
@@ -122,7 +116,7 @@ def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]
             ones.pop(one.record.identity)
             others.pop(other.record.identity)
             found = differences(one.record, other.record, tolerance=0.0)
-            causes = tuple(str(item) for item in found if _is_cause(item))
+            causes = tuple(str(item) for item in found if item.what in _CAUSES)
             kind = "changed" if found else "restated"
             changes.append(Change(kind, other.board, other.name, one.text, other.text, causes))
         changes += [Change("removed", one.board, one.name, one.text, "") for one in ones.values()]
@@ -154,27 +148,17 @@ def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str,
             name = row.record.score.name
             shown = f"{name} (seed {seed})" if seed is not None else name
             key = (name, seed, board.recordings, board.metric, board.estimator, board.time)
-            found[key][row.identity] = _Placed(row.record, label, shown, row.rank)
+            found[key][row.record.identity] = _Placed(row.record, label, shown, row.rank)
     return found
 
 
-def _is_cause(item: Difference) -> bool:
-    return item.what in ("recordings", "stimuli", "brainbench version", "card.weights", "score.layer")
-
-
 def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
-    yield from _score_statements("score", record.score)
-    if record.animal_to_animal is not None:
-        yield from _score_statements("animal_to_animal", record.animal_to_animal)
-    for name, score in record.baselines.items():
-        yield from _score_statements(f"baselines.{name}", score)
-
-
-def _score_statements(where: str, score: Score) -> Iterator[tuple[str, Any]]:
-    for name, value in to_plain(score).items():
-        if name in ("provenance", "reasons", "p_method", "name"):
-            continue
-        yield from _leaves(f"{where}.{name}", value)
+    scores: dict[str, Score | None] = {"score": record.score, "animal_to_animal": record.animal_to_animal}
+    scores |= {f"baselines.{name}": score for name, score in record.baselines.items()}
+    for where, score in scores.items():
+        for name, value in to_plain(score).items() if score is not None else ():
+            if name not in ("provenance", "reasons", "p_method", "name"):
+                yield from _leaves(f"{where}.{name}", value)
 
 
 def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -14,21 +14,18 @@ import statistics
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 from brainbench.core.files import content_hash
 from brainbench.core.records import Interval, ModelCard, Score, Status
 from brainbench.core.statistics import is_finite, t_interval
-from leaderboards import provenance
-from leaderboards.ranking import Board, RankedRecord, animals_of, rank_ranges
-from leaderboards.store import record_name
+from leaderboards.ranking import Board, Ranked, RankedRecord, animals_of, rank_ranges
 
 _SEVERITY: tuple[Status, ...] = ("ok", "unreliable", "undefined")
 UNTRAINED = "untrained"
 
 
 @dataclass(frozen=True)
-class Entry:
+class Entry(Ranked):
     """One model on a board: a record, or several that differ in the seed of the weights."""
 
     rows: tuple[RankedRecord, ...]
@@ -70,13 +67,6 @@ class Entry:
         return self.card.objective not in (None, UNTRAINED)
 
     @property
-    def rank(self) -> str:
-        """The rank in print: ``2``, ``2–5``, or a dash when not ranked."""
-        if self.first is None:
-            return "–"
-        return str(self.first) if self.first == self.last else f"{self.first}–{self.last}"
-
-    @property
     def unranked_because(self) -> str:
         """Why it has no rank; empty when it has one."""
         return "" if self.first is not None else self.rows[0].unranked_because or "not every seed is ranked"
@@ -92,10 +82,10 @@ class Entry:
         """Mean raw comparison over seeds."""
         return _mean([row.record.score.r for row in self.rows])
 
-    @cached_property
+    @property
     def architecture(self) -> str:
-        """Name without the tag of trained weights: the untrained twin's, where the card names none."""
-        return self.card.twin or self.name.partition(".")[0]
+        """Name of its untrained twin, which of an untrained network is its own."""
+        return self.card.twin or self.name
 
     @property
     def masking(self) -> float:
@@ -114,25 +104,22 @@ def entries_of(board: Board, remarks: Mapping[str, Sequence[str]] | None = None)
     groups: dict[tuple[object, ...], list[RankedRecord]] = defaultdict(list)
     taken: dict[tuple[object, ...], int] = defaultdict(int)
     # Of the same model and seed the newest is the entry's; older ones stay visible as entries of their own.
-    newest_first = sorted(
-        board.rows, key=lambda row: (provenance.made_at(row.record.score), row.identity), reverse=True
-    )
-    for row in newest_first:
+    by_age = sorted(board.rows, key=lambda row: (row.record.score.provenance.time, row.record.identity))
+    for row in reversed(by_age):
         kind = _kind(row)
         seed = row.record.card.seed if row.record.card else None
         copy = taken[*kind, seed]
         taken[*kind, seed] += 1
         groups[*kind, copy].append(row)
     entries = [_entry(board, key, rows, remarks or {}) for key, rows in groups.items()]
-    ranked = [entry for entry in entries if all(not row.unranked_because for row in entry.rows) and entry.interval]
+    ranked, found = [], []
+    for entry in entries:
+        able = entry.interval and not any(row.unranked_because for row in entry.rows)
+        (ranked if able else found).append(entry)
     intervals = [entry.interval for entry in ranked if entry.interval]
     ranges = rank_ranges(intervals, [_animals(entry) for entry in ranked], [_chance(entry) for entry in ranked])
-    placed = {id(entry): span for entry, span in zip(ranked, ranges, strict=True)}
-    found = [
-        replace(entry, first=placed[id(entry)][0], last=placed[id(entry)][1]) if id(entry) in placed else entry
-        for entry in entries
-    ]
-    return sorted(found, key=_order)
+    found += [replace(entry, first=first, last=last) for entry, (first, last) in zip(ranked, ranges, strict=True)]
+    return sorted(found, key=lambda entry: (*entry.order(entry.value), entry.name, entry.page))
 
 
 def twins(entries: Sequence[Entry]) -> dict[str, Entry]:
@@ -154,7 +141,7 @@ def _chance(entry: Entry) -> float:
 def _kind(row: RankedRecord) -> tuple[object, ...]:
     card = row.record.card
     if card is None or card.seed is None:  # nobody can know what else differs
-        return (row.record.score.name, card.weights if card else None, row.identity if card is None else None)
+        return (row.record.score.name, card.weights if card else None, row.record.identity if card is None else None)
     masking = card.training.get("masking")
     return (row.record.score.name, card.objective, card.augmentation, str(masking))
 
@@ -162,12 +149,12 @@ def _kind(row: RankedRecord) -> tuple[object, ...]:
 def _entry(
     board: Board, key: tuple[object, ...], rows: list[RankedRecord], remarks: Mapping[str, Sequence[str]]
 ) -> Entry:
-    rows = sorted(rows, key=lambda row: ((row.record.card and row.record.card.seed) or 0, row.identity))
+    rows = sorted(rows, key=lambda row: ((row.record.card and row.record.card.seed) or 0, row.record.identity))
     scores = [row.record.score for row in rows]
     values = [score.value for score in scores if math.isfinite(score.value)]
     where = (board.recordings_hash, board.stimuli_hash, board.conditions, board.time, board.estimator, board.metric)
-    slug = record_name(rows[0].record).rpartition("--")[0]
-    notes = list(dict.fromkeys(note for row in rows for note in (*remarks.get(row.identity, ()),)))
+    slug = rows[0].record.file_name.rpartition("--")[0]
+    notes = list(dict.fromkeys(note for row in rows for note in (*remarks.get(row.record.identity, ()),)))
     if key[-1]:
         notes.append("an earlier record of a model that stands above or below once more")
     return Entry(
@@ -204,8 +191,3 @@ def _interval(scores: Sequence[Score]) -> Interval | None:
 def _mean(values: Sequence[float]) -> float:
     finite = [value for value in values if math.isfinite(value)]
     return math.fsum(finite) / len(finite) if finite else math.nan
-
-
-def _order(entry: Entry) -> tuple[int, float, str, str]:
-    place = 0 if entry.first is not None else 2 if math.isnan(entry.value) else 1
-    return place, 0.0 if math.isnan(entry.value) else -entry.value, entry.name, entry.page

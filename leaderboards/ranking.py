@@ -24,8 +24,7 @@ import numpy as np
 
 from brainbench.core.records import Interval, ResultRecord, Score
 from brainbench.core.statistics import is_finite, t_interval
-from leaderboards import provenance
-from leaderboards.store import record_name
+from leaderboards.text import number, span
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,24 +34,11 @@ PAIRED_ANIMALS = 5
 FALSE_DISCOVERY_RATE = 0.05
 
 
-@dataclass(frozen=True)
-class RankedRecord:
-    """One row of a board."""
+class Ranked:
+    """What has a range of ranks."""
 
-    record: ResultRecord
-    file_name: str
-    """Name of the record's file, which ends in its content hash (:func:`leaderboards.record_name`)."""
-    first: int | None = None
-    """Best rank that the intervals allow, from 1; None when the score is not ranked."""
-    last: int | None = None
-    """Worst rank that the intervals allow."""
-    unranked_because: str = ""
-    notes: tuple[str, ...] = ()
-
-    @property
-    def identity(self) -> str:
-        """Content hash of the record."""
-        return self.file_name.rpartition("--")[2].removesuffix(".json")
+    first: int | None
+    last: int | None
 
     @property
     def rank(self) -> str:
@@ -60,6 +46,24 @@ class RankedRecord:
         if self.first is None:
             return "–"
         return str(self.first) if self.first == self.last else f"{self.first}–{self.last}"
+
+    def order(self, value: float) -> tuple[int, float]:
+        """Return a key that sorts ranked before unranked and undefined, and each by its value, the highest first."""
+        place = 0 if self.first is not None else 2 if math.isnan(value) else 1
+        return place, 0.0 if math.isnan(value) else -value
+
+
+@dataclass(frozen=True)
+class RankedRecord(Ranked):
+    """One row of a board."""
+
+    record: ResultRecord
+    first: int | None = None
+    """Best rank that the intervals allow, from 1; None when the score is not ranked."""
+    last: int | None = None
+    """Worst rank that the intervals allow."""
+    unranked_because: str = ""
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,8 +109,8 @@ def rank(records: Iterable[ResultRecord]) -> list[Board]:
     groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
     for record in records:
         score = record.score
-        brain, shown = provenance.recordings_hash(score), provenance.stimuli_hash(score)
-        groups[brain, shown, score.stimuli, provenance.time_rule(score), score.estimator, score.metric].append(record)
+        brain, shown = score.provenance.recordings_hash, score.provenance.stimuli_hash
+        groups[brain, shown, score.stimuli, score.provenance.time_rule, score.estimator, score.metric].append(record)
     boards = [_board(key, group) for key, group in groups.items()]
     return sorted(boards, key=lambda board: (-len(board.rows), board.recordings, board.estimator, board.metric))
 
@@ -154,6 +158,37 @@ def paired_difference(one: Score, other: Score, level: float = 0.95) -> tuple[fl
     if interval is None or len(difference) < PAIRED_ANIMALS:
         return None
     return float(difference.mean()), replace(interval, method=f"paired {interval.method}"), len(difference)
+
+
+def comparisons(record: ResultRecord) -> list[str]:
+    """Say how the score stands to each baseline: by the paired difference over animals, with few of them by overlap."""
+    score = record.score
+    others = list(record.baselines.items())
+    if record.animal_to_animal is not None:
+        others.append(("animal-to-animal", record.animal_to_animal))
+    if score.status != "ok" or score.interval is None or not is_finite(score.interval):
+        return []
+    sentences = []
+    for name, other in others:
+        if other.status != "ok" or other.interval is None or not is_finite(other.interval):
+            reason = "has no interval" if other.status == "ok" else f"is {other.status}"
+            sentences.append(f"Cannot be compared with {name}, which {reason}.")
+        elif (paired := paired_difference(score, other)) is not None:
+            mean, interval, animals = paired
+            verdict = "Above" if interval.low > 0 else "Below" if interval.high < 0 else "Not told apart from"
+            sentences.append(
+                f"{verdict} {name} ({number(other.value)}): difference {number(mean)} {span(interval)}, paired over "
+                f"{animals} animals."
+            )
+        elif score.interval.low > other.interval.high:
+            sentences.append(f"Above {name} ({number(other.value)}): the intervals do not overlap.")
+        elif score.interval.high < other.interval.low:
+            sentences.append(f"Below {name} ({number(other.value)}): the intervals do not overlap.")
+        else:
+            sentences.append(f"Not told apart from {name} ({number(other.value)}): the intervals overlap.")
+    if any("overlap" in sentence for sentence in sentences):
+        sentences.append(f"With fewer than {PAIRED_ANIMALS} animals in common no paired test is trusted.")
+    return sentences
 
 
 def pairs_rule(animals: Sequence[Mapping[str, float]]) -> str:
@@ -212,12 +247,12 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
         first, last = (None, None) if reason else next(ranges)
         times = repeats[_model(record)]
         notes = (f"scored {times} times on this board; compare the versions",) if times > 1 else ()
-        rows.append(RankedRecord(record, record_name(record), first, last, reason, notes))
-    rows.sort(key=_order)
+        rows.append(RankedRecord(record, first, last, reason, notes))
+    rows.sort(key=lambda row: (*row.order(row.record.score.value), row.record.score.name))
     return Board(
-        recordings=_most_common(provenance.recordings_name(record.score) for record in records),
+        recordings=_most_common(record.score.provenance.recordings_name for record in records),
         recordings_hash=recordings_hash,
-        stimuli=_most_common(provenance.stimuli_name(record.score) for record in records),
+        stimuli=_most_common(record.score.provenance.stimuli_name for record in records),
         stimuli_hash=stimuli_hash,
         conditions=conditions,
         time=time,
@@ -237,12 +272,6 @@ def _unranked(record: ResultRecord, comparable: bool) -> str:
     if not is_finite(score.interval):
         return "no interval"
     return "" if comparable else "recordings not identified"
-
-
-def _order(row: RankedRecord) -> tuple[int, float, str]:
-    value = row.record.score.value
-    place = 0 if row.first is not None else 2 if math.isnan(value) else 1
-    return place, 0.0 if math.isnan(value) else -value, row.record.score.name
 
 
 def _model(record: ResultRecord) -> tuple[object, ...]:

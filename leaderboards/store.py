@@ -1,9 +1,9 @@
 """Result records on disk: one JSON file per score, named by what it says.
 
-A file is called ``<readable name>--<content hash>.json``. The hash (:attr:`ResultRecord.identity`)
-covers everything but time, machine and package versions, so equal results have equal names, folders
-of records merge by copying files, and a record edited by hand no longer fits its name. The hash
-detects slips and careless edits; it is no signature against someone who renames the file as well.
+A file is called ``<readable name>--<content hash>.json`` (:attr:`ResultRecord.file_name`). The hash covers
+everything but time, machine and package versions, so equal results have equal names, folders of records merge
+by copying files, and a record edited by hand no longer fits its name. The hash detects slips and careless
+edits; it is no signature against someone who renames the file as well.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
-import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,17 +33,6 @@ class StoredRecord:
     """Version of the layout on disk; an earlier one was brought to the present one in reading."""
 
 
-def record_name(record: ResultRecord) -> str:
-    """Return the file name of a record: slug of the score's name, two hyphens, content hash.
-
-    >>> record_name(ResultRecord(Score("Zhuang Intersection/LN", 0.5, "ok")))[:24]
-    'zhuang-intersection-ln--'
-    """
-    ascii_name = unicodedata.normalize("NFKD", record.score.name).encode("ascii", "ignore").decode().lower()
-    slug = re.sub(r"[^a-z0-9.+]+", "-", ascii_name).strip("-.")[:80].rstrip("-.")
-    return f"{slug or 'model'}--{record.identity}.json"
-
-
 def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     """Write a record into ``folder`` and return its path.
 
@@ -55,7 +42,7 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     Raises:
         DataError: the record contradicts itself (:func:`read_record` would refuse it).
     """
-    path = Path(folder) / record_name(record)
+    path = Path(folder) / record.file_name
     text = record.to_json() + "\n"
     _parse(text, path)
     try:

@@ -9,9 +9,6 @@ from dataclasses import fields
 from typing import Any
 
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
-from brainbench.core.statistics import is_finite
-from leaderboards import provenance
-from leaderboards.ranking import PAIRED_ANIMALS, paired_difference
 
 STATUS = {
     "ok": "The recordings are reliable enough to trust this number.",
@@ -92,49 +89,18 @@ def p_sentence(score: Score) -> str:
     return "; ".join(parts)
 
 
-def comparisons(record: ResultRecord) -> list[str]:
-    """Say how the score stands to each baseline: by the paired difference over animals, with few of them by overlap."""
-    score = record.score
-    others = list(record.baselines.items())
-    if record.animal_to_animal is not None:
-        others.append(("animal-to-animal", record.animal_to_animal))
-    if score.status != "ok" or score.interval is None or not is_finite(score.interval):
-        return []
-    sentences = []
-    for name, other in others:
-        if other.status != "ok" or other.interval is None or not is_finite(other.interval):
-            reason = "has no interval" if other.status == "ok" else f"is {other.status}"
-            sentences.append(f"Cannot be compared with {name}, which {reason}.")
-        elif (paired := paired_difference(score, other)) is not None:
-            mean, interval, animals = paired
-            verdict = "Above" if interval.low > 0 else "Below" if interval.high < 0 else "Not told apart from"
-            sentences.append(
-                f"{verdict} {name} ({number(other.value)}): difference {number(mean)} {span(interval)}, paired over "
-                f"{animals} animals."
-            )
-        elif score.interval.low > other.interval.high:
-            sentences.append(f"Above {name} ({number(other.value)}): the intervals do not overlap.")
-        elif score.interval.high < other.interval.low:
-            sentences.append(f"Below {name} ({number(other.value)}): the intervals do not overlap.")
-        else:
-            sentences.append(f"Not told apart from {name} ({number(other.value)}): the intervals overlap.")
-    if any("overlap" in sentence for sentence in sentences):
-        sentences.append(f"With fewer than {PAIRED_ANIMALS} animals in common no paired test is trusted.")
-    return sentences
-
-
 def methods(record: ResultRecord) -> str:
     """Return a paragraph for a paper's methods section, made only of what the record states."""
     score = record.score
     text = (
-        f"The model {score.name} was compared with {provenance.recordings_name(score)} "
+        f"The model {score.name} was compared with {score.provenance.recordings_name} "
         f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
         "by representational similarity analysis"
     )
     text += f" ({score.metric})" if score.metric else ""
     text += f", with noise correction by the estimator '{score.estimator}'."
-    if provenance.time_rule(score):
-        text += f" Time axis: {provenance.time_rule(score)}."
+    if score.provenance.time_rule:
+        text += f" Time axis: {score.provenance.time_rule}."
     if score.layer_rule:
         text += f" Layer: {score.layer_rule}."
     if score.interval:
@@ -176,7 +142,7 @@ def loading(record: ResultRecord) -> str:
     if card is None or card.family in ("features computed elsewhere", ""):
         return f"# {name}: activations that were computed elsewhere; the record names no model to load."
     if card.family == "user module":
-        path = provenance.settings(record.score).get("model")
+        path = record.score.provenance.settings.get("model")
         shown = path if isinstance(path, str) else name
         made = f"model = load_user_model({shown!r}, seed={card.seed or 0})"
         return f"from brainbench.models.user_models import load_user_model\n\n{made}"
@@ -195,6 +161,16 @@ def training_rows(card: ModelCard) -> list[tuple[str, str]]:
         if key not in ("augmentation", "objective")
     ]
     rows += [("untrained twin", card.twin)] if stated and card.twin else []
+    return [(label, text) for label, text in rows if text]
+
+
+def accuracy_rows(card: ModelCard) -> list[tuple[str, str]]:
+    """Return what the card says of the accuracy on held-out objects, as label and text."""
+    rows = [("top-1", number(card.top1)), ("interval", span(card.accuracy_interval))]
+    rows += [("top-5", number(card.top5))] if card.top5 is not None else []
+    if card.twin_top1 is not None:
+        rows.append(("untrained twin, top-1", f"{number(card.twin_top1)} {span(card.twin_interval)}".strip()))
+    rows += [("data (hash)", card.accuracy_data or ""), ("collapsed", "yes" if card.collapsed else "no")]
     return [(label, text) for label, text in rows if text]
 
 

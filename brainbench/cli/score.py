@@ -54,7 +54,7 @@ def score(
     from brainbench.core.files import to_plain
     from brainbench.metrics.explain import explain_file
     from brainbench.scoring.scores import score_record
-    from leaderboards.report.score_report import write_report
+    from leaderboards.site.score_page import write_report
     from leaderboards.store import write_record
 
     chosen: ScoreOptions = options

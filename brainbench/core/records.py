@@ -8,8 +8,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import msgspec
@@ -146,6 +148,50 @@ class Provenance(Mapping[str, Any]):
             name: value for name, value in stated.items() if value and isinstance(value, kinds.get(name, ()))
         }
         return cls(**typed, more={name: value for name, value in stated.items() if name not in typed})
+
+    @property
+    def recordings_name(self) -> str:
+        """Short name of the recordings: the last part of each path, or ``unnamed recordings``."""
+        source = self.recordings.get("source")
+        sources = source if isinstance(source, (list, tuple)) else [source] if source else []
+        names = [str(item).replace("\\", "/").rstrip("/").rpartition("/")[2] for item in sources]
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        return ", ".join(names[:3]) + more or "unnamed recordings"
+
+    @property
+    def recordings_hash(self) -> str | None:
+        """Content hash of the recordings, if stated."""
+        return _text(self.recordings.get("content_hash")) or None
+
+    @property
+    def stimuli_name(self) -> str:
+        """Description of the stimuli; empty if not stated."""
+        return _text(self.stimuli.get("description"))
+
+    @property
+    def stimuli_hash(self) -> str | None:
+        """Hash that names the stimuli, if stated.
+
+        That of their configuration is equal on every machine; the numbers differ in their last digits.
+        """
+        return _text(self.stimuli.get("config_hash")) or _text(self.stimuli.get("content_hash")) or None
+
+    @property
+    def time_rule(self) -> str:
+        """How the time axis entered the RDMs, ``mean`` or ``concatenate``; empty if not stated."""
+        return _text(self.settings.get("time"))
+
+    @property
+    def layer_p(self) -> dict[str, float]:
+        """Each layer's p, corrected for the number of layers where that is stated."""
+        tests = self.statistics.get("layer_tests")
+        found = {}
+        for item in tests if isinstance(tests, (list, tuple)) else ():
+            if isinstance(item, Mapping) and isinstance(item.get("layer"), str):
+                p = item.get("p_corrected", item.get("p"))
+                if isinstance(p, (int, float)) and not isinstance(p, bool):
+                    found[item["layer"]] = float(p)
+        return found
 
     def __getitem__(self, name: str) -> Any:
         """Return a stated entry."""
@@ -377,10 +423,21 @@ class ResultRecord:
         """
         return _convert(cls, migrate_record(_parsed(source)))
 
-    @property
+    @cached_property
     def identity(self) -> str:
         """Content hash of the result without time and machine: equal inputs give equal names."""
         return record_identity(to_plain(self))
+
+    @property
+    def file_name(self) -> str:
+        """Name of the record's file: slug of the model's name, two hyphens, content hash.
+
+        >>> ResultRecord(Score("Zhuang Intersection/LN", 0.5, "ok")).file_name[:24]
+        'zhuang-intersection-ln--'
+        """
+        ascii_name = unicodedata.normalize("NFKD", self.score.name).encode("ascii", "ignore").decode().lower()
+        slug = re.sub(r"[^a-z0-9.+]+", "-", ascii_name).strip("-.")[:80].rstrip("-.")
+        return f"{slug or 'model'}--{self.identity}.json"
 
     def _repr_html_(self) -> str:
         """Show the score and its baselines in a notebook."""
@@ -433,6 +490,11 @@ def migrate_record(data: Any) -> Any:
         f"This result record has schema version {version!r}; this brainbench reads versions 1 to "
         f"{RECORD_SCHEMA}; {advice}."
     )
+
+
+def _text(value: Any) -> str:
+    """Return a text as it is; what is none counts as not stated, since anyone may write a record."""
+    return value if isinstance(value, str) else ""
 
 
 def _number(value: float) -> str:

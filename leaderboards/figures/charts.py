@@ -15,17 +15,17 @@ from leaderboards.entries import Entry, twins
 from leaderboards.figures.plots import (
     SHOWN,
     WIDTH,
+    Bar,
     Figure,
-    ablation,
+    Point,
+    Row,
     colours,
     cut,
     cut_name,
     cut_words,
-    draw_axis,
-    draw_band,
-    draw_interval,
     draw_matrix,
     legend_words,
+    row_chart,
     scatter,
     score_scale,
 )
@@ -38,89 +38,65 @@ _PARTS = {"encoder": "c1", "attender": "c2", "decoder": "c3"}
 
 def board_figures(board: Board, entries: Sequence[Entry]) -> list[Figure]:
     """Return all figures of a board, drawn or with what they lack."""
-    drawers: tuple[Callable[[Board, Sequence[Entry]], Figure], ...] = (
-        fit_per_model, layer_fit, rdm_panel, accuracy, accuracy_against_fit, parameters_against_fit, augmentation,
-        masking,
-    )  # fmt: skip
-    return [draw(board, entries) for draw in drawers]
+    return [
+        fit_per_model(board, entries),
+        layer_fit(entries),
+        rdm_panel(board, entries),
+        accuracy(entries),
+        accuracy_against_fit(entries),
+        parameters_against_fit(entries),
+        augmentation(entries),
+        masking(entries),
+    ]
 
 
 def fit_per_model(board: Board, entries: Sequence[Entry]) -> Figure:
-    """Neural fit of every model beside its untrained twin, with animal-to-animal and baselines (figure 3.7 b)."""
-    key, title = "fit", "Neural fit of every model"
-    twin = twins(entries)
+    """Draw the neural fit of every model beside its untrained twin, with all baselines (figure 3.7 b)."""
+    title = "Neural fit of every model"
     shown = [entry for entry in entries if math.isfinite(entry.value)]
     # A twin is drawn on the row of the network trained from it, not once more on its own.
     partnered = {entry.architecture for entry in shown if entry.trained}
-    rows = [entry for entry in shown if entry.trained or entry.architecture not in partnered]
-    if not rows:
-        return Figure(key, title, "", None, "no record has a defined score")
-    many, rows = len(rows), rows[:SHOWN]
+    shown = [entry for entry in shown if entry.trained or entry.architecture not in partnered]
+    if not shown:
+        return Figure("fit", title, lacking="no record has a defined score")
+    models, untrained = shown[:SHOWN], twins(entries)
     base = [item for item in board.baselines if math.isfinite(item.score.value)]
-    values = [entry.value for entry in rows] + [item.score.value for item in base]
-    intervals = [entry.interval for entry in rows] + [item.score.interval for item in base]
-    scale = score_scale(values, intervals, 250, WIDTH - 20)
-    drawing = Drawing(WIDTH, 44 + 19 * (len(rows) + len(base)), f"{title}: {len(rows)} models, best first")
-    draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
-    animals = next((b.score for b in base if b.kind == "animals" and is_finite(b.score.interval)), None)
-    draw_band(drawing, scale, animals.interval if animals else None, 30, drawing.height - 8)
-    colour = colours(entry.card.objective or "not stated" for entry in rows)
-    y = 44.0
-    for entry in rows:
-        kind = colour[entry.card.objective or "not stated"]
-        drawing.text(242, y + 4, cut_name(entry.name, 36), "end" if entry.first is not None else "end quiet")
-        draw_interval(drawing, scale, entry.interval, y, kind)
-        for row in entry.rows if entry.seeds > 1 else ():
-            drawing.mark(scale.at(row.record.score.value), y, "dot", f"{kind} faint", size=2)
-        other = twin.get(entry.architecture) if entry.trained else None
-        if other is not None and math.isfinite(other.value):
-            drawing.mark(scale.at(other.value), y, "dot", "c0 open", f"untrained twin {number(other.value)}", 3.5)
+    colour = colours(map(_objective, models))
+    rows = []
+    for entry in models:
+        kind = colour[_objective(entry)]
+        seeds = [Point(row.record.score.value, f"{kind} faint", size=2) for row in entry.rows]
+        twin = _twin_points(entry, untrained, 3.5) if entry.trained else ()
         hollow = " open" if entry.status != "ok" else ""
-        drawing.mark(
-            scale.at(entry.value),
-            y,
-            "dot",
-            kind + hollow,
-            f"{entry.name}: {number(entry.value)} {span(entry.interval)}",
-        )
-        y += 19
+        mark = Point(entry.value, kind + hollow, f"{entry.name}: {number(entry.value)} {span(entry.interval)}")
+        points = (*(seeds if entry.seeds > 1 else ()), *twin, mark)
+        label_kind = "end" if entry.first is not None else "end quiet"
+        rows.append(Row(cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
     for item in base:
-        drawing.text(242, y + 4, item.name, "end quiet")
-        draw_interval(drawing, scale, item.score.interval, y, "c7" if item.kind == "animals" else "c0")
-        shape = "square" if item.kind == "animals" else "diamond"
-        drawing.mark(
-            scale.at(item.score.value),
-            y,
-            shape,
-            "c7" if item.kind == "animals" else "c0",
-            f"{item.name}: {number(item.score.value)}",
-            4,
-        )
-        y += 19
-    ceiling = next((e.score.ceiling for e in rows if e.score.ceiling), None)
-    caption = (
-        "Noise-corrected score with its interval; 1 is all that recordings this noisy can show. "
-        + ("The band is the interval of animal-to-animal. " if animals else "")
-        + ("Small dots are seeds. " if any(e.seeds > 1 for e in rows) else "")
-        + ("Hollow grey points are untrained twins. " if any(e.trained for e in rows) else "")
-        + (
-            f"Noise ceiling of the raw comparison: {number(ceiling.lower)} to {number(ceiling.upper)}. "
-            if ceiling
-            else ""
-        )
-        + legend_words(colour)
-        + cut_words(many)
-    )
-    return Figure(key, f"{title} (as figure 3.7 b)", caption, drawing)
+        kind, shape = ("c7", "square") if item.kind == "animals" else ("c0", "diamond")
+        mark = Point(item.score.value, kind, f"{item.name}: {number(item.score.value)}", 4, shape)
+        rows.append(Row(item.name, (mark,), item.score.interval, kind, "end quiet"))
+    values = [entry.value for entry in models] + [item.score.value for item in base]
+    scale = score_scale(values, [row.interval for row in rows], 250, WIDTH - 20)
+    animals = next((b.score for b in base if b.kind == "animals" and is_finite(b.score.interval)), None)
+    words = f"{title}: {len(models)} models, best first"
+    drawing = row_chart(words, rows, scale, "noise-corrected RSA", band=animals.interval if animals else None)
+    ceiling = next((e.score.ceiling for e in models if e.score.ceiling), None)
+    caption = "Noise-corrected score with its interval; 1 is all that recordings this noisy can show. "
+    caption += "The band is the interval of animal-to-animal. " if animals else ""
+    caption += "Small dots are seeds. " if any(e.seeds > 1 for e in models) else ""
+    caption += "Hollow grey points are untrained twins. " if any(e.trained for e in models) else ""
+    if ceiling:
+        caption += f"Noise ceiling of the raw comparison: {number(ceiling.lower)} to {number(ceiling.upper)}. "
+    return Figure("fit", f"{title} (as figure 3.7 b)", caption + legend_words(colour) + cut_words(len(shown)), drawing)
 
 
-def layer_fit(board: Board, entries: Sequence[Entry]) -> Figure:
-    """Neural fit of every layer, a small panel per model, coloured by part of the network (figure 3.4)."""
-    del board
+def layer_fit(entries: Sequence[Entry]) -> Figure:
+    """Draw the neural fit of every layer, a small panel per model, coloured by part of the network (figure 3.4)."""
     key, title = "layers", "Neural fit by layer (as figure 3.4)"
     rows = [entry for entry in entries if any(math.isfinite(layer.value) for layer in entry.score.layers)]
     if not rows:
-        return Figure(key, title, "", None, "no record holds scores of layers")
+        return Figure(key, title, lacking="no record holds scores of layers")
     many, rows = len(rows), rows[:24]
     columns, w, h = 4, WIDTH / 4, 112.0
     drawing = Drawing(WIDTH, math.ceil(len(rows) / columns) * h + 6, f"Score of every layer of {len(rows)} models")
@@ -150,7 +126,7 @@ def layer_fit(board: Board, entries: Sequence[Entry]) -> Figure:
 
 
 def rdm_panel(board: Board, entries: Sequence[Entry]) -> Figure:
-    """RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5)."""
+    """Draw the RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5)."""
     key, title = "rdms", "Representational dissimilarity (as figure 3.5)"
     picked: list[tuple[str, str, Sequence[float]]] = []
     raw = next((b.score for b in board.baselines if b.name == "raw input"), None)
@@ -170,7 +146,7 @@ def rdm_panel(board: Board, entries: Sequence[Entry]) -> Figure:
     size = len(board.conditions)
     picked = [item for item in picked if len(item[2]) == size * (size - 1) // 2]
     if not picked or size < 2:
-        return Figure(key, title, "", None, "no record holds RDMs")
+        return Figure(key, title, lacking="no record holds RDMs")
     side = min(WIDTH / len(picked) - 16, 170.0)
     drawing = Drawing(WIDTH, side + 48, f"{len(picked)} dissimilarity matrices of {size} stimuli")
     for index, (name, detail, pairs) in enumerate(picked):
@@ -186,95 +162,135 @@ def rdm_panel(board: Board, entries: Sequence[Entry]) -> Figure:
     return Figure(key, title, caption, drawing)
 
 
-def accuracy(board: Board, entries: Sequence[Entry]) -> Figure:
-    """Task accuracy beside that of the untrained twin (figure 3.6)."""
-    del board
+def accuracy(entries: Sequence[Entry]) -> Figure:
+    """Draw the task accuracy beside that of the untrained twin (figure 3.6)."""
     key, title = "accuracy", "Task accuracy (as figure 3.6)"
-    rows = sorted((e for e in entries if e.card.top1 is not None), key=lambda e: -(e.card.top1 or 0))
-    if not rows:
-        return Figure(
-            key, title, "", None, "no record states a task accuracy (top1 on its model card); trained models do"
-        )
+    stated = sorted((e for e in entries if e.card.top1 is not None), key=lambda e: -(e.card.top1 or 0))
+    if not stated:
+        lacking = "no record states a task accuracy (top1 on its model card); trained models do"
+        return Figure(key, title, lacking=lacking)
+    models = [e for e in stated if e.trained][:SHOWN] or stated[:SHOWN]
     untrained = twins(entries)
-    many, rows = len(rows), [e for e in rows if e.trained][:SHOWN] or rows[:SHOWN]
-    reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in rows))
-    scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
-    drawing = Drawing(WIDTH, 44 + 19 * len(rows), f"{title}: {len(rows)} models")
-    draw_axis(drawing, scale, 30, drawing.height - 8, "accuracy on held-out objects")
-    colour = colours(entry.card.objective or "not stated" for entry in rows)
-    y = 44.0
-    for entry in rows:
-        kind = colour[entry.card.objective or "not stated"]
-        card = entry.card
-        drawing.text(242, y + 4, cut_name(entry.name, 36), "end")
-        twin = _twin_accuracy(entry, untrained)
-        if twin is not None:
-            drawing.rect(250, y - 6, scale.at(twin) - 250, 4, f"{kind} faint", tip=f"untrained twin {number(twin)}")
-        drawing.rect(
-            250, y - 2, scale.at(card.top1 or 0) - 250, 8, kind, tip=f"{entry.name}: top-1 {number(card.top1)}"
+    found = [_twin_accuracy(entry, untrained) for entry in models]
+    colour = colours(map(_objective, models))
+    rows = []
+    for entry, twin in zip(models, found, strict=True):
+        kind, card = colour[_objective(entry)], entry.card
+        bars = [Bar(twin, -6, 4, f"{kind} faint", f"untrained twin {number(twin)}")] if twin is not None else []
+        bars.append(Bar(card.top1 or 0, -2, 8, kind, f"{entry.name}: top-1 {number(card.top1)}"))
+        top5 = (
+            ()
+            if card.top5 is None
+            else (Point(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.2, "diamond"),)
         )
-        draw_interval(drawing, scale, card.accuracy_interval, y + 2, "line")
-        if card.top5 is not None:
-            drawing.mark(scale.at(card.top5), y + 2, "diamond", f"{kind} open", f"top-5 {number(card.top5)}", 3.2)
-        y += 19
-    lack = (
-        ""
-        if any(_twin_accuracy(entry, untrained) is not None for entry in rows)
-        else " No record states the accuracy of an untrained twin."
-    )
+        rows.append(Row(cut_name(entry.name, 36), top5, card.accuracy_interval, "line", bars=bars, drop=2))
+    reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in models))
+    scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
+    drawing = row_chart(f"{title}: {len(models)} models", rows, scale, "accuracy on held-out objects")
+    lack = " No record states the accuracy of an untrained twin." if set(found) == {None} else ""
     caption = (
         f"Top-1 accuracy (bar, Wilson interval) and top-5 (diamond). The thin bar is the untrained twin's.{lack} "
-        f"{legend_words(colour)}{cut_words(many)}"
+        f"{legend_words(colour)}{cut_words(len(stated))}"
     )
     return Figure(key, title, caption, drawing)
 
 
-def _twin_accuracy(entry: Entry, untrained: Mapping[str, Entry]) -> float | None:
-    """What the record says of its twin, or else what the twin's own record says."""
-    if entry.card.twin_top1 is not None:
-        return entry.card.twin_top1
-    other = untrained.get(entry.architecture)
-    return None if other is None else other.card.top1
-
-
-def accuracy_against_fit(board: Board, entries: Sequence[Entry]) -> Figure:
-    """Task accuracy against neural fit, with regression and its interval (figure 3.8 a, b)."""
-    del board
+def accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
+    """Draw the task accuracy against the neural fit, with regression and its interval (figure 3.8 a, b)."""
     key, title = "accuracy-fit", "Task accuracy against neural fit (as figure 3.8)"
     points = [(e.card.top1, e.value, e) for e in entries if e.card.top1 is not None and e.status == "ok"]
     if len(points) < 3:
-        return Figure(
-            key,
-            title,
-            "",
-            None,
-            f"{len(points)} records state both a task accuracy and a trusted score; at least 3 are needed",
-        )
+        lacking = f"{len(points)} records state both a task accuracy and a trusted score; at least 3 are needed"
+        return Figure(key, title, lacking=lacking)
     return scatter(key, title, points, "top-1 accuracy", fit=True)
 
 
-def parameters_against_fit(board: Board, entries: Sequence[Entry]) -> Figure:
-    """Number of parameters against neural fit (figure 3.3)."""
-    del board
+def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
+    """Draw the number of parameters against the neural fit (figure 3.3)."""
     key, title = "parameters", "Parameters against neural fit (as figure 3.3)"
     points = [(float(e.card.parameters), e.value, e) for e in entries if e.card.parameters and e.status == "ok"]
     if len(points) < 2:
-        return Figure(key, title, "", None, "fewer than 2 records state parameters and have a trusted score")
+        return Figure(key, title, lacking="fewer than 2 records state parameters and have a trusted score")
     return scatter(key, title, points, "parameters", log=True)
 
 
-def augmentation(board: Board, entries: Sequence[Entry]) -> Figure:
-    """Neural fit under each augmentation, for models trained with several (figure 3.8 c)."""
-    del board
-    key, title = "augmentation", "Augmentation ablation (as figure 3.8 c)"
-    return ablation(key, title, entries, _augmentation, lambda e: _masking(e) if e.masking else "", "augmentation")
+def augmentation(entries: Sequence[Entry]) -> Figure:
+    """Draw the neural fit under each augmentation, for models trained with several (figure 3.8 c)."""
+    title = "Augmentation ablation (as figure 3.8 c)"
+    fixed = lambda entry: _masking(entry) if entry.masking else ""  # noqa: E731
+    return _ablation("augmentation", title, entries, _augmentation, fixed, "augmentation")
 
 
-def masking(board: Board, entries: Sequence[Entry]) -> Figure:
-    """Neural fit by the share of masked time steps, for models trained with several."""
-    del board
-    key, title = "masking", "Temporal masking"
-    return ablation(key, title, entries, _masking, _augmentation, "share of masked steps")
+def masking(entries: Sequence[Entry]) -> Figure:
+    """Draw the neural fit by the share of masked time steps, for models trained with several."""
+    return _ablation("masking", "Temporal masking", entries, _masking, _augmentation, "share of masked steps")
+
+
+def layers_of(entry: Entry) -> Drawing | None:
+    """Draw the layers of one model against their scores, all seeds; None without layers."""
+    layers = entry.score.layers
+    if not layers:
+        return None
+    seeds = [row.record.score.layers for row in entry.rows]
+    rows = []
+    for index, layer in enumerate(layers):
+        kind = _PARTS.get(layer.layer.partition(".")[0], "c1")
+        chosen = layer.layer == entry.score.layer
+        found = [one[index].value for one in seeds if len(one) == len(layers)]
+        finite = [value for value in found if math.isfinite(value)]
+        points = [Point(value, f"{kind} faint", size=2.2) for value in finite if entry.seeds > 1]
+        if finite:
+            mean = math.fsum(finite) / len(finite)
+            tip = f"{layer.layer}: {number(mean)} {span(layer.interval) if entry.seeds == 1 else ''}"
+            points.append(Point(mean, kind if chosen else f"{kind} open", tip, 4))
+        interval = layer.interval if entry.seeds == 1 else None
+        rows.append(Row(cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
+    ends = [
+        end for row in rows if row.interval and is_finite(row.interval) for end in (row.interval.low, row.interval.high)
+    ]
+    values = [layer.value for one in seeds for layer in one]
+    scale = score_scale(values, [Interval(min(ends), max(ends))] if ends else [], 132, 470)
+    words = f"Score of {len(layers)} layers of {entry.name}"
+    return row_chart(words, rows, scale, "noise-corrected score", step=20, width=490)
+
+
+def _ablation(
+    key: str,
+    title: str,
+    entries: Sequence[Entry],
+    level: Callable[[Entry], str],
+    held: Callable[[Entry], str],
+    what: str,
+) -> Figure:
+    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed, and on the same data."""
+    groups: dict[tuple[str, ...], dict[str, Entry]] = {}
+    for entry in entries:
+        if entry.trained and level(entry) and math.isfinite(entry.value):
+            model = (entry.architecture, entry.card.objective or "", held(entry), entry.card.accuracy_data or "")
+            groups.setdefault(model, {}).setdefault(level(entry), entry)
+    groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
+    if not groups:
+        return Figure(key, title, lacking=f"no model was trained with more than one {what}")
+    untrained = twins(entries)
+    colour = colours(label for levels in groups.values() for label in sorted(levels))
+    rows, values = [], []
+    for model, levels in groups.items():
+        group = cut(", ".join(part for part in model[:-1] if part), 50)
+        for label, entry in sorted(levels.items()):
+            top1 = f", top-1 {number(entry.card.top1)}" if entry.card.top1 is not None else ""
+            mark = Point(entry.value, colour[label], f"{entry.name}, {label}: {number(entry.value)}{top1}")
+            points = (*_twin_points(entry, untrained, 3.2), mark)
+            rows.append(Row(cut(label, 22), points, entry.interval, colour[label], group=group))
+            values.append(entry.value)
+            group = ""
+    scale = score_scale(values, [row.interval for row in rows], 400, WIDTH - 20)
+    drawing = row_chart(f"{title}: {len(groups)} models", rows, scale, "noise-corrected RSA", step=20)
+    caption = f"Noise-corrected score with its interval by {what}; hollow grey points are untrained twins."
+    return Figure(key, title, caption, drawing)
+
+
+def _objective(entry: Entry) -> str:
+    return entry.card.objective or "not stated"
 
 
 def _augmentation(entry: Entry) -> str:
@@ -285,32 +301,15 @@ def _masking(entry: Entry) -> str:
     return f"{entry.masking:.0%} masked" if entry.trained else ""
 
 
-def layers_of(entry: Entry) -> Drawing | None:
-    """Draw the layers of one model against their scores, all seeds; None without layers."""
-    layers = entry.score.layers
-    if not layers:
-        return None
-    values = [layer.value for row in entry.rows for layer in row.record.score.layers]
-    intervals = [layer.interval for layer in layers] if entry.seeds == 1 else []
-    ends = [end for i in intervals if i and is_finite(i) for end in (i.low, i.high)]
-    scale = score_scale(values, [Interval(min(ends), max(ends))] if ends else [], 132, 470)
-    drawing = Drawing(490, 44 + 20 * len(layers), f"Score of {len(layers)} layers of {entry.name}")
-    draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected score")
-    for index, layer in enumerate(layers):
-        y = 44.0 + 20 * index
-        kind = _PARTS.get(layer.layer.partition(".")[0], "c1")
-        chosen = layer.layer == entry.score.layer
-        drawing.text(124, y + 4, cut(layer.layer, 22), "end title" if chosen else "end")
-        found = [
-            row.record.score.layers[index].value for row in entry.rows if len(row.record.score.layers) == len(layers)
-        ]
-        finite = [value for value in found if math.isfinite(value)]
-        if entry.seeds == 1:
-            draw_interval(drawing, scale, layer.interval, y, kind)
-        for value in finite if entry.seeds > 1 else ():
-            drawing.mark(scale.at(value), y, "dot", f"{kind} faint", size=2.2)
-        if finite:
-            mean = math.fsum(finite) / len(finite)
-            tip = f"{layer.layer}: {number(mean)} {span(layer.interval) if entry.seeds == 1 else ''}"
-            drawing.mark(scale.at(mean), y, "dot", kind if chosen else f"{kind} open", tip, 4)
-    return drawing
+def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[Point, ...]:
+    """Return the mark of a model's untrained twin, if its score is on the board."""
+    twin = untrained.get(entry.architecture)
+    return () if twin is None else (Point(twin.value, "c0 open", f"untrained twin {number(twin.value)}", size),)
+
+
+def _twin_accuracy(entry: Entry, untrained: Mapping[str, Entry]) -> float | None:
+    """Return what the record says of its twin, or else what the twin's own record says."""
+    if entry.card.twin_top1 is not None:
+        return entry.card.twin_top1
+    twin = untrained.get(entry.architecture)
+    return None if twin is None else twin.card.top1

@@ -13,8 +13,9 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
-from brainbench.core.records import Interval, Score
+from brainbench.core.records import Interval, LayerScore, ResultRecord, Score
 from brainbench.core.statistics import is_finite
 
 MARGIN = 4.0
@@ -27,6 +28,8 @@ LIMITS = (-1.0, 1.5)
 # colour-blind readers.
 _VIRIDIS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
 _LEVELS = 254
+_MOST_PAIRS = 100
+"""An RDM with more pairs than this is shown as a picture only; its numbers are in the record."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +84,84 @@ def axis_of(values: Iterable[float]) -> Axis:
 
 def score_axis(scores: Iterable[Score]) -> Axis:
     """Return the axis that shows these scores; only trustworthy ones may widen it by their intervals."""
-    values: list[float] = []
-    for score in scores:
-        values.append(score.value)
-        if score.status == "ok" and score.interval and is_finite(score.interval):
-            values += [score.interval.low, score.interval.high]
-    return axis_of(values)
+    scores = list(scores)
+    ends = [end for score in scores if score.status == "ok" for end in interval_ends(score.interval)]
+    return axis_of([score.value for score in scores] + ends)
+
+
+def interval_ends(interval: Interval | None) -> tuple[float, ...]:
+    """Return both ends of an interval, nothing where it has none."""
+    return (interval.low, interval.high) if interval and is_finite(interval) else ()
+
+
+@dataclass(frozen=True)
+class ScoreRow:
+    """The score of the model or of a baseline, placed on the axes of noise-corrected and raw scores."""
+
+    label: str
+    kind: str
+    """``model``, ``animals`` (animal-to-animal) or ``baseline``."""
+    shape: str
+    score: Score
+    mark: Mark
+    raw_mark: Mark
+
+
+@dataclass(frozen=True)
+class LayerRow:
+    """The score of a layer, placed on the axis."""
+
+    layer: LayerScore
+    mark: Mark
+    kind: str
+    note: str
+    shape: str
+    p: float | None
+    """Corrected for the number of layers; None when the record states none."""
+
+
+def record_charts(record: ResultRecord) -> dict[str, Any]:
+    """Return the charts of a record as the templates draw them: axes, rows, layers, animals and RDMs."""
+    score = record.score
+    named = [(score.name, "model", "dot", score)]
+    named += [("animal-to-animal", "animals", "square", record.animal_to_animal)] if record.animal_to_animal else []
+    named += [(name, "baseline", "diamond", item) for name, item in record.baselines.items()]
+    axis = score_axis(item for *_, item in named)
+    singles = [subject.value for subject in score.subjects] + [layer.value for layer in score.layers]
+    axis = axis_of([axis.low, axis.high, *singles])
+    ceiling = (score.ceiling.lower, score.ceiling.upper) if score.ceiling else ()
+    ceiling = ceiling if all(map(math.isfinite, ceiling)) else ()
+    raw_axis = axis_of([*(item.r for *_, item in named), *ceiling])
+    rows = []
+    for label, kind, shape, item in named:
+        mark = axis.mark(item.value, item.interval, [subject.value for subject in item.subjects])
+        raw_mark = raw_axis.mark(item.r, None, [subject.r for subject in item.subjects])
+        rows.append(ScoreRow(label, kind, shape, item, mark, raw_mark))
+    layers, tests = [], score.provenance.layer_p
+    for layer in score.layers:
+        chosen, best = layer.layer == score.layer, layer.layer == score.best_layer
+        notes = ["chosen on held-out data"] * chosen + ["optimistic maximum, not a result"] * best
+        kind, shape = "chosen" if chosen else "best" if best else "layer", "diamond" if best else "dot"
+        mark = axis.mark(layer.value, layer.interval)
+        layers.append(LayerRow(layer, mark, kind, "; ".join(notes), shape, tests.get(layer.layer)))
+    animals = record.animal_to_animal
+    pairs: list[tuple[str, str, float, float]] = []
+    if 0 < len(score.model_rdm) == len(score.brain_rdm) <= _MOST_PAIRS:
+        values = zip(combinations(score.stimuli, 2), score.model_rdm, score.brain_rdm, strict=True)
+        pairs = [(first, second, model, brain) for (first, second), model, brain in values]
+    return {
+        "axis": axis,
+        "raw_axis": raw_axis,
+        "band": interval_ends(animals.interval) if animals and animals.status == "ok" else (),
+        "ceiling": ceiling,
+        "rows": rows,
+        "layers": layers,
+        "layer_reference": score.value if score.status != "undefined" and score.layers else None,
+        "animals": [(subject, axis.mark(subject.value)) for subject in score.subjects],
+        "model_rdm": rdm_picture(score.model_rdm, score.stimuli),
+        "brain_rdm": rdm_picture(score.brain_rdm, score.stimuli),
+        "pairs": pairs,
+    }
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""What the figures of a leaderboard are drawn with: axes, intervals, scatter plots, ablations, matrices."""
+"""What the figures of a leaderboard are drawn with: charts of rows, scatter plots, matrices, colours."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
-from leaderboards.entries import Entry, twins
+from leaderboards.entries import Entry
 from leaderboards.figures.marks import colour_at
 from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, tick_text
 from leaderboards.text import number, span
@@ -29,8 +29,8 @@ class Figure:
     key: str
     """Short name for links and files."""
     title: str
-    caption: str
-    drawing: Drawing | None
+    caption: str = ""
+    drawing: Drawing | None = None
     lacking: str = ""
     """What the records would have to hold; empty when the figure is drawn."""
 
@@ -135,53 +135,6 @@ def fitted(drawing: Drawing, across: Scale, up: Scale, xs: Sequence[float], ys: 
     return f"Least-squares line with the 95 % band of its mean over {n} models: r = {number(r, 2)}{text}. "
 
 
-def ablation(
-    key: str,
-    title: str,
-    entries: Sequence[Entry],
-    level: Callable[[Entry], str],
-    held: Callable[[Entry], str],
-    what: str,
-) -> Figure:
-    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed, and on the same data."""
-    groups: dict[tuple[str, ...], dict[str, Entry]] = {}
-    for entry in entries:
-        if entry.trained and level(entry) and math.isfinite(entry.value):
-            model = (entry.architecture, entry.card.objective or "", held(entry), entry.card.accuracy_data or "")
-            groups.setdefault(model, {}).setdefault(level(entry), entry)
-    groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
-    if not groups:
-        return Figure(key, title, "", None, f"no model was trained with more than one {what}")
-    twin = twins(entries)
-    rows = [
-        (", ".join(part for part in model[:-1] if part) if i == 0 else "", label, entry)
-        for model, levels in groups.items()
-        for i, (label, entry) in enumerate(sorted(levels.items()))
-    ]
-    scale = score_scale([e.value for *_, e in rows], [e.interval for *_, e in rows], 400, WIDTH - 20)
-    colour = colours(label for _, label, _ in rows)
-    drawing = Drawing(WIDTH, 44 + 20 * len(rows), f"{title}: {len(groups)} models")
-    draw_axis(drawing, scale, 30, drawing.height - 8, "noise-corrected RSA")
-    for index, (name, label, entry) in enumerate(rows):
-        y = 44.0 + 20 * index
-        drawing.text(6, y + 4, cut(name, 50), "title small")
-        drawing.text(392, y + 4, cut(label, 22), "end")
-        draw_interval(drawing, scale, entry.interval, y, colour[label])
-        other = twin.get(entry.architecture)
-        if other is not None and math.isfinite(other.value):
-            drawing.mark(scale.at(other.value), y, "dot", "c0 open", f"untrained twin {number(other.value)}", 3.2)
-        top1 = f", top-1 {number(entry.card.top1)}" if entry.card.top1 is not None else ""
-        drawing.mark(
-            scale.at(entry.value), y, "dot", colour[label], f"{entry.name}, {label}: {number(entry.value)}{top1}"
-        )
-    return Figure(
-        key,
-        title,
-        f"Noise-corrected score with its interval by {what}; hollow grey points are untrained twins.",
-        drawing,
-    )
-
-
 def draw_matrix(
     drawing: Drawing, x0: float, y0: float, side: float, pairs: Sequence[float], labels: Sequence[str]
 ) -> None:
@@ -207,26 +160,81 @@ def score_scale(values: Sequence[float], intervals: Sequence[Interval | None], s
     return Scale(low, high + 0.02, start, end)
 
 
-def draw_axis(drawing: Drawing, scale: Scale, top: float, bottom: float, label: str) -> None:
-    """Draw the ticks of a scale as grid lines, and its label."""
+@dataclass(frozen=True)
+class Point:
+    """A mark at a value of a row's axis; nothing is drawn where the value is NaN."""
+
+    value: float
+    kind: str
+    """Classes, such as ``c1 open``."""
+    tip: str = ""
+    size: float = 4.5
+    shape: str = "dot"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar from the axis' start to a value; ``top`` and ``height`` in pixels from the row's middle."""
+
+    value: float
+    top: float
+    height: float
+    kind: str
+    tip: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a chart: a label, bars, an interval and marks, drawn in this order."""
+
+    label: str
+    points: Sequence[Point]
+    interval: Interval | None = None
+    kind: str = ""
+    """Colour class of the interval."""
+    label_kind: str = "end"
+    group: str | None = None
+    """Heading of the rows that begin here, at the left edge."""
+    bars: Sequence[Bar] = ()
+    drop: float = 0.0
+    """Distance of interval and marks below the row's middle [px]."""
+
+
+def row_chart(
+    title: str,
+    rows: Sequence[Row],
+    scale: Scale,
+    label: str,
+    *,
+    step: float = 19.0,
+    width: float = WIDTH,
+    band: Interval | None = None,
+) -> Drawing:
+    """Draw rows below one another along one axis; ``band`` is an interval shaded over the whole height."""
+    drawing = Drawing(width, 44 + step * len(rows), title)
+    top, bottom = 30, drawing.height - 8
     for tick in scale.ticks:
         drawing.line(scale.at(tick), top, scale.at(tick), bottom, "one" if tick == 1 else "grid")
         drawing.text(scale.at(tick), top - 6, tick_text(tick), "mid quiet")
     drawing.text(scale.end, 11, label, "end quiet small")
-
-
-def draw_band(drawing: Drawing, scale: Scale, interval: Interval | None, top: float, bottom: float) -> None:
-    """Draw an interval as a band over the whole height."""
-    if interval is not None and is_finite(interval):
-        drawing.rect(
-            scale.at(interval.low), top, scale.at(interval.high) - scale.at(interval.low), bottom - top, "band"
-        )
-
-
-def draw_interval(drawing: Drawing, scale: Scale, interval: Interval | None, y: float, kind: str) -> None:
-    """Draw an interval as a line with its ends."""
-    if interval is not None and is_finite(interval):
-        drawing.line(scale.at(interval.low), y, scale.at(interval.high), y, f"span {kind}")
+    if band is not None and is_finite(band):
+        left, right = scale.at(band.low), scale.at(band.high)
+        drawing.rect(left, top, right - left, bottom - top, "band")
+    for index, row in enumerate(rows):
+        y = 44 + step * index
+        if row.group is not None:
+            drawing.text(6, y + 4, row.group, "title small")
+        drawing.text(scale.start - 8, y + 4, row.label, row.label_kind)
+        for bar in row.bars:
+            length = scale.at(bar.value) - scale.start
+            drawing.rect(scale.start, y + bar.top, length, bar.height, bar.kind, tip=bar.tip)
+        y += row.drop
+        if row.interval is not None and is_finite(row.interval):
+            drawing.line(scale.at(row.interval.low), y, scale.at(row.interval.high), y, f"span {row.kind}")
+        for point in row.points:
+            if math.isfinite(point.value):
+                drawing.mark(scale.at(point.value), y, point.shape, point.kind, point.tip, point.size)
+    return drawing
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:

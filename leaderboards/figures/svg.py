@@ -94,6 +94,10 @@ class Drawing:
             f"{f'<style>{style}</style>' if style else ''}{''.join(self.parts)}</svg>"
         )
 
+    def __html__(self) -> str:
+        """Return the element for a template, which escapes nothing in it."""
+        return self.render()
+
 
 def standalone(drawing: Drawing) -> str:
     """Return a drawing as a file of its own, with its colours and a white ground."""

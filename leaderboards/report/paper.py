@@ -15,7 +15,6 @@ from pathlib import Path
 from brainbench.core.errors import DataError, unknown_name
 from brainbench.core.files import write_text
 from brainbench.core.records import ResultRecord
-from leaderboards import provenance
 from leaderboards import text as words
 from leaderboards.entries import Entry, entries_of
 from leaderboards.figures.architecture import diagram
@@ -114,7 +113,7 @@ def write_paper(
 def make_paper(records: Sequence[ResultRecord], title: str) -> Paper:
     """Return the report of records, board by board."""
     boards = rank(records)
-    commands = dict.fromkeys(text for record in records if (text := provenance.command(record.score)))
+    commands = dict.fromkeys(text for record in records if (text := record.score.provenance.command))
     return Paper(
         title,
         any(board.synthetic for board in boards),
@@ -130,8 +129,8 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     if len(board.rows) == 1:
         return words.methods(board.rows[0].record)
     seeds = max(entry.seeds for entry in entries)
-    versions = sorted({version for row in board.rows if (version := provenance.version(row.record.score))})
-    settings = provenance.settings(score)
+    versions = sorted({version for row in board.rows if (version := row.record.score.provenance.version)})
+    settings = score.provenance.settings
     text = (
         f"{words.plural(len(entries), 'model')} ({words.plural(len(board.rows), 'record')}) were compared with "
         f"{board.recordings} ({words.plural(len(score.subjects), 'animal')}, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import subprocess
 import tempfile
@@ -35,29 +36,27 @@ def html_to_pdf(text: str, path: Path) -> None:
 
 
 def _by_browser(browser: str, text: str, path: Path) -> bool:
-    """Print by a browser in a profile of its own; return False if it could not."""
-    with tempfile.TemporaryDirectory() as folder, atomic_path(path) as temporary:
-        page = Path(folder) / "page.html"
+    """Print by a browser in a profile of its own; return False, and leave ``path`` as it is, if it could not."""
+    with tempfile.TemporaryDirectory() as folder:
+        page, printed = Path(folder) / "page.html", Path(folder) / "page.pdf"
         page.write_text(text, encoding="utf-8")
         command = [
-            browser, "--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer", "--no-sandbox",
-            f"--user-data-dir={folder}/profile", f"--print-to-pdf={temporary}", page.as_uri(),
+            browser, "--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer",
+            f"--user-data-dir={folder}/profile", f"--print-to-pdf={printed}", page.as_uri(),
         ]  # fmt: skip
+        if hasattr(os, "geteuid") and os.geteuid() == 0:  # Chromium refuses its sandbox to root
+            command.insert(1, "--no-sandbox")
         try:
             done = subprocess.run(command, capture_output=True, timeout=180, check=False)
+            trouble = f"status {done.returncode}"
         except (OSError, subprocess.TimeoutExpired) as error:
-            _log.warning("%s could not print the report (%s); trying WeasyPrint", browser, error)
-            return _failed(temporary)
-        if done.returncode or not temporary.read_bytes().startswith(b"%PDF"):
-            _log.warning("%s could not print the report (status %d); trying WeasyPrint", browser, done.returncode)
-            return _failed(temporary)
-        return True
-
-
-def _failed(temporary: Path) -> bool:
-    temporary.unlink(missing_ok=True)
-    temporary.touch()
-    return False
+            trouble = str(error)
+        if printed.is_file() and printed.read_bytes().startswith(b"%PDF") and trouble == "status 0":
+            with atomic_path(path) as temporary:
+                shutil.copyfile(printed, temporary)
+            return True
+        _log.warning("%s could not print the report (%s); trying WeasyPrint", browser, trouble)
+        return False
 
 
 def _nothing(url: str, *_: object, **__: object) -> dict[str, object]:

@@ -1,8 +1,7 @@
-"""What a page offers for download, embedded as ``data:`` links so that it works without a network."""
+"""The table and the records that a site offers for download."""
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 import math
@@ -25,12 +24,6 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def link(content: str | bytes, kind: str) -> str:
-    """Return a ``data:`` address of ``content``; base64, so nothing in it can be read as markup."""
-    data = content.encode() if isinstance(content, str) else content
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
 def boards_table(boards: Iterable[Board]) -> list[dict[str, Any]]:
     """Return every row of every board, baselines included; absent values are None."""
     rows = []
@@ -48,22 +41,22 @@ def boards_table(boards: Iterable[Board]) -> list[dict[str, Any]]:
             card = row.record.card
             described = {name: getattr(card, name) for name in _COLUMNS if card and hasattr(card, name)}
             values = common | described | _score_values(row.record.score, row.record.score.name)
-            values |= {"row": "model", "rank_first": row.first, "rank_last": row.last, "identity": row.identity}
+            values |= {"row": "model", "rank_first": row.first, "rank_last": row.last, "identity": row.record.identity}
             rows.append(values)
         rows += [common | _score_values(item.score, item.name) | {"row": "baseline"} for item in board.baselines]
     return [{name: _known(row.get(name)) for name in _COLUMNS} for row in rows]
 
 
-def boards_csv(boards: Iterable[Board]) -> str:
+def table_csv(table: list[dict[str, Any]]) -> str:
     """Return :func:`boards_table` as CSV with one header line."""
     stream = io.StringIO()
     writer: csv.DictWriter[str] = csv.DictWriter(stream, _COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: _cell(value) for name, value in row.items()} for row in boards_table(boards))
+    writer.writerows({name: _cell(value) for name, value in row.items()} for row in table)
     return stream.getvalue()
 
 
-def boards_parquet(table: list[dict[str, Any]], path: Path) -> bool:
+def table_parquet(table: list[dict[str, Any]], path: Path) -> bool:
     """Write :func:`boards_table` as Parquet; return False where ``pyarrow`` is not installed."""
     try:
         import pyarrow as pa
@@ -87,8 +80,8 @@ def records_zip(boards: Iterable[Board]) -> bytes:
     """
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        for row in sorted((row for board in boards for row in board.rows), key=lambda row: row.file_name):
-            entry = zipfile.ZipInfo(row.file_name)  # its fixed date of 1980 keeps the bytes equal
+        for row in sorted((row for board in boards for row in board.rows), key=lambda row: row.record.file_name):
+            entry = zipfile.ZipInfo(row.record.file_name)  # its fixed date of 1980 keeps the bytes equal
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, row.record.to_json() + "\n")
     return stream.getvalue()

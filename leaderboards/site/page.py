@@ -16,8 +16,6 @@ from leaderboards.figures import marks
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-    from leaderboards.figures.svg import Drawing
-
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 
 
@@ -37,13 +35,6 @@ def render(template: str, **values: Any) -> str:
     )
     page = _environment().get_template(template)
     return page.render(**values, policy=policy, style=Markup(style), script=Markup(script))
-
-
-def drawn(drawing: Drawing | None) -> Any:
-    """Return a drawing as markup for a template, None for none."""
-    from markupsafe import Markup
-
-    return None if drawing is None else Markup(drawing.render())
 
 
 def script_json(value: Any) -> Any:

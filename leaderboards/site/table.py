@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from brainbench.core.statistics import is_finite
-from leaderboards import provenance
 from leaderboards.entries import Entry
 from leaderboards.figures.marks import score_axis
 from leaderboards.ranking import Baseline, Board, RankedRecord
@@ -122,7 +121,7 @@ def _model_row(entry: Entry) -> dict[str, Any]:
         "seed": card.seed,
         "seeds": entry.seeds,
         "animals": len(score.subjects) or None,
-        "version": provenance.version(score) or None,
+        "version": score.provenance.version or None,
         "runs": runs,
     }
 

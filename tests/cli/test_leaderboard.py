@@ -11,7 +11,7 @@ import pytest
 from brainbench.cli.leaderboard.scoring import find_models, parse_seeds, read_batch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import ResultRecord
-from leaderboards.store import read_record, record_name
+from leaderboards.store import read_record
 
 PARTS = ("--conditions", "trials:texture")
 
@@ -52,7 +52,7 @@ def _forge(path: Path) -> Path:
     """Raise the value and give the file the name that fits it, as a careful cheat would."""
     data = json.loads(path.read_text())
     data["score"]["value"] += 0.2
-    forged = path.parent / "forged" / record_name(ResultRecord.from_json(data))
+    forged = path.parent / "forged" / ResultRecord.from_json(data).file_name
     forged.parent.mkdir(exist_ok=True)
     forged.write_text(json.dumps(data))
     assert read_record(forged)

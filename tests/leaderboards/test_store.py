@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.records import ResultRecord, Score, record_identity
-from leaderboards.store import read_record, read_records, record_name, write_record
+from leaderboards.store import read_record, read_records, write_record
 
 
 def test_a_record_comes_back_as_it_was_written(make_record, tmp_path):
@@ -57,7 +57,7 @@ def test_writing_twice_keeps_the_first_file(make_record, tmp_path):
 
 def test_a_damaged_file_is_replaced_on_writing(make_record, tmp_path):
     record = make_record()
-    path = tmp_path / record_name(record)
+    path = tmp_path / record.file_name
     path.write_text("{ truncated")
     assert read_record(write_record(record, tmp_path)) == record
 
@@ -65,7 +65,7 @@ def test_a_damaged_file_is_replaced_on_writing(make_record, tmp_path):
 @settings(max_examples=60, deadline=None)
 @given(name=st.text())
 def test_any_name_gives_a_plain_file_name(name):
-    file_name = record_name(ResultRecord(Score(name, 0.5, "ok")))
+    file_name = ResultRecord(Score(name, 0.5, "ok")).file_name
     assert Path(file_name).name == file_name
     assert file_name.isascii()
     assert len(file_name) < 120
@@ -176,13 +176,13 @@ def test_concurrent_writers_lose_nothing(make_record, tmp_path):
     for writer in writers:
         writer.join(60)
     assert [writer.exitcode for writer in writers] == [0] * 4
-    assert sorted(item.name for item in tmp_path.iterdir()) == sorted(map(record_name, records))
+    assert sorted(item.name for item in tmp_path.iterdir()) == sorted(record.file_name for record in records)
     assert all(item.problem is None for item in read_records(tmp_path))
 
 
-@pytest.mark.parametrize("module", ["store", "ranking"])
+@pytest.mark.parametrize("module", ["leaderboards.ranking", "brainbench.core.records"])
 def test_the_examples_in_the_docstrings_hold(module):
-    result = doctest.testmod(importlib.import_module(f"leaderboards.{module}"))
+    result = doctest.testmod(importlib.import_module(module))
     assert result.attempted > 0
     assert result.failed == 0
 

@@ -9,6 +9,7 @@ import numpy as np
 from brainbench.core.records import Interval, SubjectScore
 from leaderboards import build_leaderboard
 from leaderboards import text as _words
+from leaderboards.ranking import comparisons
 from tests.factories.html_page import Page
 
 
@@ -98,7 +99,7 @@ def test_five_animals_tell_apart_what_overlapping_intervals_do_not(make_record):
         baselines={"raw input": _on(raw, brain), "random features": _on(random, mine[:4])},
     )
     interval = ttest_rel(mine, brain).confidence_interval(0.95)
-    above, overlap, *_ = _words.comparisons(record)
+    above, overlap, *_ = comparisons(record)
     assert above == (
         f"Above raw input (0.223): difference {np.mean(np.subtract(mine, brain)):.3f} "
         f"[{interval.low:.3f}, {interval.high:.3f}], paired over 5 animals."

@@ -25,7 +25,7 @@ def build(
     as_json: JsonOption = False,
 ) -> None:
     """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
-    from leaderboards.site.site import build_leaderboard
+    from leaderboards.site.build import build_leaderboard
     from leaderboards.store import read_records
 
     sources = records or [RECORDS]
@@ -72,8 +72,8 @@ def serve(
     as_json: JsonOption = False,
 ) -> None:
     """Serve a leaderboard for local reading, without writing anything; stop it with Ctrl-C."""
+    from leaderboards.site.build import build_leaderboard
     from leaderboards.site.serve import LOOPBACK, make_server
-    from leaderboards.site.site import build_leaderboard
     from leaderboards.store import read_records
 
     _require(source)

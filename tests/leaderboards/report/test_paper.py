@@ -92,6 +92,21 @@ def test_weasyprint_makes_a_pdf_where_there_is_no_browser(make_record, tmp_path,
     assert write_paper([make_record()], tmp_path / "a.pdf")[0].read_bytes().startswith(b"%PDF")
 
 
+def test_a_browser_that_fails_leaves_no_file_and_an_earlier_report_as_it_is(make_record, tmp_path, monkeypatch):
+    browser = tmp_path / "browser"
+    browser.write_text("#!/bin/sh\nexit 3\n")
+    browser.chmod(0o755)
+    monkeypatch.setattr(pdf.shutil, "which", lambda name: str(browser))
+    monkeypatch.setitem(__import__("sys").modules, "weasyprint", None)
+    earlier = tmp_path / "earlier.pdf"
+    earlier.write_bytes(b"%PDF earlier")
+    for path in (tmp_path / "a.pdf", earlier):
+        with pytest.raises(MissingDependencyError):
+            write_paper([make_record()], path)
+    assert not (tmp_path / "a.pdf").exists()
+    assert earlier.read_bytes() == b"%PDF earlier"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("chromium"), reason="needs the chromium browser")
 def test_chromium_prints_a_pdf_with_vector_figures(make_record, tmp_path):
