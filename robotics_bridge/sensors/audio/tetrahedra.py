@@ -48,6 +48,8 @@ def cylinder(radius: float, half_length: float, cells: int) -> Any:
 
 def _rounded(p: NDArray[np.float64], core: float) -> NDArray[np.float64]:
     """Push the shells of a cube [-1, 1] out to spheres; near the middle it stays a cube, shrunk by ``core``."""
+    # A shell of the cube, max |x| = const, becomes a sphere. Blending by the squared distance keeps the middle a cube,
+    # where tetrahedra on spheres would be flat.
     longest, far = np.abs(p).max(axis=0), np.linalg.norm(p, axis=0)
     sphere = np.where(far > 0, longest / np.maximum(far, 1e-12), 1.0)
     share = longest**2
@@ -96,6 +98,7 @@ def _untangled(mesh: Any, target: NDArray[np.float64]) -> NDArray[np.float64]:
     start, moved = mesh.p, target.copy()
     rest = volumes(start, mesh.t)
     for _ in range(20):
+        # Halving the way back converges to the start, where every volume is sound.
         bad = volumes(moved, mesh.t) * np.sign(rest) < SMALLEST * np.abs(rest)
         if not bad.any():
             return moved

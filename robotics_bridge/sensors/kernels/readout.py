@@ -115,6 +115,7 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
                 lag = io.hysteresis[channel, env, n]
             if wp.static(walk):
                 drift = io.walk[channel, env, n]
+        # Hysteresis, drift, white noise, bias, quantisation and dead probes (4.22, 4.25–4.27), in this order.
         y = apply_noise(knobs, signal, env + io.env_offset, probe, channel, age, episode, io.dt, lag, drift)
         if wp.static(hysteresis):
             io.hysteresis[channel, env, n] = y[1]
@@ -183,6 +184,7 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
             if wp.static(hysteresis):
                 if knobs.hysteresis != 0.0:
                     fading = decay(io.dt / knobs.tau)
+            # Channels go in pairs because one Philox call gives the four normal numbers that two of them need.
             for pair in range(wp.static((channels + 1) // 2)):
                 z = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
                 for odd in range(2):
@@ -221,6 +223,7 @@ def append_history(
     """
     env, n = wp.tid()
     length = ring.shape[0] // 2
+    # Each value is written at two places one window apart: any window of T updates is then one contiguous slice.
     at = count[0] % length
     for channel in range(value.shape[0]):
         if age[env] == 0:

@@ -112,6 +112,7 @@ class NoiseStage:
         signal = x
         if self._mixes:
             first, second = self._buffers
+            # Rows into one buffer, columns into the other: threads read neighbours, so no pass writes what it reads.
             for along, source, target in ((1, x, first), (0, first, second)):
                 context.launch(crosstalk, target.shape, along, x, source, own.part, own.probe, *self._crosstalk, target)
             signal = second
@@ -154,6 +155,7 @@ class DelayLine:
         own, context = self._arrays, self._arrays.context
         if own.total == 0 or context.num_envs == 0:
             return
+        # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
         slots = math.ceil(self._longest / dt - 1e-4) + 1
         if self._ring is None:
             self._ring = own.zeros(True, (slots,))
