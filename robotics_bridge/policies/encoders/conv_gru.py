@@ -37,6 +37,8 @@ class ConvGRUProducts(nn.Module):
     def __init__(self, rows: int, columns: int, kernel: int) -> None:
         super().__init__()
         cells = torch.arange(rows * columns)
+        # Offset from cell q to cell p as a place of the kernel; places outside belong to no product, which pads with
+        # zeros.
         down = cells[:, None] // columns - cells[None, :] // columns + kernel // 2
         right = cells[:, None] % columns - cells[None, :] % columns + kernel // 2
         inside = (down >= 0) & (down < kernel) & (right >= 0) & (right < kernel)

@@ -141,6 +141,7 @@ def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArr
     wrench = _WRENCHES[observe](points, normals)
     part = np.zeros((SITES, 6, len(points), wrench.shape[2]))
     for index, (row, column) in enumerate(zip(rows, columns, strict=True)):
+        # F = R f and M = R m + (x₀ − x_site) × F: the wrench about the link's origin moved to the middle of its site.
         force = turn @ wrench[index, :3]
         lever = origin - axes.centers[row, column]
         moment = turn @ wrench[index, 3:] + _cross(lever) @ force

@@ -228,6 +228,7 @@ def _too_fast(task: _Task, shortest: float) -> tuple[float, float]:
     spans = np.diff(task.times)
     share = np.divide(shortest, spans, out=np.zeros_like(spans), where=spans > 0)
     for obstacle in task.reach.obstacles:
+        # Ways between knots, scaled to the shortest step that a retry may take.
         travel = step_travel(task.job.whisker, task.position, task.euler, obstacle, task.times) * share
         if (travel > WIDEST / MILLI).any():
             first = int(np.argmax(travel > WIDEST / MILLI))

@@ -236,6 +236,8 @@ class SweepLauncher:
         speed, height, distance, size = (
             np.array([getattr(sweep, name) for sweep in sweeps]) for name in ("speed", "height", "distance", "size")
         )
+        # Objects are scaled to a diagonal and then shifted by how far the turned outline reaches, so that distances
+        # count from the surface.
         scale = size / diagonal
         reach = low[which] * (scale / MILLI)[:, None]
         side = grid.start - reach[:, 1] if grid.placing == "clear" else grid.start + reach[:, 1]
