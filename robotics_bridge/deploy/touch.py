@@ -108,6 +108,7 @@ class RealTouch:
         if self.measured:
             items, rows = (list(part) for part in zip(*self.measured, strict=True))
             if self.observe == "agg_bool":
+                # agg_bool of a real hand: |f| > η_real (4.31).
                 touching = np.linalg.norm(reading.pressure, axis=1) > self.calibration.threshold
                 group[:, items, 0] = touching[rows]
             else:

@@ -74,6 +74,8 @@ class Geometry:
     def reach(self, directions: ArrayLike) -> NDArray[np.float64]:
         """Return the support function: how far the solid reaches along unit directions [..., 3] of its frame (m)."""
         d, size = np.asarray(directions, dtype=float), self.size
+        # Support function h(d) = max x · d of each solid, in closed form; that of a sum of bodies is the sum of theirs,
+        # as for a capsule (segment and ball) or a cylinder (segment and disc).
         upright = np.abs(d[..., 2])
         if self.mesh is not None:
             return (d @ self.mesh.vertices.T).max(axis=-1)

@@ -105,6 +105,7 @@ class Modes:
         """Return the modes of a body ``size`` times as large of the same material (decays unchanged)."""
         if not size > 0:
             raise UsageError(f"A body is scaled by a positive factor; received {size!r}.")
+        # Frequencies go with 1 / size, gains with 1 / mass, hence with 1 / size³.
         gain = tuple(value / size**3 for value in self.gain)
         return replace(self, frequency=tuple(value / size for value in self.frequency), gain=gain)
 

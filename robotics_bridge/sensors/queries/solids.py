@@ -32,12 +32,14 @@ def bounding_sphere(geometry: Geometry) -> NDArray[np.float32]:
     elif geometry.kind == "capsule":
         radius = size[0] + size[1]
     elif geometry.kind == "cylinder":
+        # Distance of the rim from the middle.
         radius = float(np.hypot(size[0], size[1]))
     elif geometry.kind == "ellipsoid":
         radius = max(size)
     elif geometry.kind == "box":
         radius = float(np.linalg.norm(size[:3]))
     elif geometry.mesh is not None:
+        # Middle of the box, not the mean of the vertices, which are dense where the surface is curved.
         center = geometry.mesh.bounds.mean(axis=0)
         radius = float(np.linalg.norm(geometry.mesh.vertices - center, axis=1).max())
     return np.array([*center, radius], dtype=np.float32)
@@ -165,5 +167,6 @@ class Solids:
                 self._trees[key] = mesh_tree(surface, self.device)
             mesh = self._trees[key].id
         size, (w, x, y, z) = [*geometry.size, 0.0, 0.0, 0.0][:3], geometry.quaternion
+        # Ours are (w, x, y, z), Warp's (x, y, z, w).
         frame = (*geometry.position, x, y, z, w)
         return KINDS.index(geometry.kind), size, bounding_sphere(geometry), frame, number, mesh

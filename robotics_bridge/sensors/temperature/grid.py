@@ -155,5 +155,6 @@ def _runtime_of(suite: SensorSuite, name: str) -> TemperatureRuntime:
 def _bounds(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the box around a geometry in the link's frame (m)."""
     # Row i of the rotation is the link's axis i in the frame of the geometry.
+    # The box along the link's axes from the support function of the solid, which is exact for turned ones too.
     axes, place = to_matrices(geometry.quaternion), np.array(geometry.position)
     return place - geometry.reach(-axes), place + geometry.reach(axes)

@@ -208,6 +208,7 @@ class BulletWorld:
     def _link(self, link: int) -> int:
         """Add the collision shape of a link, less its margin: the slim cone inside a tapered link, or a capsule."""
         core, length = self._cores[link], self.chain.lengths[link] * MILLI
+        # A capsule keeps its own radius; a cone is built without the thickness that its margin adds.
         if core == 0:
             return self._capsule(np.zeros(3), np.array([length, 0, 0]), self.chain.radii[link] * MILLI)
         radii = self.chain.whisker.radius(self.chain.nodes[link : link + 2])
@@ -271,5 +272,6 @@ def _turn_from_z(axis: NDArray[np.float64]) -> tuple[float, float, float, float]
     x, y, z = axis
     if z < -1 + 1e-12:
         return 1.0, 0.0, 0.0, 0.0
+    # (cos ½θ, sin ½θ · z × axis / |z × axis|) by half-angle formulas; the opposite direction has no unique turn.
     half = np.sqrt((1 + z) / 2)
     return -y / (2 * half), x / (2 * half), 0.0, half

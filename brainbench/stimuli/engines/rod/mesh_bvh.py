@@ -34,6 +34,8 @@ def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
     while run > WIDE:
         here = middles[order]
         begins = np.arange(0, count, run)
+        # All runs of one level at once: boxes by reduceat, then one sort whose keys hold the run and the place along
+        # its side.
         low, high = np.minimum.reduceat(here, begins), np.maximum.reduceat(here, begins)
         axis = np.argmax(high - low, axis=1)
         which = np.arange(count) // run
@@ -54,6 +56,7 @@ def tree_boxes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     levels = []
     while not levels or len(low) > WIDE:
         begins = np.arange(0, len(low), WIDE)
+        # Parents from the boxes of their children, level by level.
         low, high = np.minimum.reduceat(low, begins), np.maximum.reduceat(high, begins)
         levels.append(np.stack([low, high], axis=1))
     return np.concatenate(levels)
