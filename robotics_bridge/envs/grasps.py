@@ -99,6 +99,8 @@ def sample(
     for _ in range(settings.tries):
         if len(found["joints"]) == count:
             break
+        # Candidates by rejection: random joints, places and turns about the reference, of which only those that hold
+        # are kept.
         joints = np.clip(
             model.rest + rng.uniform(-settings.perturb, settings.perturb, len(model.rest)), model.low, model.high
         )
@@ -181,6 +183,7 @@ class _Trial:
 
     def _step(self, target: NDArray[np.float64]) -> None:
         d, model = self._d, self._model
+        # The same law as the environment's actuators, without their imperfections.
         torque = model.stiffness * (target - d.qpos[self._joints]) - model.damping * d.qvel[self._speeds]
         d.ctrl[self._drive] = np.clip(torque, -model.effort, model.effort)
         self._mujoco.mj_step(self._m, d)

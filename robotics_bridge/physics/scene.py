@@ -193,6 +193,7 @@ class TouchScene:
         found: set[int] = set()
         for own in self.geometries_of(link):
             kind, affinity = self._bits[own]
+            # MuJoCo's rule: two geometries collide if the type of either is among the affinities of the other.
             meets = ((self._bits[:, 0] & affinity) | (self._bits[:, 1] & kind)) != 0
             found |= set(np.flatnonzero(meets & free).tolist())
             found |= {low + high - own for low, high in self.included if own in (low, high)}

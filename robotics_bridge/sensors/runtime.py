@@ -223,6 +223,7 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
     most = _SHARED
     if cuda:
         limit, fill = _SHARED_CUDA[mode]
+        # Enough threads must be left to fill the GPU; only beyond that do probes share one.
         most = min(limit, max(1, total // (fill * context.device.sm_count)))
     rows = []
     for number, part in enumerate(slices):

@@ -108,6 +108,8 @@ class TaxelGrid(nn.Module):
                 f"The grid reads [batch, sub-step, {self.items} items, {self.channels} channels] of "
                 f"{self.observe!r}; received {list(taxels.shape)}."
             )
+        # One product for all sites, channels and sub-steps; the transpose puts channels before sites, as encoders read
+        # them.
         sites = nn.functional.linear(taxels.flatten(2), self.matrix)
         grid = sites.unflatten(2, (SITES, len(CHANNELS))).transpose(2, 3)
         return grid.reshape(taxels.shape[0], -1, *GRID_SHAPE)

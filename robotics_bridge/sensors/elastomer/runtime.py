@@ -229,7 +229,7 @@ def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any
 
     rows, columns = sensor.probes.shape
     pitch = sensor.probes.pitch or (1.0, 1.0)
-    # Kernels of 4.19 over all offsets between two markers, with the layer's return flow (1 − c λ_d r²).
+    # Kernels of 4.19 over all offsets between two markers, with the layer's factor 1 − κ λ_d r² on the tangential ones.
     y = torch.arange(1 - rows, rows, device=device)[:, None] * pitch[0]
     x = torch.arange(1 - columns, columns, device=device)[None, :] * pitch[1]
     reach = sensor.dilate_spread * (x**2 + y**2)

@@ -111,6 +111,8 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
         lag = float(0.0)
         drift = float(0.0)
         if age > 0:
+            # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to
+            # clear.
             if wp.static(hysteresis):
                 lag = io.hysteresis[channel, env, n]
             if wp.static(walk):
@@ -186,6 +188,7 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
                     fading = decay(io.dt / knobs.tau)
             # Channels go in pairs because one Philox call gives the four normal numbers that two of them need.
             for pair in range(wp.static((channels + 1) // 2)):
+                # z holds (white, walk) of the even channel, then of the odd one.
                 z = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
                 for odd in range(2):
                     channel = 2 * pair + odd

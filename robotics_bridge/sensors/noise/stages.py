@@ -90,6 +90,7 @@ class NoiseStage:
                     f"Sensor {part.name!r} has crosstalk but its {part.count} probes form no grid; "
                     "give it a layout (ny, nx) or set crosstalk to 0."
                 )
+        # One array for all sensors: shorter kernels are padded with zeros.
         half = max(math.ceil(4 * part.noise.crosstalk_sigma) for part in mixed.values())
         weights = np.zeros((len(slices), half + 1), np.float32)
         shape, strength = np.ones((len(slices), 2), np.int32), np.zeros(len(slices), np.float32)
@@ -170,6 +171,7 @@ class DelayLine:
 
 def gaussian_weights(sigma: float, half: int) -> NDArray[np.float64]:
     """Return the centre and one side of a normalised Gaussian [half + 1], cut at four standard deviations."""
+    # Sums to one over both sides, so that crosstalk moves a signal without making it stronger (4.28).
     weights = np.exp(-0.5 * (np.arange(half + 1) / sigma) ** 2)
     weights[np.arange(half + 1) > 4 * sigma] = 0
     return weights / (weights[0] + 2 * weights[1:].sum())

@@ -178,6 +178,7 @@ class BulletWorld:
             axes += [(0, 1, 0), (0, 0, 1)]
             if i:
                 places[first] = (chain.lengths[i - 1] * MILLI, 0.0, 0.0)
+            # Rest bend about z as a fixed turn before the two hinges, of which only the second carries mass.
             turns[first] = (0.0, 0.0, np.sin(chain.rest_angles[i] / 2), np.cos(chain.rest_angles[i] / 2))
             centres[second] = (chain.centres[i] * MILLI, 0.0, 0.0)
             masses[second] = chain.masses[i] * MICRO

@@ -352,8 +352,8 @@ def marker_kernel(
                                 square = gel.spread * wp.dot(away, away)
                                 w = wp.exp(-square)
                                 if wp.static(layered):
-                                    # Layer term: material pushed outwards near an indenter returns farther off (1 − c
-                                    # λ_d r²).
+                                    # Layer term 1 − κ λ_d r² (recoil κ): what is pushed outwards near an indenter is
+                                    # drawn in farther off.
                                     away = (1.0 - gel.recoil * square) * away
                                 bulge = pads.height[wp.static(planes) + plane, env, gel.start + source]
                                 u += gel.dilate * w * (h * away + bulge * normal)

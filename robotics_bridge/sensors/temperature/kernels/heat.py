@@ -275,8 +275,8 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
         total = wp.float64(g + loss)
         power = wp.float64(inflow) - wp.float64(g) * start + wp.float64(heat.source[n])
         power = power + wp.float64(loss) * (wp.float64(grid.ambient) - start)
-        # Exact solution of C dT/dt = P − G (T − T₀) over the step with constant G: large steps end at the balance and
-        # do not overshoot, as 4.36 and 4.39 by forward Euler do.
+        # Exact solution of C dT/dt = P − G (T − T₀) over the step with constant G: a large step ends at the balance,
+        # which forward Euler (4.36, 4.39) overshoots.
         t = start + power * step * mean_decay(total * step)
     out[env, n] = t
 
