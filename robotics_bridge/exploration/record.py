@@ -276,5 +276,6 @@ class _World:
 
     def _held(self, pose: Pose, item: Explored) -> NDArray[np.float64]:
         height = pose.z + item.retreat + self._bottoms[id(item)]
+        # Yaw about the world's vertical, applied after the orientation in which the object is held.
         turned = from_matrices(to_matrices(from_rpy((0.0, 0.0, pose.yaw))) @ to_matrices(item.quaternion))
         return np.concatenate([[self._place[0] + pose.x, self._place[1] + pose.y, height], turned])

@@ -116,6 +116,7 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
             distance = mujoco.mju_rayGeom(
                 model.geom_pos[geom], matrix, model.geom_size[geom], origin, direction, kind, normal
             )
+        # A ray that misses has the distance −1.
         if distance >= 0 and (best is None or distance < best[0]):
             best = (distance, normal)
     return best

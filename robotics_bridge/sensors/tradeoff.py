@@ -119,6 +119,8 @@ def _places(height: float) -> NDArray[np.float64]:
 
 
 def _error(read: NDArray, exact: NDArray) -> float:
+    # Relative RMSE over all taxels and places together: places without contact would have no relative error of their
+    # own.
     return float(np.sqrt(((read - exact) ** 2).sum() / (exact**2).sum()))
 
 

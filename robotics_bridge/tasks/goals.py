@@ -94,6 +94,8 @@ class SteppingRotation(Goal):
         # A turn about a world axis multiplies from the left. The step starts from the last goal, not from the object,
         # so that errors of reached goals do not add up.
         turn = about(constant(self.axis or (0.0, 0.0, 1.0), quat), constant(self.step, quat))
+        # Quaternions are not normalised here: a product of unit ones stays one to rounding over the few goals of an
+        # episode.
         return multiply(turn.expand_as(goal), goal)
 
 

@@ -188,6 +188,8 @@ def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
         site = np.floor(columns * (np.cumsum(counts) - counts / 2) / counts.sum()).astype(int)
         for column in range(1, columns):
             before, after = values[site < column], values[site >= column]
+            # The edge lies half way between the last taxel before it and the first behind, so that rounding parts no
+            # taxels.
             low = before.max() if len(before) else values.min()
             high = after.min() if len(after) else np.inf
             axes.edges[row, column - 1] = _SAME * (low + high) / 2 if len(before) else 0.0

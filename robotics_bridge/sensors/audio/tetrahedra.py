@@ -74,6 +74,8 @@ def voxels(surface: Mesh, cells: int) -> Any:
     middle = (low + high) / 2
     axes = [middle[a] + edge * (np.arange(n + 1) - n / 2) for a, n in enumerate(counts)]
     grid = skfem().MeshTet.init_tensor(*axes)
+    # All six tetrahedra of a voxel are kept or dropped together, by the winding number at its middle: the skin stays
+    # closed.
     centers = grid.p[:, grid.t].mean(axis=1).T
     cell = np.floor((centers - [axis[0] for axis in axes]) / edge).astype(int)
     place = np.array([axis[0] for axis in axes]) + (cell + 0.5) * edge

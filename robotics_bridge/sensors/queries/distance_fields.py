@@ -51,6 +51,7 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
     # A margin of a quarter of the box on each side, so that most probes in reach fall within the samples.
     spacing = float((high - low).max()) / resolution
     counts = np.ceil((high - low) / spacing).astype(int) + 1 + 2 * max(4, -(-resolution // 4))
+    # Samples lie symmetrically about the middle of the box, so that a symmetric mesh has a symmetric field.
     origin = (0.5 * (low + high) - 0.5 * spacing * (counts - 1)).astype(np.float32)
     path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npy"
     if path.is_file():

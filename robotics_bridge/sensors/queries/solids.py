@@ -59,6 +59,7 @@ def tessellate(geometry: Geometry) -> Mesh:
     elif geometry.kind == "sphere":
         solid = trimesh.creation.icosphere(4, size[0])
     elif geometry.kind == "ellipsoid":
+        # Subdivided on the unit ball and then stretched: triangles stay spread over the whole surface.
         solid = trimesh.creation.icosphere(4, 1.0)
         solid.apply_scale(size)
     elif geometry.kind == "cylinder":
@@ -94,6 +95,7 @@ class Solids:
         self.scene, self.device = scene, device
         self.rows = num_envs if scene.variants else 1
         count = max(len(scene.geometries), 1)
+        # One row serves all environments unless shapes differ: kernels take row env % rows.
         shape = (self.rows, count)
         self.kinds = np.full(shape, OTHER, dtype=np.int32)
         size, bound = np.ones((*shape, 3), np.float32), np.zeros((*shape, 4), np.float32)

@@ -53,6 +53,7 @@ def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows
         areas = {g: surface_area(shape) for g, shape in shapes.items()}
         whole = sum(areas.values()) or 1.0
         for g, shape in shapes.items():
+            # The same density of points on all geometries; without a point, a small one could not be felt at all.
             share = max(1, round(points * areas[g] / whole))
             key = (id(shape), share)
             if key not in sampled:

@@ -130,6 +130,7 @@ class BulletWorld:
         Only pairs nearer than ``margin`` (mm) are found; negative distances are overlaps. Bullet measures from the
         cores of the links; what surrounds a core is everywhere as thick, so it only shifts distance and point.
         """
+        # Bullet searches between cores, so the margin is added to the distance that is searched.
         margin += float(self._margins.max())
         for number, bodies in enumerate(self.parts):
             for body, part in zip(bodies, self.obstacles[number].parts, strict=True):
@@ -137,6 +138,8 @@ class BulletWorld:
                 found = self.bullet.getClosestPoints(self.whisker, body, distance=margin, physicsClientId=self.client)
                 for point in found:
                     link, normal = (point[3] - FOLLICLE) // 2, np.array(point[7])
+                    # Closest points of the cores, moved by the margin along the normal, are those of the thickened
+                    # links.
                     around = float(self._margins[link])
                     yield link, number, np.array(point[5]) - around * normal, normal, point[8] + extra - around
 

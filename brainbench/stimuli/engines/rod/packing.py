@@ -155,6 +155,7 @@ def _spin(before: NDArray, after: NDArray) -> NDArray[np.float64]:
 
 def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Choose signs so that neighbours never jump to the antipode."""
+    # q and −q are the same rotation, but a cubic from one to the other would turn all the way round or vanish.
     flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0, -1.0, 1.0))
     return quaternion * np.concatenate([[1.0], flips])[:, None]
 

@@ -230,6 +230,7 @@ class SweepLauncher:
         turns = np.array([self._turn(rotation) for rotation in rotations])
         # Turned about z: how far it then reaches along x and y.
         x, y = surface.outline.T
+        # The lowest corner of the outline's convex hull is that of the whole surface.
         low = np.stack([(turns[:, k, 0, None] * x + turns[:, k, 1, None] * y).min(axis=1) for k in (0, 1)], axis=1)
         quaternion = from_matrices(head.T @ turns)
         which = np.searchsorted(rotations, [sweep.rotation for sweep in sweeps])
