@@ -280,7 +280,7 @@ def _differs(first: Geometry, second: Geometry) -> bool:
 
 
 def _never(model: Any) -> frozenset[tuple[int, int]]:
-    """Pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
+    """Return the pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
     mujoco = mujoco_module()
 
     pairs = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in model.exclude_signature}

@@ -104,11 +104,11 @@ class TemperatureGrid(Sensor):
         material(self.material)
 
     def layout(self) -> tuple[int, ...]:
-        """Shape (nx, ny, nz) of the reading of one environment."""
+        """Return the shape (nx, ny, nz) of the reading of one environment."""
         return tuple(int(n) for n in self.cells)
 
     def group(self) -> Hashable:
-        """Grids that think alike of other links share one runtime."""
+        """Return what is known of other links: grids for which it is the same share one runtime."""
         return (tuple(sorted(self.bodies.items(), key=lambda item: item[0])), self.other)
 
     def corners(self, scene: TouchScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

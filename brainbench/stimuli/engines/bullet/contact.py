@@ -21,7 +21,7 @@ TOLERANCE = 1e-9
 
 
 def contact_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows [3, 3]: the unit ``normal`` and two tangents that complete a right-handed frame.
+    """Return rows [3, 3]: the unit ``normal`` and two tangents that complete a right-handed frame.
 
     After Duff et al. (2017), Building an orthonormal basis, revisited.
     """
@@ -33,7 +33,7 @@ def contact_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix [3, 3] that, applied to u, gives u × ``vector``."""
+    """Return the matrix [3, 3] that, applied to u, gives u × ``vector``."""
     x, y, z = vector.tolist()
     return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
 
@@ -143,7 +143,7 @@ def _finish(yielding: NDArray, free: NDArray, friction: NDArray, start: NDArray)
 
 
 def hold_or_slide(yielding: NDArray[np.float64], slip: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """Tangential force [2] of at most ``most`` that stops the slip, or that opposes what slip remains.
+    """Return the tangential force [2] of at most ``most`` that stops the slip, or that opposes what slip remains.
 
     It minimises ½ f·Y f + s·f over the disc of radius ``most``, Y [2, 2] being the ``yielding`` and s [2] the
     ``slip`` without force. A whisker yields a thousand times less along itself than across, so both

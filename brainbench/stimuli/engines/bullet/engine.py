@@ -227,7 +227,7 @@ class _Run:
         return too_strong(strength, strongest) if strength > strongest else ""
 
     def _loads(self, n: int, q: list[float]) -> NDArray[np.float64]:
-        """Joint forces [6 + 2N] of the loads of the job at step n."""
+        """Return the joint forces [6 + 2N] of the loads of the job at step n."""
         total = np.zeros(len(q))
         for load in self.loads:
             if self.times[n] >= load.stop:
@@ -282,12 +282,12 @@ class _Run:
         )
 
     def _carried(self, n: int, point: NDArray) -> NDArray[np.float64]:
-        """Way [3] that the follicle carried a point, given at the end of step n, with the hinges at rest."""
+        """Return the way [3] that the follicle carried a point, given at the end of step n, with the hinges at rest."""
         back = self.frames[n] @ (self.frames[n + 1].T @ (point - self.path[n + 1, :3]))
         return point - self.path[n, :3] - back
 
     def _pushed(self, n: int, number: int, point: NDArray) -> NDArray[np.float64]:
-        """Way [3] that a point of an obstacle went in step n."""
+        """Return the way [3] that a point of an obstacle went in step n."""
         where, turns = self.poses[number][0], self.turns[number]
         return point - where[n] - turns[n] @ (turns[n + 1].T @ (point - where[n + 1]))
 
@@ -299,7 +299,7 @@ class _Run:
         self.penetration = max(self.penetration, rows.overlap)
 
     def _action(self, n: int, follicle: NDArray, moments: NDArray) -> NDArray[np.float64]:
-        """Action of the whisker on its base [6] (N, N·m) from the reactions of follicle and first two hinges."""
+        """Return the whisker's action on its base [6] (N, N·m) from the reactions of follicle and first two hinges."""
         base = self.frames[n]
         rest, first = self.chain.rest_angles[0], self.hinges[0]
         bent = base @ np.array(
@@ -325,7 +325,7 @@ def _solve(system: NDArray, right: NDArray) -> NDArray[np.float64]:
 
 @functools.cache
 def _cholesky() -> tuple[Any, Any]:
-    """LAPACK's dpotrf and dpotrs, without the checks that would cost more than the solution."""
+    """Return LAPACK's dpotrf and dpotrs, without the checks that would cost more than the solution."""
     from scipy.linalg import get_lapack_funcs
 
     factorise, substitute = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)

@@ -100,13 +100,13 @@ class BulletWorld:
         self.bullet.disconnect(physicsClientId=self.client)
 
     def mass_matrix(self, q: Sequence[float]) -> NDArray[np.float64]:
-        """Joint-space inertia [6 + 2N, 6 + 2N] at the joint positions ``q``."""
+        """Return the joint-space inertia [6 + 2N, 6 + 2N] at the joint positions ``q``."""
         return np.array(self.bullet.calculateMassMatrix(self.whisker, q, physicsClientId=self.client))
 
     def inverse_dynamics(
         self, q: Sequence[float], rate: Sequence[float], acceleration: Sequence[float]
     ) -> NDArray[np.float64]:
-        """Joint forces [6 + 2N] that cause the accelerations without contacts, gravity included."""
+        """Return the joint forces [6 + 2N] that cause the accelerations without contacts, gravity included."""
         return np.array(
             self.bullet.calculateInverseDynamics(self.whisker, q, rate, acceleration, physicsClientId=self.client)
         )
@@ -144,7 +144,7 @@ class BulletWorld:
                     yield link, number, np.array(point[5]) - around * normal, normal, point[8] + extra - around
 
     def jacobian(self, link: int, q: Sequence[float]) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Start of a link [3], its axis [3], and how joint rates move the start [3, 6 + 2N] and turn the link."""
+        """Return a link's start [3], its axis [3], and how joint rates move the start [3, 6 + 2N] and turn the link."""
         joint, zero = self._joint(link), [0.0] * len(q)
         state = self.bullet.getLinkState(self.whisker, joint, physicsClientId=self.client)
         linear, angular = self.bullet.calculateJacobian(
@@ -154,7 +154,7 @@ class BulletWorld:
         return np.array(state[4]), axis, np.array(linear), np.array(angular)
 
     def shape(self) -> NDArray[np.float64]:
-        """Joints and tip [N + 1, 3] (mm) as the whisker was last placed."""
+        """Return joints and tip [N + 1, 3] (mm) as the whisker was last placed."""
         joints = [self._joint(link) for link in range(self.chain.links)]
         states = self.bullet.getLinkStates(
             self.whisker, joints, computeForwardKinematics=1, physicsClientId=self.client
@@ -164,7 +164,7 @@ class BulletWorld:
         return np.array([*points, points[-1] + axis * self.chain.lengths[-1] * MILLI])
 
     def _joint(self, link: int) -> int:
-        """Bullet's number of the second hinge of a link, which carries its mass and its shape."""
+        """Return Bullet's number of the second hinge of a link, which carries its mass and its shape."""
         return FOLLICLE + 2 * link + 1
 
     def _add_whisker(self) -> int:
@@ -272,7 +272,7 @@ class BulletWorld:
 
 
 def _turn_from_z(axis: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Quaternion (x, y, z, w) of the shortest turn of the z axis to the unit vector ``axis``."""
+    """Return the quaternion (x, y, z, w) of the shortest turn of the z axis to the unit vector ``axis``."""
     x, y, z = axis
     if z < -1 + 1e-12:
         return 1.0, 0.0, 0.0, 0.0

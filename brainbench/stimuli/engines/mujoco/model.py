@@ -227,7 +227,7 @@ def _segment(
 
 
 def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
-    """Largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule.
+    """Return the largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule.
 
     Where a step's ``travel`` (mm) may bury the margin, MuJoCo would find the way out of the cone itself in a wrong
     direction and the whisker would hook; a capsule is safe to any depth.
@@ -239,7 +239,7 @@ def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
 
 
 def _travel(job: Job, reach: Reach, times: NDArray, position: NDArray, euler: NDArray) -> float:
-    """Farthest (mm) that a point of the unbent whisker can move against an obstacle in one step."""
+    """Return how far (mm) a point of the unbent whisker can move against an obstacle in one step at most."""
     moves = (step_travel(job.whisker, position / MILLI, euler, obstacle, times) for obstacle in reach.obstacles)
     return max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
 

@@ -21,7 +21,7 @@ LEVELS = 7
 
 
 def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Order [triangle] of triangles [triangle, 3, 3] in which every aligned run of 8, 16, 32, … lies together.
+    """Return the order [triangle] of triangles [triangle, 3, 3] in which aligned runs of 8, 16, 32, … lie together.
 
     Runs are halved along the longest side of the box of their middles, from the whole down to leaves.
     """
@@ -48,7 +48,7 @@ def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def tree_boxes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Boxes [box, 2, 3] (lowest, highest corner) of ordered triangles: of all leaves, then of their parents, and so on.
+    """Return boxes [box, 2, 3] (lowest, highest corner) of ordered triangles: of leaves, then of parents, and so on.
 
     The last level has no more than eight boxes; a level that follows ``n`` boxes has ⌈n / 8⌉.
     """

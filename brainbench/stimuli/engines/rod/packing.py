@@ -126,7 +126,7 @@ def _knot_times(start: float, stop: float) -> tuple[NDArray[np.float64], float]:
 
 
 def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], start: float) -> NDArray[np.float64]:
-    """Knots [n, 16] from places and rotations just before, at and just after the knot times."""
+    """Return knots [n, 16] from places and rotations just before, at and just after the knot times."""
     (place0, turn0), (place, turn), (place1, turn1) = around
     # At the very start there may be no instant before: the difference is then one-sided.
     clipped = start >= 0
@@ -145,7 +145,7 @@ def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], st
 
 
 def _spin(before: NDArray, after: NDArray) -> NDArray[np.float64]:
-    """Rotation vectors [n, 3] (rad, world) between rotations [n, 3, 3]; small angles."""
+    """Return the rotation vectors [n, 3] (rad, world) between rotations [n, 3, 3]; small angles."""
     turn = after @ np.swapaxes(before, -1, -2)
     # Antisymmetric part of the relative rotation, sin(angle) times the axis; angles between neighbours are tiny.
     return np.stack(

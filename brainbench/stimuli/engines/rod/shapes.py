@@ -170,7 +170,7 @@ class PackedShapes:
 
 
 def hull_faces(part: ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices and outward faces of the convex hull of a part."""
+    """Return the vertices and outward faces of the convex hull of a part."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(part.vertices)
@@ -183,7 +183,7 @@ def hull_faces(part: ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.int32]
 
 
 def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Outward directions [face, 7, 3] of each face, its corners and the edges opposite to them.
+    """Return the outward directions [face, 7, 3] of each face, its corners and the edges opposite to them.
 
     Angle-weighted (Baerentzen & Aanaes 2005): their sign tells inside from outside at every closest point.
     """

@@ -36,7 +36,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
 
     @wp.func
     def height_over(solids: SolidArrays, own: wp.array(dtype=wp.int32), gel: GelParams, row: int, z: wp.vec3f) -> float:
-        """Signed distance of a point to the pad's surface, negative inside."""
+        """Return the signed distance of a point to the pad's surface, negative inside."""
         # A pad without geometry of its own is the plane through its markers; otherwise the union of its solids.
         if gel.own_last == gel.own_first:
             return wp.dot(z - gel.center, gel.normal)

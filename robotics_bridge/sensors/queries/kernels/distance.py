@@ -127,7 +127,7 @@ def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
 
 @wp.func
 def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-    """Nearest point e² x / (e² + t) with t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
+    """Find the nearest point e² x / (e² + t), t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
     # Coordinates of exactly zero hide the root at the short axis.
     shift = 1.0e-6 * wp.min(size)
     y = wp.vec3f(wp.max(wp.abs(x[0]), shift), wp.max(wp.abs(x[1]), shift), wp.max(wp.abs(x[2]), shift))
