@@ -163,6 +163,8 @@ class Controller:
                 reason = self._tick(before)
                 spent = self.clock() - before
                 self.overruns += spent > 1 / self.rate
+                # Due times lie on a fixed raster, so late ticks do not lower the rate; after a long stall at most one
+                # is made up for.
                 due = max(due + 1 / self.rate, self.clock() - 1 / self.rate)
                 self.clock.sleep(max(0.0, due - self.clock()))
         finally:
@@ -222,6 +224,8 @@ class Controller:
 
     def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:
         wanted = np.array([targets.get(name, reading.position[i]) for i, name in enumerate(self.driver.joints)])
+        # The speed limit runs from target to target: measured from the joints, a load that holds them would slow the
+        # targets.
         before = reading.position if self._targets is None else self._targets
         self._targets = self.limits.limit(wanted, before, 1 / self.rate)
         self.limited += bool(np.any(np.abs(self._targets - wanted) > 1e-9))

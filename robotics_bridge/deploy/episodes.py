@@ -94,6 +94,7 @@ def total_wrench(
     for number, name in enumerate(links):
         force, torque = np.split(points[link == number].sum(axis=0), 2)
         turn, origin = axes.place[name]
+        # Wrenches moved to the palm's origin: F = R f, M = R m + x₀ × F, with the fingers at their reference position.
         total[:3] += turn @ force
         total[3:] += turn @ torque + np.cross(origin, turn @ force)
     return total

@@ -71,6 +71,8 @@ class SafetyLimits:
 
     def fault(self, reading: HandReading, age: float) -> str | None:
         """Return why a report must not be acted upon, in words; None if it may."""
+        # Numbers that are not finite are looked for first: every later comparison with NaN is false and would let them
+        # pass.
         values = (reading.position, reading.velocity, reading.pressure)
         if not all(np.isfinite(value).all() for value in values) or not math.isfinite(reading.time):
             return "the hand reports values that are no numbers"
@@ -92,6 +94,7 @@ class SafetyLimits:
     def limit(self, targets: NDArray[np.float64], before: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
         """Return targets [J] within the limits of position, and of speed from the targets before."""
         step = self.speed * dt
+        # Speed first, position last: whatever the targets before were, the outcome lies within the joint's range.
         return np.clip(np.clip(targets, before - step, before + step), self.low, self.high)
 
 
@@ -106,5 +109,6 @@ class ClockOffset:
 
     def age(self, reading: HandReading, now: float) -> float:
         """Return how long ago a report was measured (s), beyond the shortest way seen."""
+        # The offset of the clocks is not known. Least of all differences: the way of the fastest report counts as none.
         self._least = min(self._least, reading.arrived - reading.time)
         return now - reading.time - self._least

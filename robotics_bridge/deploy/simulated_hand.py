@@ -202,6 +202,7 @@ def serve(hand: SimulatedHand, link: socket.socket, faults: Faults, seconds: flo
             values, stamp = frozen
         if peer and not (faults.silent_after and now - start > faults.silent_after):
             late = faults.delay if now - start >= faults.delay_after else 0.0
+            # Each report waits by itself, so that jitter longer than a report's interval also changes their order.
             due = now + late + faults.jitter * random.random()
             spoiled = _spoil(values, faults, random, joints, fingers, sequence, stamp)
             waiting.extend((due, data) for data in spoiled)

@@ -109,6 +109,7 @@ class RateMonitor:
 
     def tick(self, now: float) -> float:
         """Count a tick; return the rate over the window [Hz], the nominal one until a window has passed."""
+        # A window that is not full yet would count too few ticks and stop every session at its beginning.
         self._begun = now if self._begun is None else self._begun
         self._times.append(now)
         while self._times and self._times[0] <= now - self.window:

@@ -50,6 +50,7 @@ class PressureCalibration:
     def force(self, fingers: tuple[str, ...], pressure: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the simulator's ``agg_force`` [F, 3] of pressures [F, 3]."""
         scales = np.array([self.per_finger.get(finger, self.scale) for finger in fingers])
+        # Linear per finger and axis; the pressure comes in a unit of the maker's, so its scale is calibrated.
         return pressure * scales[:, None] * np.array(self.axes)
 
     def pressure(self, fingers: tuple[str, ...], force: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -108,6 +109,7 @@ class RealTouch:
         if self.measured:
             items, rows = (list(part) for part in zip(*self.measured, strict=True))
             if self.observe == "agg_bool":
+                # agg_bool of a real hand: |f| > η_real (4.31).
                 touching = np.linalg.norm(reading.pressure, axis=1) > self.calibration.threshold
                 group[:, items, 0] = touching[rows]
             else:

@@ -127,6 +127,7 @@ class UdpDriver:
             counters.damaged += 1
             return
         last = self._newest.sequence if self._newest is not None else message.sequence - 1
+        # UDP may change the order: an older report that comes late is dropped, and was counted as lost before.
         if message.sequence <= last:
             counters.late += 1
             counters.lost = max(0, counters.lost - 1)

@@ -67,6 +67,7 @@ class Contacts:
     def read(self) -> None:
         """Take forces and distances from the simulation's state."""
         wp, state = warp(), self._simulation.state
+        # One thread per contact adds its force, so the sums start from zero in every control step.
         self._forces.zero_()
         inputs = [state.contact_count, state.contact_geom, state.contact_env, state.contact_normal]
         inputs += [state.contact_force, self._rows, self._forces]
@@ -93,6 +94,8 @@ class Contacts:
     @property
     def tip_force(self) -> torch.Tensor:
         """Net normal contact force [B, F, 3] on finger tips in their own frame, within ±10 N as published."""
+        # World to link: the inverse of a unit quaternion is its conjugate. A lost force reads as 0, since a network
+        # cannot take NaN.
         turn = conjugate(from_xyzw(self._simulation.pose[:, self.tip_links, 3:]))
         return rotate(turn, self.forces[:, : self._tips]).clamp(-_LIMIT, _LIMIT).nan_to_num()
 

@@ -80,6 +80,7 @@ class GoalState:
         self.angle_before.copy_(self.angle)
         self.angle.copy_(angle_of(error))
         if self._axis is not None:
+            # Rotation of the last step split into twist about the commanded axis and the swing across it.
             twist, _ = twist_and_swing(step, self._axis)
             self.rate.copy_(twist / self._dt)
             self.turned_held += twist * held
@@ -105,6 +106,7 @@ class GoalState:
         won = done & (self.count >= self._won)
         self._tally += torch.stack((done.sum(), won.sum()))
         full = self._tally[0] >= len(done)
+        # Decided on the device, without the host waiting for the count: recorded graphs cannot branch.
         narrow = full & (self._tally[1] > self.goal.mastered * self._tally[0])
         closer = (self.threshold * self.goal.narrowing).clamp(min=self._least)
         self.threshold.copy_(torch.where(narrow, closer, self.threshold))

@@ -99,6 +99,8 @@ def sample(
     for _ in range(settings.tries):
         if len(found["joints"]) == count:
             break
+        # Candidates by rejection: random joints, places and turns about the reference, of which only those that hold
+        # are kept.
         joints = np.clip(
             model.rest + rng.uniform(-settings.perturb, settings.perturb, len(model.rest)), model.low, model.high
         )
@@ -137,6 +139,7 @@ class _Trial:
         opened = self._opened(joints, place, yaw)
         if opened is None or self._near() < s.near_fingers:
             return None
+        # Targets beyond where the fingers stand: position drives press only as far as they miss their target.
         target = np.clip(opened + s.squeeze * self._closing, self._model.low, self._model.high)
         start = d.xpos[self._object].copy()
         for _ in range(round(s.hold / self._m.opt.timestep)):
@@ -180,6 +183,7 @@ class _Trial:
 
     def _step(self, target: NDArray[np.float64]) -> None:
         d, model = self._d, self._model
+        # The same law as the environment's actuators, without their imperfections.
         torque = model.stiffness * (target - d.qpos[self._joints]) - model.damping * d.qvel[self._speeds]
         d.ctrl[self._drive] = np.clip(torque, -model.effort, model.effort)
         self._mujoco.mj_step(self._m, d)
@@ -190,6 +194,7 @@ class _Trial:
         while body > 0:
             for column, name in enumerate(self._model.joints):
                 low, high = self._model.low[column], self._model.high[column]
+                # A joint whose range lies about its zero spreads the finger; flexion has a one-sided range.
                 spreads = abs(low + high) < 0.5 * (high - low)
                 if self._m.jnt_bodyid[self._m.joint(name).id] == body and not spreads:
                     found.append(column)
@@ -233,5 +238,6 @@ class _Trial:
         """Return the distance of a point from a cylinder or capsule (m)."""
         local = self._d.geom_xmat[geom].reshape(3, 3).T @ (point - self._d.geom_xpos[geom])
         radius, half = self._m.geom_size[geom, :2]
+        # Distance to a cylinder from outside; a capsule is treated as one, which is near enough for "near".
         beyond = np.array([max(np.hypot(local[0], local[1]) - radius, 0.0), max(abs(local[2]) - half, 0.0)])
         return float(np.linalg.norm(beyond))

@@ -33,6 +33,7 @@ def _joints(state: EnvState, *, noisy: bool) -> torch.Tensor:
     velocity = VELOCITY * simulation.qvel[:, state.actuators.qvel_columns]
     if noisy:
         drawn = torch.randn(2, *position.shape, generator=state.generator, device=state.device)
+        # White noise of encoders in every control step; the privileged groups read the same joints without it.
         position = position + noise.position * drawn[0]
         velocity = velocity + noise.velocity * drawn[1]
     return torch.cat((position, velocity, state.episode.action), dim=1)
@@ -42,6 +43,7 @@ def _goal(state: EnvState) -> torch.Tensor:
     import torch
 
     goals = state.goals
+    # Rotation from the object to its goal, g q⁻¹, in world axes.
     difference = multiply(goals.quat, conjugate(state.target_pose[:, 3:]))
     parts = {"orientation": goals.quat, "difference": six_numbers(difference), "angle": goals.angle.unsqueeze(1)}
     return torch.cat([parts[name] for name in state.task.goal_terms], dim=1)

@@ -87,6 +87,7 @@ class EpisodeReset:
         upright = constant(place.quaternion, poses).expand(state.num_envs, -1)
         up = constant((0.0, 0.0, 1.0), poses)
         if self._sites is not None:
+            # Sorting random numbers gives a random order of the sites: objects never share one.
             order = state.draw(len(self._sites), 0.0, 1.0).argsort(dim=1)[:, :count]
             poses[..., :3] = self._sites[order]
         for index in range(count):
@@ -108,6 +109,7 @@ class EpisodeReset:
         ratio, offset = state.draw(1, *changes.friction), state.draw(1, *changes.mass_offset)
         bodies, geoms, column = state.object_bodies, self._geoms, mask.unsqueeze(1)
         mass = (nominal["body_mass"][:, bodies] + offset).clamp(min=1e-6)
+        # Inertia grows with the mass as for a body of other density and the same shape.
         growth = (mass / nominal["body_mass"][:, bodies]).unsqueeze(2)
         inertia = nominal["body_inertia"][:, bodies] * growth
         # What MuJoCo's mj_setConst derives for a body that moves freely.

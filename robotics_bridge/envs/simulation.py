@@ -50,6 +50,7 @@ class Simulation:
         starts = zip(self.model.jnt_bodyid, self.model.jnt_type, self.model.jnt_dofadr, strict=True)
         # A body whose centre of mass is not its origin is not simple: its inertia depends on how it lies.
         self._free = {int(b): int(d) for b, kind, d in starts if kind == free and self.model.body_simple[b]}
+        # Shapes in turn: every environment keeps its shape, whatever the size of the batch.
         order = np.arange(num_envs) % len(models)
         self.shape_of = order
         """Number [B] of the shape that each environment has."""

@@ -152,6 +152,7 @@ class EnvState:
         """[A] numbers of the joints that actions move."""
         self.low, self.high, self.rest = floats(model.low), floats(model.high), floats(model.rest)
         """[J] limits and positions at rest (rad)."""
+        # An action of 1 is the same share of every joint's range.
         self.action_scale = self.task.action_ratio * (self.high - self.low)[self.moved]
         """[A] change of a target per unit of action (rad)."""
         bodies = [first.body(name).id for name in model.objects]
@@ -175,6 +176,8 @@ class EnvState:
         """Return uniform random numbers [B, count]."""
         import torch
 
+        # Numbers are drawn for all environments, whoever needs them: the draws of one do not depend on the resets of
+        # others.
         numbers = torch.rand(self.num_envs, count, generator=self.generator, device=self.device)
         return low + (high - low) * numbers
 
@@ -208,6 +211,7 @@ class EnvState:
             raise UsageError("There are no tactile links; make the environment with an observation type.")
         pose = self.simulation.pose
         palm, links = pose[:, self._palm : self._palm + 1], pose[:, self._tactile_links]
+        # Pose relative to the palm, p = R₀ᵀ (x − x₀) and q = q₀⁻¹ q: it does not change when the whole hand is carried.
         inverse = conjugate(from_xyzw(palm[..., 3:])).expand(-1, links.shape[1], -1)
         place = rotate(inverse, links[..., :3] - palm[..., :3])
         return torch.cat((place, multiply(inverse, from_xyzw(links[..., 3:]))), dim=-1)

@@ -96,6 +96,7 @@ def compute_step(state: EnvState, reset: EpisodeReset) -> StepResult:
     terminated = diverged.clone()
     for condition in endings.values():
         terminated |= condition
+    # Episodes cut by time are told apart from ended ones: learners go on with the value of the last state there.
     truncated = (episode.age >= task.max_episode_length) & ~terminated
     done = terminated | truncated
     info = {"time_outs": truncated, "diverged": diverged, "log": _count_episodes(state, parts, done, diverged)}
@@ -114,6 +115,7 @@ def isolate_diverged(state: EnvState) -> torch.Tensor:
     import torch
 
     simulation = state.simulation
+    # A sum times zero is NaN as soon as one of its terms is NaN or infinite: one number per environment to look at.
     flaw = (simulation.qpos.sum(dim=1) * 0 + simulation.qvel.sum(dim=1) * 0).isnan()
     diverged = flaw | (simulation.qvel.abs() > _DIVERGED_SPEED).any(dim=1)
     column = diverged.unsqueeze(1)
@@ -148,6 +150,7 @@ def _reward(state: EnvState, context: StepContext, diverged: torch.Tensor) -> tu
     """Return the reward [B] and its terms [B, terms], zero where diverged."""
     import torch
 
+    # Weights are per second, so that rewards do not depend on the control rate.
     parts = [r.weight * r.term(context, **r.params) * state.step_dt for r in state.task.rewards.values()]
     if not parts:
         return torch.zeros(state.num_envs, device=state.device), state.episode.reward_sums

@@ -111,6 +111,8 @@ class TactileObservation:
         if kind.per_link:
             columns = len(taxels)
             pool = np.zeros((len(links), columns, kind.channels))
+            # Sum over the taxels of a link as one matrix product: counts of contacts, or 10⁴ Σ d n with axes z, y, x
+            # (4.29).
             pool[np.arange(len(links)), links] = 1.0 if observe == "agg_bool" else PATCH_FORCE_SCALE * normal[:, ::-1]
             self._pool = torch.as_tensor(pool, dtype=torch.float32, device=where).flatten(1)
             mean = np.zeros((columns, len(links)))
@@ -147,6 +149,7 @@ class TactileObservation:
         if self._pool is None:
             self.reading[:, substep] = self._taxels
             return
+        # One product for all links: no sum has to be taken by index, whose order differs from run to run on a GPU.
         pooled = self._taxels[..., 0] @ self._pool
         if self._name == "agg_bool":
             pooled = (pooled > TAXELS_IN_CONTACT).float()

@@ -43,6 +43,7 @@ _ABOVE, _PRESSED, _LIGHT = 0.008, -0.002, -0.001
 
 def _ramp(time: float, start: float, end: float) -> float:
     """Return a smooth step from 0 to 1."""
+    # 3 s² − 2 s³: starts and ends at rest, so that prescribed objects do not jerk.
     share = min(max((time - start) / (end - start), 0.0), 1.0)
     return share * share * (3 - 2 * share)
 
@@ -63,6 +64,7 @@ def _enclosure(time: float) -> Pose:
 
 def _contour(time: float) -> Pose:
     z = _ABOVE + (_LIGHT - _ABOVE) * _ramp(time, 0.0, 0.2)
+    # The object turns about itself while its middle goes once around a circle: the outline passes along the fingers.
     turn = 2 * math.pi * _ramp(time, 0.2, 1.0)
     return Pose(x=0.008 * math.sin(turn), y=0.008 * (1 - math.cos(turn)), z=z, yaw=turn, closing=0.45)
 

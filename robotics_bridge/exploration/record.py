@@ -252,6 +252,7 @@ class _World:
 
     def _bottom(self, item: Explored) -> float:
         """Return how far the lowest point of a held object lies below its body's origin (m)."""
+        # Support function downwards: row 2 of the rotation is the vertical in the object's frame.
         return float(item.shape().reach(-to_matrices(item.quaternion)[2]))
 
     def move(self, conditions: Sequence[tuple[Explored, Procedure]], time: float) -> None:
@@ -260,6 +261,8 @@ class _World:
         for data, (item, procedure) in zip(self.engine.data, conditions, strict=True):
             pose, after = procedure.pose(time), procedure.pose(time + step)
             data.qpos[self._at : self._at + 7] = self._held(pose, item)
+            # Velocity by a forward difference over 1 ‰ of the procedure: friction needs the speed of an object that is
+            # put in place.
             rates = [
                 (getattr(after, name) - getattr(pose, name)) / (step * self.span) for name in ("x", "y", "z", "yaw")
             ]
@@ -273,5 +276,6 @@ class _World:
 
     def _held(self, pose: Pose, item: Explored) -> NDArray[np.float64]:
         height = pose.z + item.retreat + self._bottoms[id(item)]
+        # Yaw about the world's vertical, applied after the orientation in which the object is held.
         turned = from_matrices(to_matrices(from_rpy((0.0, 0.0, pose.yaw))) @ to_matrices(item.quaternion))
         return np.concatenate([[self._place[0] + pose.x, self._place[1] + pose.y, height], turned])

@@ -188,6 +188,7 @@ def from_file(path: Path) -> Hand:
         children[int(model.body_parentid[body])].append(body)
     jointed = {body: _joints_below(model, body, children) for body in range(model.nbody)}
     branches = {body: [child for child in children[body] if jointed[child]] for body in range(model.nbody)}
+    # The palm is the body with most branches that have joints; of equals the one with the lowest number.
     palm = max(range(model.nbody), key=lambda body: (len(branches[body]), -body))
     if not branches[palm]:
         raise DataError(f"{str(path)!r} holds no hand: it has no joints.")
@@ -235,6 +236,7 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
                 towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ known
                 tips += [known] if place + 1 == len(chain) else []
     if tips and np.linalg.norm(np.mean(tips, axis=0)) > 0.1:
+        # Mean flexion of the finger tips in the palm's frame, snapped to the nearest of its axes.
         turned = data.xmat[model.body(palm).id].reshape(3, 3).T @ np.mean(tips, axis=0)
         face = np.argmax(np.abs(turned))
         towards[palm] = np.sign(turned[face]) * np.eye(3)[face]

@@ -54,6 +54,7 @@ def fillers(rows: int, columns: int, count: int) -> NDArray[np.int64]:
     [2, 8]
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
+    # Rank by distance from the middle row and the first column: symmetric pairs of corners are left out together.
     off = np.abs(row - (rows - 1) / 2) / max(rows - 1, 1) + column / max(columns - 1, 1)
     return np.sort(np.lexsort((row, -off))[:count])
 
@@ -67,6 +68,7 @@ def _on_capsule(solid: CapsuleGeometry, pad: Pad, grid: Grid) -> tuple[NDArray, 
     start, end = np.array(solid.start), np.array(solid.end)
     length = np.linalg.norm(end - start)
     axis = (end - start) / length
+    # Frame of the pad: along the axis, across it towards the facing side, and sideways.
     up = np.array(pad.facing, dtype=float) - axis * np.dot(pad.facing, axis)
     up /= np.linalg.norm(up)
     side = np.cross(axis, up)
@@ -89,6 +91,7 @@ def _on_box(solid: BoxGeometry, pad: Pad, grid: Grid) -> tuple[NDArray, NDArray]
     sides = (_centred(grid.rows, pad.along[0]), _centred(grid.columns, pad.along[1]))
     y, x = (item.ravel() for item in np.meshgrid(*sides, indexing="ij"))
     position = np.tile(np.array(solid.center), (len(y), 1))
+    # From the middle of the box to the face that looks along the normal.
     position[:, face] += normal[face] * solid.half[face]
     position[:, rows_axis] += y
     position[:, columns_axis] += x
@@ -164,6 +167,7 @@ def palm_side(axis: Any, reach: Any, limits: tuple[float, float]) -> NDArray[np.
         limits: Of the joint [rad]; the longer side is flexion.
     """
     sign = 1.0 if abs(limits[1]) >= abs(limits[0]) else -1.0
+    # Velocity of the far end under a turn about the joint, ω × r; its sign follows the longer side of the range.
     direction = sign * np.cross(axis, reach)
     length = float(np.linalg.norm(direction))
     return direction / length if length > 1e-9 * max(math.dist(reach, (0, 0, 0)), 1e-9) else np.zeros(3)

@@ -150,6 +150,7 @@ def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
         return (values[..., 0].sum(dim=1, keepdim=True) > TAXELS_IN_CONTACT).float()
     if name == "agg_force":
         normal = torch.as_tensor(probes.normal[probes.active].copy(), dtype=values.dtype, device=values.device)
+        # 10⁴ P Σ d n with P the order z, y, x of the axes (4.29).
         return PATCH_FORCE_SCALE * (values[..., :1] * normal).sum(dim=1).flip(-1)
     if name == "force":
         values = values[..., :3]

@@ -87,6 +87,7 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
     model = hand.model
     joints = model.actuator_trnid[:, 0] if model.nu else np.arange(model.njnt)
     low, high = model.jnt_range[joints].T
+    # Flexion is the longer side of a joint's range.
     target = np.where(np.abs(high) >= np.abs(low), high, low) * share
     # Joints that spread the fingers stay in their middle.
     return np.where(np.abs(high + low) < 0.5 * np.ptp(model.jnt_range[joints], axis=1), 0.0, target)
@@ -133,6 +134,8 @@ def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], 
 def _onto_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the quaternion (w, x, y, z) of the shortest turn of a unit vector onto z."""
     z = np.array([0.0, 0.0, 1.0])
+    # Shortest turn between unit vectors: (1 + a · b, a × b), normalised. It vanishes for opposite ones, which are
+    # turned about x.
     axis, cosine = np.cross(direction, z), float(direction @ z)
     if cosine < -0.999999:
         return np.array([0.0, 1.0, 0.0, 0.0])

@@ -67,6 +67,7 @@ def cast_grid(
         raise UsageError(f"Link {link!r} has no geometry, so no probe can lie on it.")
     up = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
     u, v = _plane(up, corners, along)
+    # Extent of the link across and along the rays: the grid covers its shadow, and rays start just above its top.
     seen = corners @ np.stack([u, v, up], axis=1)
     low, high = seen.min(axis=0), seen.max(axis=0)
     middle, half = (low + high) / 2, (high - low) / 2 * extent
@@ -88,10 +89,12 @@ def cast_grid(
 def _plane(up: NDArray, corners: NDArray, along: ArrayLike | None) -> tuple[NDArray, NDArray]:
     """Return the directions of columns and rows across ``up``."""
     if along is None:
+        # The axis nearest to the rays is no candidate for the direction of columns.
         extent = np.ptp(corners, axis=0)
         extent[np.argmax(np.abs(up))] = -1
         along = np.eye(3)[np.argmax(extent)]
     u = np.asarray(along, dtype=float)
+    # Gram–Schmidt: columns run across the rays even if the given direction does not.
     u = u - up * (u @ up)
     u = u / np.linalg.norm(u)
     return u, np.cross(up, u)
@@ -113,6 +116,7 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
             distance = mujoco.mju_rayGeom(
                 model.geom_pos[geom], matrix, model.geom_size[geom], origin, direction, kind, normal
             )
+        # A ray that misses has the distance −1.
         if distance >= 0 and (best is None or distance < best[0]):
             best = (distance, normal)
     return best

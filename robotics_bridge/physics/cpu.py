@@ -230,6 +230,7 @@ class _Gatherer:
         """Return the normal force of every contact: with a pyramidal cone the sum of its edges."""
         address, dim = (np.concatenate([parts[index] for parts in found]) for index in (4, 5))
         before = np.cumsum([0, *(len(parts[6]) for parts in found)])
+        # Sum over each contact's rows as a difference of running sums, without a loop over contacts.
         total = np.concatenate([[0.0], *(parts[6] for parts in found)]).cumsum()
         rows = np.where((dim > 1) & (self._model.opt.cone == 0), 2 * (dim - 1), 1)
         first = np.maximum(address, 0) + np.repeat(before[:-1], [len(parts[4]) for parts in found])
@@ -237,6 +238,7 @@ class _Gatherer:
 
     def finish(self) -> None:
         omega = self._twist[..., :3]
+        # v + ω × (p − com): MuJoCo's spatial velocities refer to the centre of mass of the kinematic tree.
         lever = self._pose[..., :3] - self._com[:, self._root]
         self._velocity[..., :3] = self._twist[..., 3:] + np.cross(omega, lever)
         self._velocity[..., 3:] = omega

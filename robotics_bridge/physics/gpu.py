@@ -69,6 +69,8 @@ class MujocoWarpEngine:
         with wp.ScopedDevice(self._device):
             self._m = _put_model(self._engine, self.model, varied, num_envs)
             contacts = contacts or 16 + 9 * int(np.count_nonzero(self.model.body_weldid))
+            # Room for constraint rows: four per contact (two tangents in a pyramid), limits, equalities, tendons,
+            # friction of joints.
             rows = 4 * contacts + 2 * self.model.njnt + 6 * self.model.neq + 2 * self.model.ntendon + self.model.nv
             room = {"nconmax": contacts, "njmax": constraints or rows}
             self._d = self._engine.make_data(self.model, nworld=num_envs, **room)
@@ -188,6 +190,7 @@ class MujocoWarpEngine:
         from robotics_bridge.physics.kernels.state import fill_links
 
         wp, d, state = warp(), self._d, self.state
+        # MuJoCo's quaternions are (w, x, y, z); the kernel stores them as Warp's (x, y, z, w).
         poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
         wp.launch(fill_links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
 

@@ -74,6 +74,8 @@ class Geometry:
     def reach(self, directions: ArrayLike) -> NDArray[np.float64]:
         """Return the support function: how far the solid reaches along unit directions [..., 3] of its frame (m)."""
         d, size = np.asarray(directions, dtype=float), self.size
+        # Support function h(d) = max x · d of each solid, in closed form; that of a sum of bodies is the sum of theirs,
+        # as for a capsule (segment and ball) or a cylinder (segment and disc).
         upright = np.abs(d[..., 2])
         if self.mesh is not None:
             return (d @ self.mesh.vertices.T).max(axis=-1)
@@ -191,6 +193,7 @@ class TouchScene:
         found: set[int] = set()
         for own in self.geometries_of(link):
             kind, affinity = self._bits[own]
+            # MuJoCo's rule: two geometries collide if the type of either is among the affinities of the other.
             meets = ((self._bits[:, 0] & affinity) | (self._bits[:, 1] & kind)) != 0
             found |= set(np.flatnonzero(meets & free).tolist())
             found |= {low + high - own for low, high in self.included if own in (low, high)}
@@ -277,7 +280,7 @@ def _differs(first: Geometry, second: Geometry) -> bool:
 
 
 def _never(model: Any) -> frozenset[tuple[int, int]]:
-    """Pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
+    """Return the pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
     mujoco = mujoco_module()
 
     pairs = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in model.exclude_signature}

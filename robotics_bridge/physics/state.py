@@ -74,6 +74,7 @@ class HandState:
             )
         wp, device = warp(), pick_device(device)
         pose = np.zeros((num_envs, num_links, 7), dtype=np.float32)
+        # Unit quaternion in Warp's order (x, y, z, w).
         pose[..., 6] = 1
         room = max(contacts, 1)
 

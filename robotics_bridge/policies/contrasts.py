@@ -60,6 +60,7 @@ def contrast(one: Sequence[float], other: Sequence[float], spread: float, freedo
     from scipy.special import stdtr, stdtrit
 
     difference = float(np.mean(one) - np.mean(other))
+    # Two-sample t with the pooled spread: its degrees of freedom are those of all students, not of these two.
     error = spread * math.sqrt(1 / len(one) + 1 / len(other))
     half = float(stdtrit(freedom, 0.975)) * error
     p = 2 * float(stdtr(freedom, -abs(difference) / error)) if error else float(difference == 0)

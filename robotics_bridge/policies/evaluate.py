@@ -164,6 +164,8 @@ def evaluate(
             dropped = terminated & ~info["diverged"] & ~full
             table = torch.stack((*columns, dropped.float()), dim=1)
             found += table[done & (left > 0)].tolist()
+            # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
+            # often.
             left -= done.long()
         threshold = env.task.success.threshold
         rates.append(sum(row[0] >= threshold for row in found) / len(found))

@@ -66,6 +66,8 @@ class GroupEncoder(nn.Module):
         hidden, memory = h_in.chunk(2, 1)
         found = []
         for step, each in enumerate(x):
+            # Step by step, since memory may be forgotten between any two steps; what has no memory follows as one
+            # batch.
             hidden, memory = self.cell(each, (hidden, memory))
             found.append(hidden)
             if ended is not None:

@@ -107,6 +107,8 @@ class AfferentFilter:
         for name, sections in self._sections.items():
             y = x
             for row, (first, second) in zip(sections, self._state[name], strict=True):
+                # Second-order sections in transposed direct form II: two memories each, and little rounding in single
+                # precision where one long polynomial would lose the poles near 1.
                 b0, b1, b2, _a0, a1, a2 = (float(value) for value in row)
                 out = b0 * y + first
                 first.copy_(b1 * y - a1 * out + second)

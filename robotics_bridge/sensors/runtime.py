@@ -95,6 +95,7 @@ class ReadoutRuntime(Runtime):
         noises = [sensor.noise for sensor in sensors.values()]
         self.noisy = any(noise.active for noise in noises)
         staged = self.noisy and (not fusable or any(noise.crosstalk for noise in noises))
+        # Crosstalk needs the values of neighbours, which threads of one kernel cannot have; all other noise is fused.
         self.mode = STAGED if staged else FUSED if self.noisy else CLEAN
         fused = self.mode == FUSED
         self.stores = (
@@ -222,6 +223,7 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
     most = _SHARED
     if cuda:
         limit, fill = _SHARED_CUDA[mode]
+        # Enough threads must be left to fill the GPU; only beyond that do probes share one.
         most = min(limit, max(1, total // (fill * context.device.sm_count)))
     rows = []
     for number, part in enumerate(slices):
@@ -239,6 +241,7 @@ def enclosing_sphere(probes: Probes) -> tuple[np.ndarray, float]:
     position, radius = probes.position[probes.active], probes.radius[probes.active]
     if not len(position):
         return np.zeros(3), 1e-6
+    # Not the smallest sphere, but near it and never too small.
     center = 0.5 * (position.min(axis=0) + position.max(axis=0))
     return center, float((np.linalg.norm(position - center, axis=1) + radius).max())
 

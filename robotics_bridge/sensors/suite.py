@@ -172,6 +172,7 @@ class SensorSuite:
             raise UsageError(f"The sensor {name!r} keeps no history; configure it with history=<readings>.")
         kept = self._histories[name]
         first = self._updates % kept.length
+        # Every reading stands twice in the ring, so the window is a slice of it and no copy.
         window = warp().to_torch(kept.ring)[first : first + kept.length]
         tensor = window.permute(2, 0, 3, 1).unflatten(2, kept.part.layout)
         return tensor.squeeze(-1) if kept.part.scalar else tensor

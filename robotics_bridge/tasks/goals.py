@@ -91,7 +91,11 @@ class SteppingRotation(Goal):
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return the goals one step further."""
         del draw
+        # A turn about a world axis multiplies from the left. The step starts from the last goal, not from the object,
+        # so that errors of reached goals do not add up.
         turn = about(constant(self.axis or (0.0, 0.0, 1.0), quat), constant(self.step, quat))
+        # Quaternions are not normalised here: a product of unit ones stays one to rounding over the few goals of an
+        # episode.
         return multiply(turn.expand_as(goal), goal)
 
 
@@ -110,5 +114,6 @@ class TimedRotation(Goal):
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return tilted orientations of the object."""
         del goal
+        # Uniform in both angles and about world axes, hence from the left.
         angles = self.tilt[0] + (self.tilt[1] - self.tilt[0]) * draw
         return multiply(tilted(angles[:, 0], angles[:, 1]), quat)

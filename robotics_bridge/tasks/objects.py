@@ -55,6 +55,7 @@ class ObjectShape:
 
     def scaled(self, factor: float) -> ObjectShape:
         """Return the shape with all lengths multiplied."""
+        # Lengths grow by the factor, the density stays: mass grows with its cube.
         solids = tuple(
             replace(
                 solid,
@@ -109,6 +110,8 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
     handle = ObjectPrimitive(
         "cylinder", (handle_radius, handle_length / 2), (0.0, length - handle_length / 2, 0.0), _UPRIGHT_Y
     )
+    # A capsule's half length leaves out its round ends, so that the lower one ends at the tip and the upper in the
+    # handle.
     free = length - handle_length
     shaft = ObjectPrimitive(
         "capsule", (shaft_radius, (free - shaft_radius) / 2), (0.0, (free + shaft_radius) / 2, 0.0), _UPRIGHT_Y

@@ -83,6 +83,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
     first = models[0]
     joints = tuple(drives)
     ids = [first.joint(name).id for name in joints]
+    # Joints without limits get a full turn: actions are scaled by ranges.
     limited = first.jnt_limited[ids].astype(bool)
     low = np.where(limited, first.jnt_range[ids, 0], -np.pi)
     high = np.where(limited, first.jnt_range[ids, 1], np.pi)
@@ -116,6 +117,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
             joint.armature = joint.armature or _ARMATURE
     slides = {}
     for axis, ((low, high), stiffness, damping, effort) in task.carriage.items():
+        # The carriage moves along world axes, while a joint's axis is given in the frame of its body.
         direction = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[axis]
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, np.array(palm.quat, dtype=float))
@@ -231,6 +233,7 @@ def palm_up(hand: Hand) -> Pose:
     # Columns: where the palm's own directions (forward, up × forward, up) go in the world.
     own = np.stack([forward, np.cross(up, forward), up], axis=1)
     world = np.stack([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]], axis=1)
+    # Rotation that takes the palm's orthonormal directions to their place in the world.
     matrix = world @ own.T
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, matrix.ravel())

@@ -29,11 +29,13 @@ def goal_reached(m: StepContext) -> torch.Tensor:
 
 def orientation_gaussian(m: StepContext, *, sigma: float) -> torch.Tensor:
     """Return exp(−(θ/σ)²) of the angle θ to the goal."""
+    # Flat far from the goal and at it: rewards the last part of the way alone.
     return (-((m.goal_angle / sigma) ** 2)).exp()
 
 
 def orientation_inverse(m: StepContext, *, rot_eps: float) -> torch.Tensor:
     """Return 1 / (θ + ε) of the angle θ to the goal (1/rad)."""
+    # Has a slope at any angle; ε bounds it at the goal.
     return 1 / (m.goal_angle + rot_eps)
 
 
@@ -49,12 +51,15 @@ def rotation_progress(m: StepContext, *, clip: float, penalty_scale: float) -> t
 
 def approach(m: StepContext, *, clip: tuple[float, float], negative_scale: float) -> torch.Tensor:
     """Return how fast the angle to the goal shrinks (rad/s), within bounds; growth counts ``negative_scale`` times."""
+    # A difference of potentials: going to and fro adds up to nothing while both directions count alike, and to a loss
+    # where growth counts more.
     rate = ((m.previous_goal_angle - m.goal_angle) / m.dt).clamp(*clip)
     return rate.clamp(min=0) + abs(negative_scale) * rate.clamp(max=0)
 
 
 def near_surface(m: StepContext, *, nearest_k: int, sigma: float) -> torch.Tensor:
     """Return the mean of exp(−d/σ) over the k finger tips that are nearest to the object."""
+    # Overlap counts as distance zero: pressing harder must not pay.
     nearest = m.surface_distance.clamp(min=0).topk(nearest_k, dim=1, largest=False).values
     return (-nearest / sigma).exp().mean(dim=1)
 
@@ -106,12 +111,15 @@ def work(m: StepContext) -> torch.Tensor:
 
 def spin(m: StepContext, *, local_axis: tuple[float, float, float], low: float, high: float) -> torch.Tensor:
     """Return the object's angular velocity about its own axis (rad/s), within bounds."""
+    # The object's axis in the world, ω · a: spin about a tilted axis counts as such, not by its vertical part.
     axis = rotate(m.object_quat, constant(local_axis, m.object_quat))
     return (m.object_spin * axis).sum(dim=1).clamp(low, high)
 
 
 def alignment(m: StepContext, local_up: tuple[float, float, float]) -> torch.Tensor:
     """Return the cosine [B] between an axis of the object and the vertical."""
+    # The z component of the rotated axis is the cosine of its tilt: no arc cosine, whose slope is infinite when
+    # upright.
     return rotate(m.object_quat, constant(local_up, m.object_quat))[:, 2]
 
 

@@ -189,6 +189,8 @@ class Thermometers:
         )  # fmt: skip
         self.age += dt
         self.touching.copy_(self._touched.gather(1, self._env.episode.target.unsqueeze(1))[:, 0] > 0)
+        # The latch fires once, at progress 1 − m of the warmest cell, and holds for the episode; S counts from then on
+        # (4.42).
         fires = (self.temperature().amax(dim=1) >= self.thermal.threshold) & ~self.latched
         self.latch_time.copy_(torch.where(fires, self.age, self.latch_time))
         self.latched |= fires

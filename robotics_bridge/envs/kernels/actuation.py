@@ -54,15 +54,22 @@ def actuate(
     error = target[env, joint] - (q - play + d.bias[env, joint])
     if wp.abs(error) < d.deadband[env, joint]:
         error = 0.0
+    # PD law on the error after play, bias and deadband; damping acts on the true speed.
     torque = d.stiffness[env, joint] * error - d.damping[env, joint] * v
+    # A constant torque towards the target, none within the deadband, where it would switch to and fro.
     if error != 0.0:
         torque += wp.sign(error) * d.kick[env, joint]
+    # Strength scales what the controller asks for, noise comes on top of it, and the effort limits the sum.
     torque *= d.strength[env, joint]
     if d.noise[joint] > 0.0:
+        # Numbers counted by launch, environment and joint, not drawn in turn: the same on every device and in every
+        # order.
         state = wp.rand_init(random[1] + random[0], env * d.position.shape[0] + joint)
         torque += d.noise[joint] * wp.randf(state, -1.0, 1.0)
     torque = wp.clamp(torque, -d.effort[joint], d.effort[joint])
     ctrl[env, d.channel[joint]] = torque
+    # Mean of |τ q̇| over the physics steps of a control step; the first launch starts the sum, so nothing need be
+    # cleared.
     spent = share * wp.abs(torque * v)
     if first == 1:
         power[env, joint] = spent

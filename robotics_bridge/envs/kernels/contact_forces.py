@@ -21,6 +21,8 @@ def add_contact_forces(
     f = force[c]
     if pair[0] < 0 or pair[1] < 0 or not wp.isfinite(f):
         return
+    # Newton's third law with the normal from the first geometry to the second; friction is left out, as in the
+    # published senses.
     push = f * normal[c]
     if row[pair[1]] >= 0:
         wp.atomic_add(total, env[c], row[pair[1]], push)

@@ -87,6 +87,7 @@ def fill_links(
     q = xquat[env, link]
     pose[env, link] = wp.transformf(p, wp.quatf(q[1], q[2], q[3], q[0]))
     twist = cvel[env, link]
+    # Velocity of a rigid body shifted from the reference point of the tree to the link's origin: v + ω × r.
     omega = wp.vec3f(twist[0], twist[1], twist[2])
     linear = wp.vec3f(twist[3], twist[4], twist[5]) + wp.cross(omega, p - subtree_com[env, root[link]])
     velocity[env, link] = wp.spatial_vectorf(linear[0], linear[1], linear[2], omega[0], omega[1], omega[2])
@@ -114,6 +115,8 @@ def fill_contacts(
     rows = frame[c]
     normal[c] = wp.vec3f(rows[0, 0], rows[0, 1], rows[0, 2])
     total = float(0.0)
+    # An elliptic cone has one row for the normal force; a pyramidal one has two edges per tangent, each of which
+    # carries a share of it.
     edges = int(1)
     if pyramidal == 1 and dim[c] > 1:
         edges = 2 * (dim[c] - 1)

@@ -190,6 +190,7 @@ class RunningScale(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the scaled values."""
+        # Root mean square instead of a standard deviation: taxels rest at zero, and the zero must stay where it is.
         mean = torch.where(self.count > 0, self.total / self.count.clamp(min=1), 1.0).clamp(min=1e-24)
         return x / mean.sqrt().to(x.dtype)
 
@@ -238,6 +239,7 @@ class _Recurrent(_Learned):
         self.head = nn.Linear(_HIDDEN, self.features)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        # Both states of the LSTM travel in one array, as exported policies pass all memory through one input.
         hidden, memory = h_in.chunk(2, 1)
         hidden, memory = self.cell(self.scale(taxels).flatten(1), (hidden, memory))
         return self.head(hidden), torch.cat((hidden, memory), 1)
@@ -293,6 +295,7 @@ class _Images(_Learned):
             grid = self.grid(taxels).unflatten(1, (-1, 6))
             return self.scale(grid.movedim(2, -1)).movedim(-1, 2).flatten(1, 2)
         planes = self.scale(taxels).permute(0, 1, 3, 2).flatten(1, 2)
+        # Fillers point at one item more than there are, a zero: a single gather lays out all links.
         cells = torch.cat((planes, torch.zeros_like(planes[..., :1])), 2)[..., self.index]
         return cells.unflatten(2, (self.images, self.rows, self.columns)).transpose(1, 2).flatten(0, 1)
 

@@ -58,6 +58,7 @@ class HandCalibration:
         if not torch.isfinite(grid).all():
             raise DataError("The recording holds values that are not finite, so the hand cannot be calibrated on it.")
         cells = grid.double().reshape(-1, len(CHANNELS), GRID_SHAPE[0] * GRID_SHAPE[1]).transpose(1, 2).flatten(0, 1)
+        # Silent sites are left out: their share depends on the recording and would set the unit.
         strength = cells[:, :3].norm(dim=1)
         touched = cells[strength > _TOUCHING * strength.max()]
         if not len(touched):

@@ -37,6 +37,8 @@ class ConvGRUProducts(nn.Module):
     def __init__(self, rows: int, columns: int, kernel: int) -> None:
         super().__init__()
         cells = torch.arange(rows * columns)
+        # Offset from cell q to cell p as a place of the kernel; places outside belong to no product, which pads with
+        # zeros.
         down = cells[:, None] // columns - cells[None, :] // columns + kernel // 2
         right = cells[:, None] % columns - cells[None, :] % columns + kernel // 2
         inside = (down >= 0) & (down < kernel) & (right >= 0) & (right < kernel)
@@ -70,6 +72,8 @@ class ConvGRUProducts(nn.Module):
                 reset, keep = self._normalised(cell, fused, ("r", "u"))
                 remembered = torch.sigmoid(reset + FORGET_BIAS) * state.to(kind)
                 new = self._normalised(cell, torch.addmm(shares[1][step], remembered, split[1][1]), ("c",))[0]
+                # h = u h + (1 − u) c. The state stays in single precision, since small updates vanish in half
+                # precision.
                 state = torch.lerp(torch.tanh(new).float(), state.float(), torch.sigmoid(keep).float())
                 found.append(state)
                 if ended is not None:
@@ -82,7 +86,10 @@ class ConvGRUProducts(nn.Module):
         assert conv.bias is not None
         weight = conv.weight.float().unflatten(0, (len(names), -1))
         bias = conv.bias.float().unflatten(0, (len(names), -1))
+        # Layer norm subtracts the mean over channels, which is linear: taken out of the weights, it costs nothing per
+        # step.
         weight, bias = weight - weight.mean(1, keepdim=True), bias - bias.mean(1, keepdim=True)
+        # The convolution as a dense matrix over all pairs of cells, in one product with the places of the kernel.
         everywhere = weight.flatten(3).flatten(0, 1) @ self.places.flatten(1)  # [O, I, P·P]
         cells = len(self.places[0])
         matrix = everywhere.unflatten(2, (cells, cells)).permute(1, 2, 0, 3).flatten(2).flatten(0, 1)
@@ -92,6 +99,7 @@ class ConvGRUProducts(nn.Module):
         """Return the gates [N, C·P] of centred pre-activations [N, gates·C·P] (Ba et al. 2016)."""
         norms = [cell.norms[name] for name in names]
         parts = fused.unflatten(1, (len(names), cell.out_channels, -1))
+        # The mean is gone already, so the variance is the mean square; its sum is taken in single precision.
         size = torch.linalg.vector_norm(parts, dim=2, keepdim=True, dtype=torch.float32)
         scale = torch.rsqrt(size.square() / cell.out_channels + norms[0].eps).to(fused.dtype)  # type: ignore[operator]
         gain, bias = (torch.stack([getattr(norm, name) for norm in norms])[..., None] for name in ("weight", "bias"))

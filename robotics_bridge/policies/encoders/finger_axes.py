@@ -105,6 +105,7 @@ class FingerAxes:
                 return np.full(len(points), row), _along(self.joints[row], start, points)[0]
         if link != self.palm:
             raise UsageError(f"The link {link!r} is neither the palm {self.palm!r} nor part of a finger.")
+        # A taxel of the palm belongs to the finger axis nearest to it, whose first segment leads over the palm.
         order = sorted(self.chains)
         found = [_along(self.joints[row], 0, points) for row in order]
         nearest = np.argmin([distance for _, distance in found], axis=0)
@@ -141,6 +142,7 @@ def _corners(chain: tuple[str, ...], place: Mapping[str, Any], reference: Layout
     """Return the corners of a finger axis: wrist, joints, and a point beyond the tip in line with the last phalanx."""
     corners = [np.zeros(3), *(place[link][1] for link in chain)]
     steps = [after - before for before, after in pairwise(corners[1:])]
+    # Links whose origins coincide have no direction; the last two that differ show where the finger points.
     long = [step for step in steps if np.linalg.norm(step) > _SAME]
     direction = long[-1] if long else corners[-1] - corners[0]
     tip = reference.get(chain[-1])
@@ -161,6 +163,7 @@ def _along(
     rest = lengths[segment + 1 :].sum()
     step = corners[segment + 1] - corners[segment]
     size = lengths[segment]
+    # Nearest point of the segment: projection on it, held between its ends.
     share = np.clip((points - corners[segment]) @ step / size**2, 0, 1) if size > 0 else np.zeros(len(points))
     distance = np.linalg.norm(points - corners[segment] - share[:, None] * step, axis=1)
     return rest + (1 - share) * size, distance
@@ -185,6 +188,8 @@ def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
         site = np.floor(columns * (np.cumsum(counts) - counts / 2) / counts.sum()).astype(int)
         for column in range(1, columns):
             before, after = values[site < column], values[site >= column]
+            # The edge lies half way between the last taxel before it and the first behind, so that rounding parts no
+            # taxels.
             low = before.max() if len(before) else values.min()
             high = after.min() if len(after) else np.inf
             axes.edges[row, column - 1] = _SAME * (low + high) / 2 if len(before) else 0.0

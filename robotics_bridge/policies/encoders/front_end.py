@@ -133,6 +133,8 @@ class FrontEnd(nn.Module):
             state, held, clock = h_in.split(sizes, 1)
             readings, new, clock = self.resampler(stimulus.unflatten(1, (self.sub_steps, -1)).flatten(2), clock)
             features, after = self.step(readings.reshape(stimulus.shape), state)
+            # The network is stepped in every row; rows whose resampled step is not complete keep their old state. A
+            # branch would make rows depend on each other.
             features, state = torch.where(new, features, held), torch.where(new, after, state)
             return features, torch.cat((state, features, clock), 1)
 

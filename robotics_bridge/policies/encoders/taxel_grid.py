@@ -108,6 +108,8 @@ class TaxelGrid(nn.Module):
                 f"The grid reads [batch, sub-step, {self.items} items, {self.channels} channels] of "
                 f"{self.observe!r}; received {list(taxels.shape)}."
             )
+        # One product for all sites, channels and sub-steps; the transpose puts channels before sites, as encoders read
+        # them.
         sites = nn.functional.linear(taxels.flatten(2), self.matrix)
         grid = sites.unflatten(2, (SITES, len(CHANNELS))).transpose(2, 3)
         return grid.reshape(taxels.shape[0], -1, *GRID_SHAPE)
@@ -141,6 +143,7 @@ def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArr
     wrench = _WRENCHES[observe](points, normals)
     part = np.zeros((SITES, 6, len(points), wrench.shape[2]))
     for index, (row, column) in enumerate(zip(rows, columns, strict=True)):
+        # F = R f and M = R m + (x₀ − x_site) × F: the wrench about the link's origin moved to the middle of its site.
         force = turn @ wrench[index, :3]
         lever = origin - axes.centers[row, column]
         moment = turn @ wrench[index, 3:] + _cross(lever) @ force

@@ -61,6 +61,7 @@ class Resampler(nn.Module):
         for phase in range(self.advance):
             for sample in range(sub_steps):
                 parts = phase * sub_steps + (sub_steps - 1 - sample) * self.cycle
+                # Times as whole numbers of 1/p readings: no rounding decides which readings a sample lies between.
                 whole, rest = divmod(parts, self.advance)
                 weights[phase, sample, kept - 1 - whole] += 1 - rest / self.advance
                 if rest:
@@ -71,6 +72,7 @@ class Resampler(nn.Module):
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return (step [B, S, V], whether it is a new one [B, 1] bool, state [B, state_size])."""
+        # The phase advances by p of q per control step; a step of the encoder is complete where it wraps around.
         phase = torch.remainder(state[:, :1] + self.advance, self.cycle)
         past = state[:, 1:].unflatten(1, (self.past, self.values))
         window = torch.cat((past, x), 1)

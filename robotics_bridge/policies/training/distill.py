@@ -213,6 +213,8 @@ class _Run:
             latent, memory = self.student.unroll(now, self.memory, None, None if features is None else features[None])
             own = self.student.action_of(latent[0]).float()
             right = self.teacher.act(obs).float()
+            # Ross et al. 2011: the student's own states are visited, a share of actions being the teacher's, and the
+            # teacher labels them all.
             taught = torch.rand(len(own), 1, device=self.device) < share
             self.observations, _, terminated, truncated, _ = self.env.step(torch.where(taught, right, own))
             ended = terminated | truncated
@@ -244,6 +246,7 @@ class _Run:
         memory = rollout.memory
         scale = torch.ones(rollout.teacher.shape[-1], device=self.device)
         if self.config.loss == "inv_var_mse":
+            # Error of each joint in units of the teacher's own variance, bounded below for joints that hardly move.
             scale = 1 / rollout.teacher.flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
         sums: dict[str, torch.Tensor] = {}
         for first in range(0, rollout.steps, length):
@@ -258,6 +261,7 @@ class _Run:
         latent, memory = self.student.unroll(given, given["memory"], given["ended"], given.get("features"))
         parts = {"behaviour": self._behaviour(self.student.action_of(latent), given)}
         for head in self.decoders:
+            # Auxiliary decoders read the latent: their losses shape it, and nothing of them remains in the policy.
             aim = given[head.target].flatten(2) * head.scale
             parts[head.target] = head.weight * nn.functional.mse_loss(self.learner.decoders[head.target](latent), aim)
         return parts, memory

@@ -105,6 +105,7 @@ class Modes:
         """Return the modes of a body ``size`` times as large of the same material (decays unchanged)."""
         if not size > 0:
             raise UsageError(f"A body is scaled by a positive factor; received {size!r}.")
+        # Frequencies go with 1 / size, gains with 1 / mass, hence with 1 / size³.
         gain = tuple(value / size**3 for value in self.gain)
         return replace(self, frequency=tuple(value / size for value in self.frequency), gain=gain)
 
@@ -123,6 +124,7 @@ def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16
         raise UsageError(
             f"A body rings between 20 and 20000 Hz in at least one mode; received {lowest!r} Hz, {count!r} modes."
         )
+    # Free bar: wave numbers near (2n + 1) π / 2L, and frequencies with their square.
     every = [(n, lowest * (2 * n + 1) ** 2 / 9) for n in range(1, count + 1)]
     heard = [(n, frequency) for n, frequency in every if frequency <= 20_000]
     frequency = tuple(value for _n, value in heard)

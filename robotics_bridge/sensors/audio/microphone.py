@@ -93,6 +93,7 @@ class Listener:
 
         c, m, envs = self._suite.context, self.microphone, self._suite.num_envs
         rate, age, block = self.samples / dt, c.clock.age, (self.samples, envs)
+        # The ring holds the longest delay, reach / c, a few samples for the interpolation, and the block being written.
         blocks = math.ceil((m.reach / m.speed_of_sound * rate + 3) / self.samples) + 1
         if self._ring is None:
             self._ring = c.zeros((blocks * self.samples, envs, len(self._sources)))
@@ -101,6 +102,7 @@ class Listener:
         for index, (name, runtime) in enumerate(self._sources.items()):
             part = runtime.slices[name]
             c.launch(k.record_source, block, runtime.truth(), part.start, part.count, self._slot, index, self._ring)
+        # Lengths at the start and the end of the block: the kernel lets them change evenly in between.
         place, paths = warp().vec3f(*m.position), [self._now, self._before]
         c.launch(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, *paths)
         inputs = [self._ring, self._slot, self.samples, rate, m.speed_of_sound, m.nearest, m.power, age]

@@ -121,6 +121,7 @@ def solve(
 
     fem = tetrahedra.skfem()
     helpers, elasticity = import_module("skfem.helpers"), import_module("skfem.models.elasticity")
+    # K φ = ω² M φ (4.33) with a consistent mass and quadratic elements.
     basis = fem.Basis(mesh, fem.ElementVector(fem.ElementTetP2()), intorder=4)
     if 3 * (count + 6) > basis.N:
         raise UsageError(f"{count} modes need a finer mesh than {mesh.t.shape[1]} tetrahedra; raise cells.")
@@ -129,6 +130,8 @@ def solve(
     # E = 1 and density 1 keep the numbers near one; the shift makes the free body's stiffness definite.
     size = float(np.ptp(mesh.p, axis=1).max())
     values, vectors = eigsh(stiffness, count + 6, mass, sigma=-1e-3 / size**2, which="LM", v0=np.ones(basis.N))
+    # The six lowest are the rigid motions of a free body. Frequencies scale with √(E/ρ) and mass-normalised shapes with
+    # 1/√ρ, so the eigenproblem is solved for unit constants.
     order = np.argsort(values)[6:]
     speed = material.young_modulus / material.density
     frequency = np.sqrt(values[order] * speed) / (2 * np.pi)
@@ -147,6 +150,7 @@ def _corner_normals(mesh: Any) -> NDArray[np.float64]:
     cross = np.cross(b - a, c - a)
     owner = mesh.f2t[0, facets]
     inward = mesh.p[:, mesh.t[:, owner]].mean(axis=1).T - a
+    # Facets are listed with either orientation; the tetrahedron behind a facet tells which way is out.
     cross *= -np.sign(np.einsum("ni,ni->n", cross, inward))[:, None]
     normal = np.zeros((mesh.p.shape[1], 3))
     for corner in corners:

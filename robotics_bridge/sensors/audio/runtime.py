@@ -68,6 +68,8 @@ class ContactAudioRuntime(ReadoutRuntime):
             theta, radius = 2 * np.pi * frequency * step, np.exp(-decay * step)
             heard = theta < np.pi
             rows = slice(0, len(frequency))
+            # Coefficients of 4.32 for this sample rate: pole radius e^(−d Δt) and angle 2π f Δt, computed in double
+            # precision.
             poles[0, rows, column] = 2 * radius * np.cos(theta)
             poles[1, rows, column] = radius**2
             # The resonator answers an impulse with sin(kθ) / sin θ; this factor makes it the velocity per impulse.
@@ -79,6 +81,7 @@ class ContactAudioRuntime(ReadoutRuntime):
             item.pulse = int(np.clip(round(sensor.contact_time / step), 1, self.samples))
             sources.append(item)
         for array, values in zip((self._own.first, self._own.second, self._own.gain), poles, strict=True):
+            # Four modes side by side in one vector: a thread loads them at once.
             quads = values.reshape(self._quads, 4, -1).transpose(0, 2, 1)
             array.assign(np.ascontiguousarray(quads, dtype=np.float32))
         self._own.sources.assign(self.context.array(sources, SourceParams))

@@ -78,11 +78,11 @@ class ContactAudio(AudioSensor):
                 raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
 
     def layout(self) -> tuple[int, ...]:
-        """One emitter."""
+        """Return the shape of one emitter."""
         return (1,)
 
     def group(self) -> Hashable:
-        """Sensors of equal block and number of modes share one runtime."""
+        """Return block length and quads of modes: sensors that share both share one runtime."""
         return (self.samples, (len(self.modes.frequency) + 3) // 4)
 
 
@@ -126,11 +126,11 @@ class ActuationAudio(AudioSensor):
                 raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
 
     def layout(self) -> tuple[int, ...]:
-        """One emitter per joint."""
+        """Return the shape of one emitter per joint."""
         return (self.joints,)
 
     def group(self) -> Hashable:
-        """Sensors of equal block share one runtime."""
+        """Return the block length: sensors that share it share one runtime."""
         return self.samples
 
 

@@ -48,6 +48,8 @@ def cylinder(radius: float, half_length: float, cells: int) -> Any:
 
 def _rounded(p: NDArray[np.float64], core: float) -> NDArray[np.float64]:
     """Push the shells of a cube [-1, 1] out to spheres; near the middle it stays a cube, shrunk by ``core``."""
+    # A shell of the cube, max |x| = const, becomes a sphere. Blending by the squared distance keeps the middle a cube,
+    # where tetrahedra on spheres would be flat.
     longest, far = np.abs(p).max(axis=0), np.linalg.norm(p, axis=0)
     sphere = np.where(far > 0, longest / np.maximum(far, 1e-12), 1.0)
     share = longest**2
@@ -72,6 +74,8 @@ def voxels(surface: Mesh, cells: int) -> Any:
     middle = (low + high) / 2
     axes = [middle[a] + edge * (np.arange(n + 1) - n / 2) for a, n in enumerate(counts)]
     grid = skfem().MeshTet.init_tensor(*axes)
+    # All six tetrahedra of a voxel are kept or dropped together, by the winding number at its middle: the skin stays
+    # closed.
     centers = grid.p[:, grid.t].mean(axis=1).T
     cell = np.floor((centers - [axis[0] for axis in axes]) / edge).astype(int)
     place = np.array([axis[0] for axis in axes]) + (cell + 0.5) * edge
@@ -96,6 +100,7 @@ def _untangled(mesh: Any, target: NDArray[np.float64]) -> NDArray[np.float64]:
     start, moved = mesh.p, target.copy()
     rest = volumes(start, mesh.t)
     for _ in range(20):
+        # Halving the way back converges to the start, where every volume is sound.
         bad = volumes(moved, mesh.t) * np.sign(rest) < SMALLEST * np.abs(rest)
         if not bad.any():
             return moved

@@ -90,6 +90,8 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     lags = np.zeros(0, int)
     for _ in range(_ROUNDS if moving and guess[1] else 0):
         aligned, found = find_lags(living, guess, log.step, fit)
+        # Lags and dynamics are fitted in turn: each is simple where the other is known. Ends when the lags stay as they
+        # are.
         settled, lags = np.array_equal(found, lags), found
         if settled or (guess[0] == guess[1] and np.all(lags == guess[0])):
             break
@@ -162,6 +164,7 @@ def _gain(fit: Fit, knobs: dict[str, Any], estimates: dict[str, Estimate], notes
         for name in ("gain_low", "gain_high"):
             estimates[name] = Estimate(middle, middle - error, middle + error, "gains are equal within their errors")
         return
+    # For uniform gains the extremes lie inside the range by its width / (n + 1) on average, which is span / (n − 1).
     out = span / (count - 1)
     knobs["gain"] = (float(gains[0] - out), float(gains[-1] + out))
     # The end lies beyond the extreme by at most the span times a^(-1/(n-1)) - 1, at confidence 1 - a per end.

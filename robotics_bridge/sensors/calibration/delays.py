@@ -23,6 +23,7 @@ _WINDOW = 40
 
 def blur(x: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
     """Return the mean of ``x`` over lags of ``first`` to ``last`` readings; it was 0 before."""
+    # Running mean as a difference of two sums: its cost does not depend on the range of lags.
     total = np.cumsum(np.pad(x, (last + 1, 0)))
     end = np.arange(len(x)) + last + 1
     return (total[end - first] - total[end - last - 1]) / (last - first + 1)
@@ -40,6 +41,7 @@ def find_delays(parts: list[Episode], longest: int) -> tuple[int, int]:
     def explained(first: int, last: int) -> float:
         score = 0.0
         for (x, _y), step, power in zip(parts, steps, powers, strict=True):
+            # Squared correlation of differences: gain, bias and drift of the readings do not enter.
             a = np.diff(blur(x, first, last)[longest:])
             own = float(a @ a)
             score += float(((a @ step) ** 2 / own / power).mean()) if own > 0 else 0.0
@@ -103,6 +105,7 @@ def extent(lags: NDArray[np.int64], guess: tuple[int, int]) -> tuple[int, int]:
 
 def _level(rest: NDArray, moves: NDArray, noise: float) -> NDArray:
     """Return what drifts slowly under ``rest`` [T, N], told where no lag matters: ``moves`` [T] is how much one can."""
+    # Readings at which the lag matters would pull the level towards a wrong lag, so they count little.
     weight = 1 / (1 + moves**2 / noise) ** 2
     window = np.ones(2 * _WINDOW + 1)
     total = np.convolve(weight, window)[_WINDOW:-_WINDOW]

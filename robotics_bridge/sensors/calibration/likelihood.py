@@ -114,9 +114,12 @@ class _Likelihood:
         total = 0.0
         extra = self.lagged(d.tau) if d.hysteresis else [0.0] * len(self.x)
         for y, s, e, rate in zip(self.y, self.signal, extra, self.rate, strict=True):
+            # Gaussian likelihood in the sine basis, where differences are independent: no matrix has to be inverted.
             variance = d.walk**2 + d.white**2 * rate
             rest = y
             if self.moving:
+                # Gains are profiled out: for given dynamics the best one of each probe is a weighted projection on the
+                # signal.
                 model = s + d.hysteresis * e
                 weight = model / variance
                 rest = y - np.outer(model, (weight @ y) / max(float(weight @ model), 1e-300))
@@ -155,6 +158,7 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     plain = Dynamics(noise[0], noise[1], 0.0, no_lag)
     best, cost = plain, plain_cost
     if moving:
+        # The likelihood has several maxima in τ: starts spread over the decades that the log can tell.
         taus = np.geomspace(2 * dt, min(duration / 4, 100.0 * dt), 5)
         if known and known.dynamics.hysteresis:
             taus = [known.dynamics.tau]
@@ -164,6 +168,7 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
             )
             if value < cost - 1e-9:
                 best, cost = Dynamics._make(found), value
+    # Likelihood-ratio tests: a knob must earn its place, or every log would have a little drift and hysteresis.
     hysteresis = moving and 2 * (plain_cost - cost) > _SIGNIFICANT + 2.6
     if not hysteresis:
         best, cost = plain, plain_cost
@@ -197,6 +202,8 @@ def _errors(target: _Likelihood, best: Dynamics, free: list[str]) -> dict[str, f
 
     for i in range(n):
         for j in range(n):
+            # Central second differences of the likelihood; the inverse of the curvature is the covariance. The
+            # pseudo-inverse copes with parameters that the log does not tell.
             corners = cost((i, step), (j, step)) - cost((i, step), (j, -step))
             corners += cost((i, -step), (j, -step)) - cost((i, -step), (j, step))
             hessian[i, j] = corners / (4 * step * step)
@@ -212,6 +219,7 @@ def _estimates(best: Dynamics, errors: dict[str, float], quantum: float) -> dict
         value, error = getattr(best, name), Z95 * errors[name]
         return math.exp(value), math.exp(value - error), math.exp(value + error)
 
+    # Rounding to steps q has the variance q²/12, which the fit has counted as white noise.
     white = [math.sqrt(max(value**2 - quantum**2 / 12, 0.0)) for value in spread("log_white")]
     found = {"white": Estimate(white[0], white[1], white[2], how)}
     if "log_walk" in errors:
@@ -240,6 +248,7 @@ def _bias(
         place += n
         # Differences, with the first reading in front: its drift is one step.
         z = np.vstack([rest[:1], np.diff(rest, axis=0)])
+        # Covariance of the differences, tridiagonal: walk² + 2 white² on the diagonal, −white² beside it.
         band = np.zeros((2, count))
         band[0, 1:] = -(white**2)
         band[1] = walk**2 + 2 * white**2

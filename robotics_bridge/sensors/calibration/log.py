@@ -102,6 +102,7 @@ def segments(log: Log) -> list[Episode]:
 
 def find_dead(parts: list[Episode]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.float64]]]:
     """Return per episode which probes [N] never change, and their values."""
+    # Exactly equal: a living probe has noise, or moves by a quantisation step now and then.
     stuck = [np.ptp(y, axis=0) == 0 for _x, y in parts]
     return stuck, [y[0] for _x, y in parts]
 

@@ -167,6 +167,7 @@ class ElastomerRuntime(ProbeRuntime):
         for row, sensor in zip(reach, self._sensors, strict=True):
             shape, pitch = sensor.probes.shape, sensor.probes.pitch or (1.0, 1.0)
             for axis, (step, length) in enumerate(((pitch[1], shape[1]), (pitch[0], shape[0]))):
+                # Distance at which exp(−λ_d r²) falls to the negligible weight; beyond it, markers are not asked.
                 far = math.sqrt(-math.log(_NEGLIGIBLE) / sensor.dilate_spread) if sensor.dilate_spread else math.inf
                 row[axis] = length - 1 if step * length <= far else min(length - 1, math.ceil(far / step))
                 columns.append((sensor.dilate_spread, step))
@@ -188,6 +189,8 @@ class ElastomerRuntime(ProbeRuntime):
             span = place.span
             for plane in range(self._planes):
                 h = height[plane, :, span].unflatten(1, (rows, columns))
+                # Padding to 3 n − 2 along each side holds the full linear convolution, so that nothing wraps around the
+                # edges. Two transforms serve three kernels: the tangential ones share that of h.
                 flat = torch.fft.rfft2(h, s=size)
                 bulge = height[self._planes + plane, :, span].unflatten(1, (rows, columns))
                 raised = torch.fft.rfft2(bulge, s=size)
@@ -226,6 +229,7 @@ def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any
 
     rows, columns = sensor.probes.shape
     pitch = sensor.probes.pitch or (1.0, 1.0)
+    # Kernels of 4.19 over all offsets between two markers, with the layer's factor 1 − κ λ_d r² on the tangential ones.
     y = torch.arange(1 - rows, rows, device=device)[:, None] * pitch[0]
     x = torch.arange(1 - columns, columns, device=device)[None, :] * pitch[1]
     reach = sensor.dilate_spread * (x**2 + y**2)

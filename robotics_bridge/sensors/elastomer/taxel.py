@@ -116,6 +116,7 @@ class ElastomerTaxel(QuerySensor):
             return self.dilation
         if not self.planar:
             return "direct"
+        # The factor 1 − κ λ_d r² is no product of two axes, so recoil needs the full convolution.
         return "fft" if self.layer and self.layer.recoil else "separable"
 
     def group(self) -> Hashable:

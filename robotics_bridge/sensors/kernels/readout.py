@@ -111,10 +111,13 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
         lag = float(0.0)
         drift = float(0.0)
         if age > 0:
+            # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to
+            # clear.
             if wp.static(hysteresis):
                 lag = io.hysteresis[channel, env, n]
             if wp.static(walk):
                 drift = io.walk[channel, env, n]
+        # Hysteresis, drift, white noise, bias, quantisation and dead probes (4.22, 4.25–4.27), in this order.
         y = apply_noise(knobs, signal, env + io.env_offset, probe, channel, age, episode, io.dt, lag, drift)
         if wp.static(hysteresis):
             io.hysteresis[channel, env, n] = y[1]
@@ -183,7 +186,9 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
             if wp.static(hysteresis):
                 if knobs.hysteresis != 0.0:
                     fading = decay(io.dt / knobs.tau)
+            # Channels go in pairs because one Philox call gives the four normal numbers that two of them need.
             for pair in range(wp.static((channels + 1) // 2)):
+                # z holds (white, walk) of the even channel, then of the odd one.
                 z = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
                 for odd in range(2):
                     channel = 2 * pair + odd
@@ -221,6 +226,7 @@ def append_history(
     """
     env, n = wp.tid()
     length = ring.shape[0] // 2
+    # Each value is written at two places one window apart: any window of T updates is then one contiguous slice.
     at = count[0] % length
     for channel in range(value.shape[0]):
         if age[env] == 0:

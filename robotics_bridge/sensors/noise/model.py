@@ -190,4 +190,5 @@ for _alias, _name in {"agg_bool": "bool", "agg_force": "depth", "force_torque": 
 
 def stream_seed(seed: int, name: str) -> int:
     """Return the 64-bit seed of one sensor: a stable hash of the experiment's seed and the sensor's name."""
+    # A hash and not the sensor's number: adding a sensor leaves the noise of the others as it was.
     return int.from_bytes(hashlib.sha256(f"{seed}:{name}".encode()).digest()[:8], "little")

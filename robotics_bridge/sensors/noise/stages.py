@@ -90,6 +90,7 @@ class NoiseStage:
                     f"Sensor {part.name!r} has crosstalk but its {part.count} probes form no grid; "
                     "give it a layout (ny, nx) or set crosstalk to 0."
                 )
+        # One array for all sensors: shorter kernels are padded with zeros.
         half = max(math.ceil(4 * part.noise.crosstalk_sigma) for part in mixed.values())
         weights = np.zeros((len(slices), half + 1), np.float32)
         shape, strength = np.ones((len(slices), 2), np.int32), np.zeros(len(slices), np.float32)
@@ -112,6 +113,7 @@ class NoiseStage:
         signal = x
         if self._mixes:
             first, second = self._buffers
+            # Rows into one buffer, columns into the other: threads read neighbours, so no pass writes what it reads.
             for along, source, target in ((1, x, first), (0, first, second)):
                 context.launch(crosstalk, target.shape, along, x, source, own.part, own.probe, *self._crosstalk, target)
             signal = second
@@ -154,6 +156,7 @@ class DelayLine:
         own, context = self._arrays, self._arrays.context
         if own.total == 0 or context.num_envs == 0:
             return
+        # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
         slots = math.ceil(self._longest / dt - 1e-4) + 1
         if self._ring is None:
             self._ring = own.zeros(True, (slots,))
@@ -168,6 +171,7 @@ class DelayLine:
 
 def gaussian_weights(sigma: float, half: int) -> NDArray[np.float64]:
     """Return the centre and one side of a normalised Gaussian [half + 1], cut at four standard deviations."""
+    # Sums to one over both sides, so that crosstalk moves a signal without making it stronger (4.28).
     weights = np.exp(-0.5 * (np.arange(half + 1) / sigma) ** 2)
     weights[np.arange(half + 1) > 4 * sigma] = 0
     return weights / (weights[0] + 2 * weights[1:].sum())

@@ -168,6 +168,7 @@ def cover_evenly(corners: NDArray, area: NDArray, count: int) -> NDArray[np.floa
     Faces are taken at even steps of their summed area, places within them by the R2 sequence (Roberts 2018), so that
     sums over the points converge faster than over random ones.
     """
+    # Middles of even strata of the summed area: a face gets as many points as its share of the area, to within one.
     steps = (np.arange(count) + 0.5) / count
     faces = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), steps), len(corners) - 1)
     root = 1.32471795724474602596
@@ -187,6 +188,8 @@ def spread_over(corners: NDArray, area: NDArray, count: int, seed: int) -> tuple
     rng = np.random.default_rng(seed)
     many = 8 * count if count <= 4000 else count
     faces = rng.choice(len(corners), many, p=area / area.sum())
+    # Uniform on a triangle: the square root makes up for its width, which grows in proportion to the distance from a
+    # corner.
     u, v = np.sqrt(rng.random(many)), rng.random(many)
     a, b, c = corners[faces].swapaxes(0, 1)
     points = a * (1 - u)[:, None] + b * (u * (1 - v))[:, None] + c * (u * v)[:, None]
@@ -195,6 +198,7 @@ def spread_over(corners: NDArray, area: NDArray, count: int, seed: int) -> tuple
     chosen = np.zeros(count, dtype=int)
     distance = np.linalg.norm(points - points[0], axis=1)
     for index in range(1, count):
+        # Greedy farthest points: each next one is as far as can be from all that were chosen.
         chosen[index] = int(distance.argmax())
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[index]], axis=1))
     return points[chosen], faces[chosen]

@@ -48,8 +48,10 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
     if not 4 <= resolution <= 512:
         raise UsageError(f"The resolution of a distance field lies between 4 and 512 cells; received {resolution}.")
     low, high = mesh.bounds
+    # A margin of a quarter of the box on each side, so that most probes in reach fall within the samples.
     spacing = float((high - low).max()) / resolution
     counts = np.ceil((high - low) / spacing).astype(int) + 1 + 2 * max(4, -(-resolution // 4))
+    # Samples lie symmetrically about the middle of the box, so that a symmetric mesh has a symmetric field.
     origin = (0.5 * (low + high) - 0.5 * spacing * (counts - 1)).astype(np.float32)
     path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npy"
     if path.is_file():

@@ -56,6 +56,8 @@ class PairTable:
         """
         wanted = {"link": link, "members": tuple(members), "contact": contact}
         for number, slot in enumerate(self._slots):
+            # Sensors of one link that may meet the same geometries share a list; lists by distance depend on where the
+            # probes are.
             if all(slot[key] == value for key, value in wanted.items()) and (contact or reach == slot["reach"] == 0):
                 return number
         self._slots.append({**wanted, "center": np.asarray(center, np.float32), "reach": float(reach)})

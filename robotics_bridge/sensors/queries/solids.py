@@ -32,12 +32,14 @@ def bounding_sphere(geometry: Geometry) -> NDArray[np.float32]:
     elif geometry.kind == "capsule":
         radius = size[0] + size[1]
     elif geometry.kind == "cylinder":
+        # Distance of the rim from the middle.
         radius = float(np.hypot(size[0], size[1]))
     elif geometry.kind == "ellipsoid":
         radius = max(size)
     elif geometry.kind == "box":
         radius = float(np.linalg.norm(size[:3]))
     elif geometry.mesh is not None:
+        # Middle of the box, not the mean of the vertices, which are dense where the surface is curved.
         center = geometry.mesh.bounds.mean(axis=0)
         radius = float(np.linalg.norm(geometry.mesh.vertices - center, axis=1).max())
     return np.array([*center, radius], dtype=np.float32)
@@ -57,6 +59,7 @@ def tessellate(geometry: Geometry) -> Mesh:
     elif geometry.kind == "sphere":
         solid = trimesh.creation.icosphere(4, size[0])
     elif geometry.kind == "ellipsoid":
+        # Subdivided on the unit ball and then stretched: triangles stay spread over the whole surface.
         solid = trimesh.creation.icosphere(4, 1.0)
         solid.apply_scale(size)
     elif geometry.kind == "cylinder":
@@ -92,6 +95,7 @@ class Solids:
         self.scene, self.device = scene, device
         self.rows = num_envs if scene.variants else 1
         count = max(len(scene.geometries), 1)
+        # One row serves all environments unless shapes differ: kernels take row env % rows.
         shape = (self.rows, count)
         self.kinds = np.full(shape, OTHER, dtype=np.int32)
         size, bound = np.ones((*shape, 3), np.float32), np.zeros((*shape, 4), np.float32)
@@ -165,5 +169,6 @@ class Solids:
                 self._trees[key] = mesh_tree(surface, self.device)
             mesh = self._trees[key].id
         size, (w, x, y, z) = [*geometry.size, 0.0, 0.0, 0.0][:3], geometry.quaternion
+        # Ours are (w, x, y, z), Warp's (x, y, z, w).
         frame = (*geometry.position, x, y, z, w)
         return KINDS.index(geometry.kind), size, bounding_sphere(geometry), frame, number, mesh

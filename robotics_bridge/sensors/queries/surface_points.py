@@ -53,6 +53,7 @@ def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows
         areas = {g: surface_area(shape) for g, shape in shapes.items()}
         whole = sum(areas.values()) or 1.0
         for g, shape in shapes.items():
+            # The same density of points on all geometries; without a point, a small one could not be felt at all.
             share = max(1, round(points * areas[g] / whole))
             key = (id(shape), share)
             if key not in sampled:
@@ -92,6 +93,8 @@ def halve(points: NDArray, order: NDArray[np.int64], most: int) -> list[NDArray[
 def _in_blocks(points: NDArray) -> NDArray[np.float32]:
     """Order points along a space-filling curve and fill the last block up with NaN."""
     low, high = points.min(axis=0), points.max(axis=0)
+    # Morton code: the bits of three 10-bit coordinates interleaved. Points that follow each other in it lie close
+    # together, so that spheres around blocks of them are small.
     cells = ((points - low) / np.maximum((high - low).max(), 1e-12) * 1023).astype(np.int64)
     code = np.zeros(len(points), np.int64)
     for bit in range(10):
@@ -104,6 +107,7 @@ def _in_blocks(points: NDArray) -> NDArray[np.float32]:
 
 def _spheres(points: NDArray) -> NDArray[np.float32]:
     grouped = points.reshape(-1, BLOCK, 3)
+    # The middle of the bounding box is near the least sphere's and does not follow a crowd of points as the mean does.
     center = 0.5 * (np.nanmin(grouped, axis=1) + np.nanmax(grouped, axis=1))
     radius = np.nanmax(np.linalg.norm(grouped - center[:, None], axis=2), axis=1)
     return np.concatenate([center, radius[:, None]], axis=1).astype(np.float32)

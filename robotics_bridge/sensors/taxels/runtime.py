@@ -83,6 +83,7 @@ class ProximityRuntime(ProbeRuntime):
             law = ProximityParams()
             law.stiffness, law.coupling = sensor.stiffness, sensor.coupling
             laws.append(law)
+            # ρ_b of 4.14, by variant: a body with more points does not push harder.
             row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
         # A processor walks through all probes of an environment anyway, so it may list their points in between.
         self.gathered = not context.device.is_cuda
@@ -116,6 +117,8 @@ class ProximityRuntime(ProbeRuntime):
             position, radius = sensor.probes.position, sensor.probes.radius + sensor.noise.radius
             first = part.start
             for chosen in halve(position, np.arange(part.count), CELL):
+                # Sphere around the sensing spheres of a cell, radius noise included: its list holds every point that a
+                # member may feel.
                 middle = 0.5 * (position[chosen].min(axis=0) + position[chosen].max(axis=0))
                 far = (np.linalg.norm(position[chosen] - middle, axis=1) + radius[chosen]).max()
                 # Rounding must not lose a point at the rim.

@@ -104,11 +104,11 @@ class TemperatureGrid(Sensor):
         material(self.material)
 
     def layout(self) -> tuple[int, ...]:
-        """Shape (nx, ny, nz) of the reading of one environment."""
+        """Return the shape (nx, ny, nz) of the reading of one environment."""
         return tuple(int(n) for n in self.cells)
 
     def group(self) -> Hashable:
-        """Grids that think alike of other links share one runtime."""
+        """Return what is known of other links: grids for which it is the same share one runtime."""
         return (tuple(sorted(self.bodies.items(), key=lambda item: item[0])), self.other)
 
     def corners(self, scene: TouchScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -155,5 +155,6 @@ def _runtime_of(suite: SensorSuite, name: str) -> TemperatureRuntime:
 def _bounds(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the box around a geometry in the link's frame (m)."""
     # Row i of the rotation is the link's axis i in the frame of the geometry.
+    # The box along the link's axes from the support function of the solid, which is exact for turned ones too.
     axes, place = to_matrices(geometry.quaternion), np.array(geometry.position)
     return place - geometry.reach(-axes), place + geometry.reach(axes)

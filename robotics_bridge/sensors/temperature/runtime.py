@@ -80,6 +80,7 @@ class TemperatureRuntime(ReadoutRuntime):
         item.link, item.first = self.context.scene.link_index(sensor.link), first
         item.shape, item.low, item.cell = wp.vec3i(*sensor.cells), wp.vec3f(*low), wp.vec3f(*edges)
         item.conductivity = own.conductivity
+        # C = ρ c_p V of a whole cell; the source is given per volume for the same reason, not per area as in 4.36.
         item.capacity = own.density * own.specific_heat * edges.prod()
         item.emissivity = own.emissivity if sensor.radiates else 0.0
         item.convection, item.ambient, item.base = (
@@ -96,6 +97,7 @@ class TemperatureRuntime(ReadoutRuntime):
 
     def _set_step(self, dt: float) -> None:
         """Exponentiate the diffusion of every axis for a time step (s)."""
+        # Exponentials are taken on the host and only when the step changes.
         if dt == self._dt:
             return
         matrices, offsets, start = [], [], 0
@@ -122,6 +124,8 @@ class TemperatureRuntime(ReadoutRuntime):
         heat.number.zero_()
         c.launch(collect_contacts, state.contact_env.shape[0], state.arrays, heat)
         c.launch(conduct_contacts, heat.kept.shape, state.arrays, heat, self.io)
+        # Sources, contacts and surfaces first, then diffusion axis by axis: the exponentials of the axes commute, so
+        # their order does not matter. Cells read their neighbours, hence two buffers in turn.
         now, spare = self._buffers
         c.launch(exchange_heat, cells, heat, self.io, now)
         for axis in self._axes:
@@ -148,6 +152,8 @@ def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:
         edge: Length of a cell [m].
         spread: α Δt [m²].
     """
+    # The second difference with insulated ends is diagonal in cosines (DCT-II) with eigenvalues 2 (1 − cos(π m / n)) /
+    # edge²; mode 0 has the rate zero, which keeps the mean.
     place = (np.arange(cells) + 0.5) * np.pi / cells
     modes = np.cos(np.outer(place, np.arange(cells)))
     modes /= np.linalg.norm(modes, axis=0)
@@ -171,6 +177,7 @@ def _exposed(cells: tuple[int, int, int], edges: NDArray[np.float64]) -> NDArray
     """Return the outer surface [nx, ny, nz] of each cell (m²)."""
     area = np.zeros(cells)
     for axis in range(3):
+        # A cell at an end of an axis shows one face there, two where the axis has one cell only.
         face = edges.prod() / edges[axis]
         ends = np.moveaxis(area, axis, 0)
         ends[0] += face

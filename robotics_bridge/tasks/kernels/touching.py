@@ -1,4 +1,4 @@
-"""Which objects the finger tips touch. Letters: B environment, C contact, G geometry, K object."""
+"""Objects that the finger tips touch. Letters: B environment, C contact, G geometry, K object."""
 
 import warp as wp
 
@@ -21,6 +21,7 @@ def find_touched(
         return
     a = role[pair[0]]
     b = role[pair[1]]
+    # Many threads may write the same 1, so no atomic operation is needed.
     if a == 1 and b >= 2:
         touched[env[c], b - 2] = 1
     if b == 1 and a >= 2:

@@ -21,7 +21,7 @@ TOLERANCE = 1e-9
 
 
 def contact_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows [3, 3]: the unit ``normal`` and two tangents that complete a right-handed frame.
+    """Return rows [3, 3]: the unit ``normal`` and two tangents that complete a right-handed frame.
 
     After Duff et al. (2017), Building an orthonormal basis, revisited.
     """
@@ -33,7 +33,7 @@ def contact_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix [3, 3] that, applied to u, gives u × ``vector``."""
+    """Return the matrix [3, 3] that, applied to u, gives u × ``vector``."""
     x, y, z = vector.tolist()
     return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
 
@@ -69,6 +69,7 @@ def _sweep(yielding: NDArray, free: NDArray, friction: NDArray, force: NDArray) 
         change = 0.0
         for contact, limit in enumerate(friction.tolist()):
             n = 3 * contact
+            # Exact solution of the one normal row, held at a force of zero: one step of projected Gauss–Seidel.
             step = max(-force[n], -moved[n] / yielding[n, n])
             if step:
                 force[n] += step
@@ -77,6 +78,7 @@ def _sweep(yielding: NDArray, free: NDArray, friction: NDArray, force: NDArray) 
             if not limit:
                 continue
             tangents = slice(n + 1, n + 3)
+            # Both tangents together, within the disc of Coulomb's law for the present normal force.
             block = yielding[tangents, tangents]
             pair = hold_or_slide(block, moved[tangents] - block @ force[tangents], limit * force[n])
             difference = pair - force[tangents]
@@ -102,6 +104,8 @@ def _finish(yielding: NDArray, free: NDArray, friction: NDArray, start: NDArray)
         missed = 0.0
         for contact, limit in enumerate(friction.tolist()):
             n, tangents = 3 * contact, slice(3 * contact + 1, 3 * contact + 3)
+            # Sign of f − w/ρ tells which branch of the projection holds: open, sticking or sliding. Rows of an open
+            # contact stay as the identity, which sets its force to zero.
             pressed = force[n] - scale[n] * moved[n]
             missed = max(missed, abs(force[n] - max(pressed, 0.0)))
             if pressed <= 0:
@@ -120,6 +124,7 @@ def _finish(yielding: NDArray, free: NDArray, friction: NDArray, start: NDArray)
             way = pushed / size
             residual[tangents] = force[tangents] - most * way
             missed = max(missed, float(np.abs(residual[tangents]).max()))
+            # Derivative of the projection on the disc: turning with the slip, growing with the normal force.
             across = most / size * (np.eye(2) - np.outer(way, way))
             slope[tangents] += rate * across @ yielding[tangents]
             slope[tangents, tangents] -= across
@@ -138,7 +143,7 @@ def _finish(yielding: NDArray, free: NDArray, friction: NDArray, start: NDArray)
 
 
 def hold_or_slide(yielding: NDArray[np.float64], slip: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """Tangential force [2] of at most ``most`` that stops the slip, or that opposes what slip remains.
+    """Return the tangential force [2] of at most ``most`` that stops the slip, or that opposes what slip remains.
 
     It minimises ½ f·Y f + s·f over the disc of radius ``most``, Y [2, 2] being the ``yielding`` and s [2] the
     ``slip`` without force. A whisker yields a thousand times less along itself than across, so both
@@ -147,6 +152,8 @@ def hold_or_slide(yielding: NDArray[np.float64], slip: NDArray[np.float64], most
     if not most:
         return np.zeros(2)
     (a, b), (_, c) = yielding.tolist()
+    # Axes of the 2 × 2 matrix: there the law for a multiplier λ reads f = −s / (Y + λ), one scalar equation for |f| =
+    # most.
     turn = 0.5 * math.atan2(2 * b, a - c)
     cosine, sine = math.cos(turn), math.sin(turn)
     middle, half = (a + c) / 2, math.hypot((a - c) / 2, b)

@@ -184,6 +184,8 @@ class _Run:
         rates = [*self.drive.velocity[n], *self.rates]
         forces = world.inverse_dynamics(q, rates, [*self.drive.acceleration[n], *([0.0] * len(self.rates))])
         mass = world.mass_matrix(q)
+        # (M + h D + h² K) v⁺ = M v − h (c + K q): springs and dampers at the end of the step, inertia and bias at its
+        # start. The follicle's rows are left out since its motion is prescribed.
         hinged = mass[FOLLICLE:, FOLLICLE:]
         system = hinged + np.diag(h * self.damping + h * h * self.stiffness)
         forces = forces - self._loads(n, q)
@@ -196,6 +198,7 @@ class _Run:
         if rows is None:
             after = _solve(system, impulse)
         else:
+            # One factorisation serves the free motion and the compliance of every contact row.
             both = _solve(system, np.column_stack([impulse, rows.jacobian[:, FOLLICLE:].T]))
             after, yielding = both[:, 0], h * both[:, 1:]
             to_rows = rows.jacobian[:, FOLLICLE:] * h
@@ -203,7 +206,10 @@ class _Run:
             after = after + yielding @ force
             forces = forces - rows.jacobian.T @ force
             self._touch(n, rows, force)
+        # Reaction of the prescribed joints: inverse dynamics was taken with hinges that do not accelerate, so the
+        # coupling inertia times their acceleration is added.
         follicle = forces[:FOLLICLE] + mass[:FOLLICLE, FOLLICLE:] @ ((after - self.rates) / h)
+        # Moment of the first two springs and dampers at the end of the step, as the implicit step applied it.
         moments = -(self.stiffness[:2] * (self.hinges[:2] + h * after[:2]) + self.damping[:2] * after[:2])
         self.wrench[n] = self._action(n, follicle, moments)
         self.hinges, self.rates = self.hinges + h * after, after
@@ -221,7 +227,7 @@ class _Run:
         return too_strong(strength, strongest) if strength > strongest else ""
 
     def _loads(self, n: int, q: list[float]) -> NDArray[np.float64]:
-        """Joint forces [6 + 2N] of the loads of the job at step n."""
+        """Return the joint forces [6 + 2N] of the loads of the job at step n."""
         total = np.zeros(len(q))
         for load in self.loads:
             if self.times[n] >= load.stop:
@@ -230,6 +236,7 @@ class _Run:
             share = (load.arc - self.chain.nodes[link]) / (self.chain.nodes[link + 1] - self.chain.nodes[link])
             self.world.place(q)
             _, axis, linear, angular = self.world.jacobian(link, q)
+            # Jᵀ F with J the velocity of the loaded point: that of the link's start plus ω × arm.
             arm = share * self.chain.lengths[link] * MILLI * axis
             total += (linear + cross_matrix(arm) @ angular).T @ np.multiply(load.force, MILLI)
         return total
@@ -243,6 +250,7 @@ class _Run:
         for number, (where, turn) in enumerate(self.poses):
             if self.travels[number] or not n:
                 world.place_obstacle(number, where[n + 1], turn[n + 1])
+        # Farthest that any point can move: each hinge's turn times the length of whisker beyond it.
         margin = SEARCH + float(np.abs(moved) @ self._beyond)
         if not math.isfinite(margin):
             return None
@@ -257,6 +265,7 @@ class _Run:
             arm = point - start
             axes.append(frame)
             jacobian.append(frame @ (linear + cross_matrix(arm) @ angular))
+            # Way of the follicle less the way of the obstacle at the point: what friction feels while the hinges rest.
             slip = frame @ (self._carried(n, point) - self._pushed(n, number, point - distance * normal))
             gaps.append([distance, slip[1], slip[2]])
             overlap = max(overlap, slip[0] - distance)
@@ -273,12 +282,12 @@ class _Run:
         )
 
     def _carried(self, n: int, point: NDArray) -> NDArray[np.float64]:
-        """Way [3] that the follicle carried a point, given at the end of step n, with the hinges at rest."""
+        """Return the way [3] that the follicle carried a point, given at the end of step n, with the hinges at rest."""
         back = self.frames[n] @ (self.frames[n + 1].T @ (point - self.path[n + 1, :3]))
         return point - self.path[n, :3] - back
 
     def _pushed(self, n: int, number: int, point: NDArray) -> NDArray[np.float64]:
-        """Way [3] that a point of an obstacle went in step n."""
+        """Return the way [3] that a point of an obstacle went in step n."""
         where, turns = self.poses[number][0], self.turns[number]
         return point - where[n] - turns[n] @ (turns[n + 1].T @ (point - where[n + 1]))
 
@@ -290,7 +299,7 @@ class _Run:
         self.penetration = max(self.penetration, rows.overlap)
 
     def _action(self, n: int, follicle: NDArray, moments: NDArray) -> NDArray[np.float64]:
-        """Action of the whisker on its base [6] (N, N·m) from the reactions of follicle and first two hinges."""
+        """Return the whisker's action on its base [6] (N, N·m) from the reactions of follicle and first two hinges."""
         base = self.frames[n]
         rest, first = self.chain.rest_angles[0], self.hinges[0]
         bent = base @ np.array(
@@ -316,7 +325,7 @@ def _solve(system: NDArray, right: NDArray) -> NDArray[np.float64]:
 
 @functools.cache
 def _cholesky() -> tuple[Any, Any]:
-    """LAPACK's dpotrf and dpotrs, without the checks that would cost more than the solution."""
+    """Return LAPACK's dpotrf and dpotrs, without the checks that would cost more than the solution."""
     from scipy.linalg import get_lapack_funcs
 
     factorise, substitute = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)

@@ -100,13 +100,13 @@ class BulletWorld:
         self.bullet.disconnect(physicsClientId=self.client)
 
     def mass_matrix(self, q: Sequence[float]) -> NDArray[np.float64]:
-        """Joint-space inertia [6 + 2N, 6 + 2N] at the joint positions ``q``."""
+        """Return the joint-space inertia [6 + 2N, 6 + 2N] at the joint positions ``q``."""
         return np.array(self.bullet.calculateMassMatrix(self.whisker, q, physicsClientId=self.client))
 
     def inverse_dynamics(
         self, q: Sequence[float], rate: Sequence[float], acceleration: Sequence[float]
     ) -> NDArray[np.float64]:
-        """Joint forces [6 + 2N] that cause the accelerations without contacts, gravity included."""
+        """Return the joint forces [6 + 2N] that cause the accelerations without contacts, gravity included."""
         return np.array(
             self.bullet.calculateInverseDynamics(self.whisker, q, rate, acceleration, physicsClientId=self.client)
         )
@@ -130,6 +130,7 @@ class BulletWorld:
         Only pairs nearer than ``margin`` (mm) are found; negative distances are overlaps. Bullet measures from the
         cores of the links; what surrounds a core is everywhere as thick, so it only shifts distance and point.
         """
+        # Bullet searches between cores, so the margin is added to the distance that is searched.
         margin += float(self._margins.max())
         for number, bodies in enumerate(self.parts):
             for body, part in zip(bodies, self.obstacles[number].parts, strict=True):
@@ -137,11 +138,13 @@ class BulletWorld:
                 found = self.bullet.getClosestPoints(self.whisker, body, distance=margin, physicsClientId=self.client)
                 for point in found:
                     link, normal = (point[3] - FOLLICLE) // 2, np.array(point[7])
+                    # Closest points of the cores, moved by the margin along the normal, are those of the thickened
+                    # links.
                     around = float(self._margins[link])
                     yield link, number, np.array(point[5]) - around * normal, normal, point[8] + extra - around
 
     def jacobian(self, link: int, q: Sequence[float]) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Start of a link [3], its axis [3], and how joint rates move the start [3, 6 + 2N] and turn the link."""
+        """Return a link's start [3], its axis [3], and how joint rates move the start [3, 6 + 2N] and turn the link."""
         joint, zero = self._joint(link), [0.0] * len(q)
         state = self.bullet.getLinkState(self.whisker, joint, physicsClientId=self.client)
         linear, angular = self.bullet.calculateJacobian(
@@ -151,7 +154,7 @@ class BulletWorld:
         return np.array(state[4]), axis, np.array(linear), np.array(angular)
 
     def shape(self) -> NDArray[np.float64]:
-        """Joints and tip [N + 1, 3] (mm) as the whisker was last placed."""
+        """Return joints and tip [N + 1, 3] (mm) as the whisker was last placed."""
         joints = [self._joint(link) for link in range(self.chain.links)]
         states = self.bullet.getLinkStates(
             self.whisker, joints, computeForwardKinematics=1, physicsClientId=self.client
@@ -161,7 +164,7 @@ class BulletWorld:
         return np.array([*points, points[-1] + axis * self.chain.lengths[-1] * MILLI])
 
     def _joint(self, link: int) -> int:
-        """Bullet's number of the second hinge of a link, which carries its mass and its shape."""
+        """Return Bullet's number of the second hinge of a link, which carries its mass and its shape."""
         return FOLLICLE + 2 * link + 1
 
     def _add_whisker(self) -> int:
@@ -178,6 +181,7 @@ class BulletWorld:
             axes += [(0, 1, 0), (0, 0, 1)]
             if i:
                 places[first] = (chain.lengths[i - 1] * MILLI, 0.0, 0.0)
+            # Rest bend about z as a fixed turn before the two hinges, of which only the second carries mass.
             turns[first] = (0.0, 0.0, np.sin(chain.rest_angles[i] / 2), np.cos(chain.rest_angles[i] / 2))
             centres[second] = (chain.centres[i] * MILLI, 0.0, 0.0)
             masses[second] = chain.masses[i] * MICRO
@@ -208,6 +212,7 @@ class BulletWorld:
     def _link(self, link: int) -> int:
         """Add the collision shape of a link, less its margin: the slim cone inside a tapered link, or a capsule."""
         core, length = self._cores[link], self.chain.lengths[link] * MILLI
+        # A capsule keeps its own radius; a cone is built without the thickness that its margin adds.
         if core == 0:
             return self._capsule(np.zeros(3), np.array([length, 0, 0]), self.chain.radii[link] * MILLI)
         radii = self.chain.whisker.radius(self.chain.nodes[link : link + 2])
@@ -267,9 +272,10 @@ class BulletWorld:
 
 
 def _turn_from_z(axis: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Quaternion (x, y, z, w) of the shortest turn of the z axis to the unit vector ``axis``."""
+    """Return the quaternion (x, y, z, w) of the shortest turn of the z axis to the unit vector ``axis``."""
     x, y, z = axis
     if z < -1 + 1e-12:
         return 1.0, 0.0, 0.0, 0.0
+    # (cos ½θ, sin ½θ · z × axis / |z × axis|) by half-angle formulas; the opposite direction has no unique turn.
     half = np.sqrt((1 + z) / 2)
     return -y / (2 * half), x / (2 * half), 0.0, half

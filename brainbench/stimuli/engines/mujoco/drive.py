@@ -46,6 +46,7 @@ def drive_free(position: NDArray[np.float64], quaternion: NDArray[np.float64], s
     """
     from scipy.spatial.transform import Rotation
 
+    # A semi-implicit step moves by the velocity after it: the forward difference is that velocity exactly.
     linear = np.diff(position, axis=0) / step
     turns = Rotation.from_quat(np.roll(quaternion, -1, axis=-1))
     angular = (turns[:-1].inv() * turns[1:]).as_rotvec() / step
@@ -55,6 +56,8 @@ def drive_free(position: NDArray[np.float64], quaternion: NDArray[np.float64], s
 def _drive(position: NDArray, after: NDArray, step: float) -> PrescribedMotion:
     """Build a drive from positions before and velocities after each step."""
     acceleration = np.empty_like(after)
+    # Second difference of the path. Force B a on the armature B makes the integrator's own velocities those of the
+    # path.
     acceleration[1:] = np.diff(after, axis=0) / step
     # The acceleration at the start is unknown before the first sample: continue the next one.
     acceleration[0] = acceleration[1] if len(after) > 1 else 0.0

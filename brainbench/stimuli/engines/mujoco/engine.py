@@ -113,6 +113,7 @@ def _simulate(run: SteppedJob) -> Trace:
 
 def _wrench(built: WhiskerModel, sensors: NDArray, steps: NDArray) -> NDArray[np.float64]:
     """Return force and moment [n, 6] (N, N·m, world) of the whisker on its base before ``steps`` [n]."""
+    # From mN and µN·m to SI units, then from the frame of the base to the world.
     local = sensors[steps, :6] * np.repeat([1 / MILLI, 1 / MICRO], 3)
     # MuJoCo's sensor reads the action of the base on the whisker, in the frame of the base.
     return -np.einsum("nij,nkj->nki", built.rotation[steps], local.reshape(-1, 2, 3)).reshape(-1, 6)
@@ -142,6 +143,7 @@ def _integrate(
         count = min(CHUNK, steps - first)
         control = _control(built, job, times[first : first + count], first)
         q = v = 0
+        # Prescribed coordinates are put on their path at the start of every chunk, so that rounding does not add up.
         for drive in built.drives:
             position, velocity = drive.position[first], drive.velocity[first]
             state[at][q : q + len(position)] = position
@@ -179,6 +181,7 @@ def _control(built: WhiskerModel, job: Job, times: NDArray, first: int) -> NDArr
     column = 0
     for drive in built.drives:
         width = drive.acceleration.shape[1]
+        # F = B a: against an armature of 1e9 the reaction of the whisker changes nothing that counts.
         forces[:, column : column + width] = ARMATURE * drive.acceleration[first : first + len(times)]
         column += width
     if not job.loads:
@@ -205,6 +208,7 @@ def _rotation_zyz(rest: float, y: NDArray, z: NDArray) -> NDArray[np.float64]:
     cr, sr = np.cos(rest), np.sin(rest)
     cy, sy, cz, sz = np.cos(y), np.sin(y), np.cos(z), np.sin(z)
     zero = np.zeros_like(y)
+    # Ry · Rz written out for all steps at once, in place of a stack of matrix products.
     turn = np.stack([cy * cz, -cy * sz, sy, sz, cz, zero, -sy * cz, sy * sz, cy], axis=-1).reshape(-1, 3, 3)
     return np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]]) @ turn
 
@@ -212,6 +216,7 @@ def _rotation_zyz(rest: float, y: NDArray, z: NDArray) -> NDArray[np.float64]:
 def _contacts(slots: NDArray, shape: NDArray, chain: Chain) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return whether there is contact [n], and the force-weighted mean arc length (m) of the contact points [n]."""
     slots = slots.reshape(len(slots), -1, SLOT_WIDTH)
+    # Weighted by force, so that a contact that merely grazes does not pull the mean arc towards itself.
     force = np.linalg.norm(slots[..., 1:4], axis=-1)
     total = force.sum(axis=1)
     contact = total > 0
@@ -225,6 +230,7 @@ def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.
     """Return the arc lengths [n, k] (m) of the points of chains [n, N + 1, 3] nearest to ``points`` [n, k, 3]."""
     along = np.diff(joints, axis=1)[:, None]
     offset = points[:, :, None] - joints[:, None, :-1]
+    # Nearest point of every link as a segment, all links at once; the nearest of them gives the arc length.
     share = np.clip(np.sum(offset * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
     distance = np.linalg.norm(offset - share[..., None] * along, axis=-1)
     link = np.argmin(distance, axis=-1)

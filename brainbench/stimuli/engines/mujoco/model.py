@@ -149,6 +149,7 @@ def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[El
     Rotations that do not change become body orientations, so only moving coordinates cost.
     """
     body = _add(world, "body", pos=position[0])
+    # Slides first, in world axes, then the three turns of the follicle: the same order as its Euler angles.
     moving = np.flatnonzero(np.ptp(position, axis=0) > 0)
     paths = [position[:, axis] - position[0, axis] for axis in moving]
     for axis in moving:
@@ -184,6 +185,7 @@ def _add_links(
     for i in range(chain.links):
         body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
         end = chain.lengths[i] * MILLI
+        # Bending about two axes across the link with the chain's lumped stiffness; twist is left out.
         for axis in ((0, 1, 0), (0, 0, 1)):
             _add(
                 body,
@@ -226,18 +228,19 @@ def _segment(
 
 
 def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
-    """Largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule.
+    """Return the largest radius (mm) of the cone inside a link, and what its margin adds; both 0 for a plain capsule.
 
     Where a step's ``travel`` (mm) may bury the margin, MuJoCo would find the way out of the cone itself in a wrong
     direction and the whisker would hook; a capsule is safe to any depth.
     """
     first, last = chain.whisker.radius(chain.nodes[link : link + 2]) * MILLI
+    # A link of radii r₁ > r₂ is taken as all points within r₂ of a slim cone of radius r₁ − r₂ that ends in a point.
     core, margin = float(abs(first - last)), float(min(first, last))
     return (core, margin) if core >= LEAST_TAPER and margin >= SAFE_TRAVEL * travel else (0.0, 0.0)
 
 
 def _travel(job: Job, reach: Reach, times: NDArray, position: NDArray, euler: NDArray) -> float:
-    """Farthest (mm) that a point of the unbent whisker can move against an obstacle in one step."""
+    """Return how far (mm) a point of the unbent whisker can move against an obstacle in one step at most."""
     moves = (step_travel(job.whisker, position / MILLI, euler, obstacle, times) for obstacle in reach.obstacles)
     return max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
 
@@ -271,6 +274,8 @@ def _add_obstacles(
                 priority=1,
                 friction=(friction, 0, 0),
                 condim=3 if friction > 0 else 1,
+                # Critically damped contact whose time constant follows the step: its error shrinks together with the
+                # step.
                 solref=(CONTACT_TIME * step, 1),
                 solimp=(CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 1e-3),
             )
@@ -285,6 +290,7 @@ def _add_obstacle_joints(body: Element, position: NDArray, quaternion: NDArray, 
     moving = np.flatnonzero(np.ptp(position, axis=0) > 0)
     if not len(moving):
         return []
+    # Slide axes are given in the frame of the turned body, the path in world axes.
     to_body = to_matrices(quaternion[0]).T
     for axis in moving:
         _add(body, "joint", type="slide", axis=to_body[:, axis], armature=ARMATURE)

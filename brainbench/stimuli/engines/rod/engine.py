@@ -146,6 +146,7 @@ def _simulate(
     """Run jobs that share their readings and their capacity in one launch, and return their traces."""
     first = next(iter(jobs.values()))
     stop = first.times[-1]
+    # Base and obstacles are looked at about once per knot of their motion to find what is in reach.
     seen = np.linspace(first.start, stop, max(2, math.ceil((stop - first.start) / KNOT)))
     tasks: list[_Task] = []
     traces: dict[int, Trace] = {}
@@ -228,6 +229,7 @@ def _too_fast(task: _Task, shortest: float) -> tuple[float, float]:
     spans = np.diff(task.times)
     share = np.divide(shortest, spans, out=np.zeros_like(spans), where=spans > 0)
     for obstacle in task.reach.obstacles:
+        # Ways between knots, scaled to the shortest step that a retry may take.
         travel = step_travel(task.job.whisker, task.position, task.euler, obstacle, task.times) * share
         if (travel > WIDEST / MILLI).any():
             first = int(np.argmax(travel > WIDEST / MILLI))
@@ -237,6 +239,7 @@ def _too_fast(task: _Task, shortest: float) -> tuple[float, float]:
 
 def _trace(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds: float) -> Trace:
     """Return the trace of a job, NaN from where it cannot be trusted."""
+    # Readings at the very moment of failure are not trusted either.
     good = job.times < result.verdict.until[row, 0] - 1e-9
     arc = result.contact[row, :, 0].astype(float)
     touching = (arc >= 0) & good

@@ -176,6 +176,7 @@ class WhiskerSolver:
         options.start = start * MILLI
         options.quasistatic = int(self.quasistatic)
         weight = LIGHT if self.quasistatic else 1.0
+        # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.
         options.gravity = structs.vec3(*np.divide(gravity, MILLI * weight).tolist())
         options.axes = structs.mat33(*(np.eye(3) if axes is None else axes).ravel().tolist())
         options.shape = int(record_shape)
@@ -245,6 +246,7 @@ def _strong(
     """Return ``strength``, ``strong_at`` and ``strongest`` of :class:`RunFacts`, [row, column]."""
     force = wrench[..., :3]
     strength = np.sqrt(np.einsum("...d,...d", force, force))
+    # Written as "not at most" so that NaN counts as too strong.
     wild = ~(strength <= strongest[:, None])
     first = wild.argmax(axis=1)
     at = np.where(wild.any(axis=1), readings[first], np.inf)

@@ -21,7 +21,7 @@ LEVELS = 7
 
 
 def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Order [triangle] of triangles [triangle, 3, 3] in which every aligned run of 8, 16, 32, … lies together.
+    """Return the order [triangle] of triangles [triangle, 3, 3] in which aligned runs of 8, 16, 32, … lie together.
 
     Runs are halved along the longest side of the box of their middles, from the whole down to leaves.
     """
@@ -34,6 +34,8 @@ def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
     while run > WIDE:
         here = middles[order]
         begins = np.arange(0, count, run)
+        # All runs of one level at once: boxes by reduceat, then one sort whose keys hold the run and the place along
+        # its side.
         low, high = np.minimum.reduceat(here, begins), np.maximum.reduceat(here, begins)
         axis = np.argmax(high - low, axis=1)
         which = np.arange(count) // run
@@ -46,7 +48,7 @@ def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def tree_boxes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Boxes [box, 2, 3] (lowest, highest corner) of ordered triangles: of all leaves, then of their parents, and so on.
+    """Return boxes [box, 2, 3] (lowest, highest corner) of ordered triangles: of leaves, then of parents, and so on.
 
     The last level has no more than eight boxes; a level that follows ``n`` boxes has ⌈n / 8⌉.
     """
@@ -54,6 +56,7 @@ def tree_boxes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     levels = []
     while not levels or len(low) > WIDE:
         begins = np.arange(0, len(low), WIDE)
+        # Parents from the boxes of their children, level by level.
         low, high = np.minimum.reduceat(low, begins), np.maximum.reduceat(high, begins)
         levels.append(np.stack([low, high], axis=1))
     return np.concatenate(levels)

@@ -126,7 +126,7 @@ def _knot_times(start: float, stop: float) -> tuple[NDArray[np.float64], float]:
 
 
 def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], start: float) -> NDArray[np.float64]:
-    """Knots [n, 16] from places and rotations just before, at and just after the knot times."""
+    """Return knots [n, 16] from places and rotations just before, at and just after the knot times."""
     (place0, turn0), (place, turn), (place1, turn1) = around
     # At the very start there may be no instant before: the difference is then one-sided.
     clipped = start >= 0
@@ -136,6 +136,7 @@ def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], st
     spin0 = np.where(back > 0, spin0, spin1)
     knots = np.empty((len(times), 16))
     knots[:, :3] = place * MILLI
+    # Central differences over 20 µs, whose error is of second order; m per s are mm per ms.
     knots[:, 3:6] = (place1 - place0) / span
     knots[:, 6:10] = _continuous(rotations.from_matrices(turn))
     knots[:, 10:13] = _spin(turn0, turn1) / span / MILLI
@@ -144,8 +145,9 @@ def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], st
 
 
 def _spin(before: NDArray, after: NDArray) -> NDArray[np.float64]:
-    """Rotation vectors [n, 3] (rad, world) between rotations [n, 3, 3]; small angles."""
+    """Return the rotation vectors [n, 3] (rad, world) between rotations [n, 3, 3]; small angles."""
     turn = after @ np.swapaxes(before, -1, -2)
+    # Antisymmetric part of the relative rotation, sin(angle) times the axis; angles between neighbours are tiny.
     return np.stack(
         [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=-1
     ) / 2  # fmt: skip
@@ -153,6 +155,7 @@ def _spin(before: NDArray, after: NDArray) -> NDArray[np.float64]:
 
 def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Choose signs so that neighbours never jump to the antipode."""
+    # q and −q are the same rotation, but a cubic from one to the other would turn all the way round or vanish.
     flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0, -1.0, 1.0))
     return quaternion * np.concatenate([[1.0], flips])[:, None]
 
@@ -185,6 +188,7 @@ class PackedChains:
             taper[:n, w] = np.stack(
                 [radii[:-1], radii[1:], chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI], axis=1
             )
+        # Damping ratio ζ of the first mode ω₁ as stiffness-proportional damping, β = 2 ζ / ω₁.
         beta = [
             0 if self.quasistatic else 2 * c.whisker.damping_ratio / c.frequencies()[0] * MILLI for c in self.chains
         ]
@@ -201,7 +205,7 @@ class PackedChains:
 
 @dataclass
 class PackedJobs:
-    """Which whisker meets which scene in each job of a launch, and where its results go. Letters: job."""
+    """Jobs of a launch: the whisker and the scene of each, and the place of its results. Letters: job."""
 
     whisker: NDArray[np.int32]
     """[job] index of the chain."""

@@ -64,6 +64,7 @@ class Slices:
         )
         on.budget = budget or (1 if lanes < FEW else BUDGET)
         queue = np.zeros(queues, dtype=np.int32)
+        # All whiskers begin in the queue that waits for nothing.
         queue[AFTER_OTHERS] = np.arange(lanes)
         size = np.zeros(3, dtype=np.int32)
         size[AFTER_OTHERS] = lanes

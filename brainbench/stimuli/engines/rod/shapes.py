@@ -77,6 +77,7 @@ class PackedShapes:
             solids = obstacle.parts if obstacle.surface is None else (obstacle.surface,)
             for solid in solids:
                 row = self._row(solid)
+                # Fastest that any point can be: speed of the origin plus spin times the farthest distance from it.
                 reach = float(np.linalg.norm(np.abs(solid.bounds()).max(axis=0))) * MILLI
                 speed = np.linalg.norm(knots[:, 3:6], axis=1) + np.linalg.norm(knots[:, 10:13], axis=1) * reach
                 row |= {"radius": reach, "speed": float(speed.max()), "track": track}
@@ -112,6 +113,8 @@ class PackedShapes:
                 return row | box | {"turn": np.array(solid.quaternion)}
             case Capsule() | Cylinder():
                 ends = _mm(solid.start), _mm(solid.end)
+                # Capsules and cylinders are kept by half length, middle and a turn from z, so that the kernel measures
+                # in their frame.
                 half = float(np.linalg.norm(ends[1] - ends[0])) / 2
                 kind = CAPSULE if isinstance(solid, Capsule) else CYLINDER
                 size = np.array([solid.radius * MILLI, half, 0.0])
@@ -167,7 +170,7 @@ class PackedShapes:
 
 
 def hull_faces(part: ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices and outward faces of the convex hull of a part."""
+    """Return the vertices and outward faces of the convex hull of a part."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(part.vertices)
@@ -180,7 +183,7 @@ def hull_faces(part: ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.int32]
 
 
 def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Outward directions [face, 7, 3] of each face, its corners and the edges opposite to them.
+    """Return the outward directions [face, 7, 3] of each face, its corners and the edges opposite to them.
 
     Angle-weighted (Baerentzen & Aanaes 2005): their sign tells inside from outside at every closest point.
     """
@@ -191,9 +194,12 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
     at_vertex = np.zeros_like(vertices)
     for k in range(3):
         to_next, to_last = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
+        # Angle of the face at the corner by atan2, which keeps its digits at slim triangles where an arc cosine does
+        # not.
         angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_last), axis=1), np.sum(to_next * to_last, axis=1))
         for axis in range(3):
             at_vertex[:, axis] += np.bincount(faces[:, k], normals[:, axis] * angle, len(vertices))
+    # Each edge gets one number from its two corners: both faces at it add to the same sum.
     edges = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1), axis=2)
     names = edges[..., 0].astype(np.int64) * len(vertices) + edges[..., 1]
     _, which = np.unique(names, return_inverse=True)

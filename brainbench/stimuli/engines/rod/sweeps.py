@@ -229,12 +229,15 @@ class SweepLauncher:
         turns = np.array([self._turn(rotation) for rotation in rotations])
         # Turned about z: how far it then reaches along x and y.
         x, y = surface.outline.T
+        # The lowest corner of the outline's convex hull is that of the whole surface.
         low = np.stack([(turns[:, k, 0, None] * x + turns[:, k, 1, None] * y).min(axis=1) for k in (0, 1)], axis=1)
         quaternion = from_matrices(head.T @ turns)
         which = np.searchsorted(rotations, [sweep.rotation for sweep in sweeps])
         speed, height, distance, size = (
             np.array([getattr(sweep, name) for sweep in sweeps]) for name in ("speed", "height", "distance", "size")
         )
+        # Objects are scaled to a diagonal and then shifted by how far the turned outline reaches, so that distances
+        # count from the surface.
         scale = size / diagonal
         reach = low[which] * (scale / MILLI)[:, None]
         side = grid.start - reach[:, 1] if grid.placing == "clear" else grid.start + reach[:, 1]

@@ -75,6 +75,7 @@ def gather_contacts(state: StateArrays, own: ContactSoundArrays):
     vb = state.velocity[env, b]
     oa = wp.transform_get_translation(state.pose[env, a])
     ob = wp.transform_get_translation(state.pose[env, b])
+    # Slip at the contact point, v_a + ω_a × (p − o_a) less the same of the other link, without its normal part.
     slip = wp.spatial_top(va) + wp.cross(wp.spatial_bottom(va), p - oa)
     slip = slip - wp.spatial_top(vb) - wp.cross(wp.spatial_bottom(vb), p - ob)
     n = state.contact_normal[c]
@@ -94,6 +95,8 @@ def excite_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     earlier = own.before[env, s]
     if io.age[env] == 0:
         earlier = float(0.0)
+    # Source and filter: a rise of force is an impact and excites the modes with an impulse, sliding excites them with
+    # noise.
     rise = own.force[env, s] - earlier
     u = float(0.0)
     if rise > source.threshold and k < source.pulse:
@@ -126,6 +129,8 @@ def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
         if io.age[env] == 0:
             a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
             b = a
+        # y[k] = 2 r cos θ y[k−1] − r² y[k−2] + u[k] (4.32), with poles of radius r < 1, hence stable at any block
+        # length.
         c1 = own.first[q, s]
         c2 = own.second[q, s]
         g = own.gain[q, s]
@@ -138,6 +143,7 @@ def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
             if q > 0:
                 total = total + io.truth[k, env, s]
             io.truth[k, env, s] = total
+        # A resonator keeps a NaN for ever, so its memory is emptied.
         if broken or not wp.isfinite(wp.dot(a, a)):
             a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
             b = a
@@ -210,6 +216,8 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
     nyquist = float(0.5) / h
     last = (wp.uint32(io.episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(FRICTION))
     for k in range(samples):
+        # Loudness and speed change evenly within a block, and phases go on from the last one: steps between blocks
+        # would click.
         share = (float(k) + float(1.0)) / float(samples)
         now = fast0 + share * (fast - fast0)
         base = d.pitch * now
@@ -218,6 +226,7 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
         tone = float(0.0)
         weight = float(1.0)
         for i in range(d.partials):
+            # A partial beyond half the sample rate would fold back to a wrong pitch.
             if base * float(i + 1) < nyquist:
                 tone = tone + weight * wp.sin(wp.tau * turn * float(i + 1))
             weight = weight * d.rolloff
@@ -303,6 +312,8 @@ def mix_sources(
     known = age[env] * samples + k
     for s in range(ring.shape[2]):
         r = before[env, s] + share * (now[env, s] - before[env, s])
+        # Delay r / c in samples, interpolated between two of them: a moving source then changes its pitch smoothly
+        # (Doppler).
         lag = wp.min(r / speed * rate, float(size - samples - 2))
         whole = int(wp.floor(lag))
         part = lag - float(whole)

@@ -36,7 +36,8 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
 
     @wp.func
     def height_over(solids: SolidArrays, own: wp.array(dtype=wp.int32), gel: GelParams, row: int, z: wp.vec3f) -> float:
-        """Signed distance of a point to the pad's surface, negative inside."""
+        """Return the signed distance of a point to the pad's surface, negative inside."""
+        # A pad without geometry of its own is the plane through its markers; otherwise the union of its solids.
         if gel.own_last == gel.own_first:
             return wp.dot(z - gel.center, gel.normal)
         phi = float(wp.static(FAR))
@@ -90,6 +91,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
         first = cloud.first[row, geometry] + block
         sphere = cloud.sphere[first]
         solid_row = env % solids.kind.shape[0]
+        # If even the bounding sphere lies above the release height, no point of the block can hold an anchor.
         middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
         if height_over(solids, pads.own, gel, solid_row, middle) - sphere[3] > gel.leave:
             pads.held[store, env] = 0
@@ -106,6 +108,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
             if alone:
                 pad = pads.own[gel.own_first]
                 frame = wp.transform_inverse(solids.frame[solid_row, pad])
+                # Pose of the object and frame of the pad joined into one transform: each point then costs one product.
                 turn = wp.quat_to_matrix(wp.transform_get_rotation(frame)) @ rotation
                 shift = wp.transform_get_translation(frame) - turn @ offset
                 shape = shape_of(solids, solid_row, pad)
@@ -126,6 +129,8 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
                     phi = distance_to(solids.values, shape, turn @ p + shift, limit)[3]
                 else:
                     phi = height_over(solids, pads.own, gel, solid_row, z)
+                # Two heights as in a Schmitt trigger: an anchor set at −enter is lost only above +leave, so that a
+                # point that trembles at the surface keeps its history of shear.
                 if wp.isnan(kept):
                     if phi < -gel.enter:
                         kept = z[0]
@@ -137,9 +142,11 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
                 if not wp.isnan(kept):
                     way = z - wp.vec3f(kept, pads.anchor[index, 1, env], pads.anchor[index, 2, env])
                     if wp.length_sq(way) > 0.0:
+                        # s_s h_p of 4.20; the Gaussian and the slip z − e follow for each marker.
                         strength = gel.shear * wp.max(-phi, 0.0)
                     holds += 1
             if strength > 0.0:
+                # Points that moved are listed without gaps: markers loop over these alone, without asking each point.
                 pads.drive[store * wp.static(BLOCK) + found, env] = strength
                 pads.order[store * wp.static(BLOCK) + found, env] = wp.uint8(n)
                 found += 1

@@ -143,6 +143,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
             if wp.static(planes == 2):
                 error = radius_noise(io.knobs[part], env + io.env_offset, probes.probe[n], io.age[env], io.episode[env])
                 noisy = wp.max(error - best, 0.0)
+            # A stamp in place of a flag needs no clearing: pads that nothing touches skip all later sums.
             if h > 0.0 or noisy > 0.0:
                 pads.stamp[env, part] = mark_of(io, env)
         pads.height[0, env, n] = h
@@ -203,6 +204,9 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
                 plain = float(0.0)
                 tilted = float(0.0)
                 raised = float(0.0)
+                # exp(−λ_d |x_j − x_i|²) is a product of one weight per axis, so 4.19 costs rows + columns instead of
+                # rows × columns. Of its three terms, the tangential ones carry one factor x_j − x_i each, the normal
+                # one h^α.
                 low = wp.max(place - pads.reach[part, 0], 0)
                 high = wp.min(place + pads.reach[part, 0] + 1, gel.columns)
                 for source in range(low, high):
@@ -253,6 +257,8 @@ def across_plane(v: wp.vec3f, n: wp.vec3f) -> wp.vec3f:
 @wp.func
 def traction(gel: GelParams, away: wp.vec3f, slip: wp.vec3f) -> wp.vec3f:
     """Return Cerruti's surface displacement, softened over the contact, minus its image below the bonded base."""
+    # Tangential displacement under a tangential point load: ((1 − ν) s + ν (r · s) r / r²) / r. The softening length
+    # keeps it finite below the load, the image at 2 × thickness takes out most of what a bonded base forbids.
     square = wp.dot(away, away) + gel.softening * gel.softening
     inverse = 1.0 / wp.sqrt(square)
     u = inverse * ((1.0 - gel.poisson) * slip + gel.poisson * (wp.dot(away, slip) * inverse * inverse) * away)
@@ -316,12 +322,14 @@ def marker_kernel(
                     u = wp.vec3f(0.0)
                     total = float(0.0)
                     if wp.static(way == 2):
+                        # The three convolutions of 4.19 are done; only s_d and the directions of the pad remain.
                         u = gel.dilate * (
                             pads.spread[3 * plane, env, n] * gel.along
                             + pads.spread[3 * plane + 1, env, n] * gel.across
                             + pads.spread[3 * plane + 2, env, n] * normal
                         )
                     elif wp.static(way == 1):
+                        # Second pass of the separable sum: rows, over what the first pass left for each column.
                         place = probe // gel.columns
                         along = float(0.0)
                         across = float(0.0)
@@ -339,14 +347,19 @@ def marker_kernel(
                         for source in range(gel.rows * gel.columns):
                             h = pads.height[plane, env, gel.start + source]
                             if h > 0.0:
+                                # 4.19 as written, source by source: for pads whose markers form no planar grid.
                                 away = across_plane(x - probes.position[gel.start + source], normal)
                                 square = gel.spread * wp.dot(away, away)
                                 w = wp.exp(-square)
                                 if wp.static(layered):
+                                    # Layer term 1 − κ λ_d r² (recoil κ): what is pushed outwards near an indenter is
+                                    # drawn in farther off.
                                     away = (1.0 - gel.recoil * square) * away
                                 bulge = pads.height[wp.static(planes) + plane, env, gel.start + source]
                                 u += gel.dilate * w * (h * away + bulge * normal)
                     if wp.static(layered):
+                        # Layer term: a layer that can hardly be compressed spreads in proportion to the mean
+                        # indentation.
                         if gel.expansion_x != 0.0 or gel.expansion_y != 0.0:
                             for source in range(gel.rows * gel.columns):
                                 total += pads.height[plane, env, gel.start + source]
@@ -383,6 +396,8 @@ def marker_kernel(
                         # Σ w (z − anchor) with z = rotation (p − offset): the pose of the block is applied once.
                         here = wp.transpose(rotation) @ x + offset
                         up = wp.transpose(rotation) @ normal
+                        # Sum of 4.20 over the block in the object's frame, where points do not move: the sum of weights
+                        # times points and that of weights times anchors are rotated once, not point by point.
                         mass = float(0.0)
                         carried = wp.vec3f(0.0)
                         left = wp.vec3f(0.0)
@@ -409,9 +424,11 @@ def marker_kernel(
                         if mass > 0.0:
                             slide += rotation @ carried - left
                 if gel.layered == 0:
+                    # Π of 4.17 is linear: it is applied to the sum of 4.20 instead of to every term.
                     slide = across_plane(slide, normal)
             if wp.static(planes == 1):
                 signal = truth
+            # Sum of 4.21. Shear has one value for both branches: radius noise acts on the dilation alone.
             truth += slide
             age = io.age[env]
             episode = io.episode[env]

@@ -34,6 +34,7 @@ def add_chunk(
     span: wp.vec4i,
 ):
     """Add what the kept points do to the markers between the rows and the groups of ``span``."""
+    # Sum of products of a weight per row and one per column, four columns at a time for the processor's vector units.
     for row in range(span[0], span[1]):
         for group in range(span[2], span[3]):
             x = wp.vec4f()
@@ -85,11 +86,15 @@ def sum_shear(
                         index = block * wp.static(BLOCK) + own
                         z = rotation @ (cloud.point[first * wp.static(BLOCK) + own] - offset)
                         kept = anchor_of(pads, index, env)
+                        # s_s h (z − e) of 4.20, projected on the pad's axes, which leaves out the part along the
+                        # normal.
                         slip = pads.drive[block * wp.static(BLOCK) + k, env] * (z - kept)
                         force = wp.vec2f(wp.dot(slip, gel.along), wp.dot(slip, gel.across))
                         x = wp.dot(z - corner, gel.along)
                         y = wp.dot(z - corner, gel.across)
                         for row in range(gel.rows):
+                            # exp(−λ_s r²) = exp(−λ_s y²) exp(−λ_s x²): rows + columns exponentials a point. Rows and
+                            # columns with no weight bound the span that is added to.
                             w = weight(gel.smear, y - float(row) * gel.step_y)
                             pads.across[env, row, points] = w * force
                             if w > 0.0:
@@ -104,6 +109,7 @@ def sum_shear(
                                 span[2] = wp.min(span[2], group)
                                 span[3] = wp.max(span[3], group + 1)
                         points += 1
+                        # Chunks keep the weights few enough to stay in the processor's cache.
                         if points == wp.static(CHUNK):
                             add_chunk(pads, env, points, gel.start, gel.columns, span)
                             points = 0

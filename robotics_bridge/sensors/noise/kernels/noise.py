@@ -74,6 +74,7 @@ def philox(a: wp.uint32, b: wp.uint32, c: wp.uint32, d: wp.uint32, key_low: wp.u
 @wp.func
 def draw(p: NoiseParams, env: int, probe: int, age: int, episode: int, purpose: int):
     """Return four random words; ``env`` is the number in the whole experiment."""
+    # The purpose takes the low eight bits, so that draws for different ends in one update never share a counter.
     last = (wp.uint32(episode) << wp.uint32(8)) | wp.uint32(purpose)
     return philox(wp.uint32(probe), wp.uint32(env), wp.uint32(age), last, p.key_low, p.key_high)
 
@@ -81,6 +82,7 @@ def draw(p: NoiseParams, env: int, probe: int, age: int, episode: int, purpose: 
 @wp.func
 def uniform(word: wp.uint32) -> float:
     """Return a number in [0, 1) with 24 random bits."""
+    # 24 bits are what a float holds exactly: the largest value, 1 − 2⁻²⁴, does not round up to 1.
     return float(word >> wp.uint32(8)) * float(5.9604644775390625e-08)
 
 
@@ -94,6 +96,8 @@ def minus_two_log(word: wp.uint32) -> float:
 @wp.func
 def normals(first: wp.uint32, second: wp.uint32) -> wp.vec2:
     """Return two independent standard normal numbers of two random words (Box and Muller 1958)."""
+    # Box and Muller: √(−2 ln u₁) (cos 2π u₂, sin 2π u₂). Series instead of library calls keep the digits the same on
+    # every device.
     length = wp.sqrt(minus_two_log(first))
     # The angle within a quarter turn, counted from its middle: −π/4 … π/4.
     part = float((second >> wp.uint32(7)) & wp.uint32(0x7FFFFF)) - float(4194303.5)
@@ -126,6 +130,7 @@ def gain(p: NoiseParams, env: int, probe: int, episode: int) -> float:
     """Return the gain γ of a probe in this episode (4.24)."""
     if p.gain_high <= p.gain_low:
         return p.gain_low
+    # Age 0 in the counter: the same number in every update of the episode, without storing it.
     w0, _w1, _w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
     return p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
 
@@ -184,13 +189,16 @@ def apply_drawn(
         hysteresis_state: As there.
         walk_state: As there.
     """
+    # Equations 4.26 and 4.27: the state kept is e^(−Δt/τ) ξ − x, so ξ of this update needs no copy of the last signal.
     # Knobs that are off add zeros, which costs less than asking.
     xi = hysteresis_state + x
     drift = walk_state + p.walk * walk
     y = x + p.hysteresis * xi + drift + p.white * white + p.bias
     lag = fading * xi - x
+    # Quantisation acts on the sum of 4.22; a dead probe (4.25) overwrites whatever was measured.
     y = wp.where(p.quantum > float(0.0), p.quantum * wp.rint(y * p.levels), y)
     y = wp.where(fixed[1] > float(0.0), fixed[2], y)
+    # A lost reading passes as it is and leaves the memories untouched, so that later readings are valid again.
     finite = wp.isfinite(x)
     return wp.vec3(wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state))
 
@@ -223,6 +231,7 @@ def apply_noise(
         hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
         walk_state: Drift d of the last update (0 at first).
     """
+    # One call of Philox yields four words: white noise and drift of two neighbouring channels.
     z = pair_normals(p, env, probe, channel // 2, age, episode)
     white = z[0]
     walk = z[1]
@@ -266,6 +275,7 @@ def measure(
             out[channel, env, n] = float(0.0)
         return
     knobs = p[part[n]]
+    # Numbers belong to the environment of the whole experiment: splitting it over devices does not change them.
     number = env_offset + env
     scale = float(1.0)
     if gained == 0:
@@ -318,6 +328,8 @@ def crosstalk(
         place = probe[n] // columns
         length = shape[i, 0]
         stride = columns
+    # The Gaussian G of 4.28 is a product of weights along rows and columns: two passes cost 2 K, not K², per probe.
+    # Both neighbours at distance k share one weight since the kernel is symmetric.
     half = weights.shape[1] - 1
     total = weights[i, 0] * x
     for k in range(1, half + 1):
@@ -326,6 +338,7 @@ def crosstalk(
         if place >= k:
             total = total + weights[i, k] * value[channel, env, n - k * stride]
     if along == 0:
+        # (1 − χ) z + χ (G ∗ z), mixed only after the second pass.
         total = (float(1.0) - strength[i]) * signal[channel, env, n] + strength[i] * total
     out[channel, env, n] = total
 
@@ -354,5 +367,7 @@ def delay_line(
     # The last reading at or before the moment; before the first has arrived, the first.
     back = wp.min(wp.min(int(wp.ceil(wait / dt - float(1.0e-4))), age[env]), size - 1)
     for channel in range(value.shape[0]):
+        # Written before it is read: a delay of zero returns this update. What is stored is the measured value, so a
+        # delayed reading keeps the noise it was recorded with.
         ring[age[env] % size, channel, env, n] = value[channel, env, n]
         out[channel, env, n] = ring[(age[env] - back) % size, channel, env, n]

@@ -55,9 +55,13 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
             rotation = pairs.rotation[env, at]
             limit = reach
             if wp.static(raycast):
+                # A query of triangles searches within a limit: from inside, the surface is at most a bounding diameter
+                # away.
                 if reach <= 0.0:
                     limit = 2.0 * solids.bound[row, geometry][3] + probes.radius[n]
             found = distance(solids, row, geometry, rotation @ x + pairs.offset[env, at], limit)
+            # The largest penetration of 4.2 is the least signed distance. A strict comparison keeps the first of equals
+            # in the order of geometry numbers, so that ties do not depend on the order of contacts.
             if found[3] < best:
                 best = found[3]
                 normal = wp.transpose(rotation) @ wp.vec3f(found[0], found[1], found[2])
@@ -102,6 +106,7 @@ def distance_kernel(
         episode = io.episode[env]
         best, normal, place = deepest(probes, solids, pairs, env, n, wp.static(FAR))
         if wp.static(nearest):
+            # The gradient of a signed distance has unit length: one step of that distance along it ends on the surface.
             near = probes.position[n] - best * normal
             for axis in range(3):
                 points[axis, env, n] = wp.where(place >= 0, near[axis], wp.static(float("nan")))
@@ -153,9 +158,12 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
         signal = truth
         if wp.static(mode != CLEAN):
             noisy = wp.max(radius + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode), 0.0)
+            # Radius noise (4.23) and gain (4.24) act before anything else of the measured branch; the truth sees
+            # neither.
             signal = wp.max(noisy - best, 0.0) * gain(io.knobs[part], env + io.env_offset, probe, episode)
         if wp.static(binary):
             if wp.static(mode != CLEAN):
+                # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
                 y = measure(io, io.knobs[part], env, n, probe, 0, age, episode, signal)
                 io.measured[0, env, n] = latch(io.measured[0, env, n], age, y, limits[part])
             io.truth[0, env, n] = latch(io.truth[0, env, n], age, truth, limits[part])
@@ -190,6 +198,7 @@ def kinematic_function(physical: bool, fast: bool = False) -> Any:
     def wrench(
         p: KinematicParams, x: wp.vec3f, depth: float, normal: wp.vec3f, velocity: wp.vec3f, spin: wp.vec3f
     ) -> wp.spatial_vectorf:
+        # s = d^α, then 4.7–4.9 in the link's frame. Velocities arrive for the link's origin, so 4.6 is v + ω × x.
         s = power(depth, p.exponent)
         relative = velocity + wp.cross(spin, x)
         approach = wp.dot(relative, normal)
@@ -198,6 +207,9 @@ def kinematic_function(physical: bool, fast: bool = False) -> Any:
         turn = p.twist * wp.dot(spin, normal)
         f = wp.vec3f(0.0)
         if wp.static(physical):
+            # Published signs (4.8, 4.9) let friction act against the object's slip although f is the force on the
+            # sensor, and let damping pull. Here friction and twist follow the object, and the normal force is never
+            # negative.
             f = wp.max(push, 0.0) * normal + p.shear * tangential
             turn = -turn
         else:
@@ -271,6 +283,8 @@ def kinematic_kernel(
             knobs = io.knobs[part]
             age = io.age[env]
             episode = io.episode[env]
+        # Probes of a row share slot and sensor, hence pairs, law and noise: these stay in registers while the thread
+        # strides through its probes.
         held = int(-1)
         shape = SolidShape()
         rotation = wp.mat33f()
@@ -279,6 +293,7 @@ def kinematic_kernel(
         while n < span[1]:
             radius = probes.radius[n]
             if radius > 0.0:
+                # Memory is asked for first: the distances below are worked out while it arrives.
                 lag, drift = recall_six(io, env, n, age)
                 x = probes.position[n]
                 best = float(wp.static(FAR))
@@ -309,6 +324,7 @@ def kinematic_kernel(
                     noisy = noisy * fixed[0]
                 truth = wp.spatial_vectorf()
                 signal = wp.spatial_vectorf()
+                # Most probes touch nothing: their velocities are never loaded.
                 if best < radius or noisy > 0.0:
                     velocity = pairs.velocity[env, place]
                     spin = pairs.spin[env, place]

@@ -82,6 +82,8 @@ def capsule(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
 
 @wp.func
 def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    # Signed distance to a capped cylinder: Euclidean to the rim where both are exceeded, else the nearer of side and
+    # end.
     radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
     side = radial - size[0]
     end = wp.abs(x[2]) - size[1]
@@ -101,6 +103,8 @@ def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
 
 @wp.func
 def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    # Signed distance to a box by symmetry in one octant: length of the positive excesses outside, the largest of the
+    # three (all negative) inside, with that face's normal.
     ox = wp.abs(x[0]) - size[0]
     oy = wp.abs(x[1]) - size[1]
     oz = wp.abs(x[2]) - size[2]
@@ -123,10 +127,12 @@ def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
 
 @wp.func
 def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-    """Nearest point e² x / (e² + t) with t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
+    """Find the nearest point e² x / (e² + t), t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
     # Coordinates of exactly zero hide the root at the short axis.
     shift = 1.0e-6 * wp.min(size)
     y = wp.vec3f(wp.max(wp.abs(x[0]), shift), wp.max(wp.abs(x[1]), shift), wp.max(wp.abs(x[2]), shift))
+    # The sum decreases steadily beyond t = −min e², so halving finds the root for any ratio of axes; Newton steps
+    # overshoot near the centre of flat ellipsoids. Octant by symmetry, sign restored at the end.
     short = wp.min(size)
     squares = wp.cw_mul(size, size)
     scaled = wp.cw_mul(size, y)
@@ -189,6 +195,7 @@ def field(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f) ->
     v11 = v110 + fz * (v111 - v110)
     v0 = v00 + fy * (v01 - v00)
     v1 = v10 + fy * (v11 - v10)
+    # Gradient of the same trilinear interpolant, not differences of queries: distance and normal agree within a cell.
     gy = (1.0 - fx) * (v01 - v00) + fx * (v11 - v10)
     gz0 = (1.0 - fy) * (v001 - v000) + fy * (v011 - v010)
     gz1 = (1.0 - fy) * (v101 - v100) + fy * (v111 - v110)
@@ -226,6 +233,7 @@ def sample_field(mesh: wp.uint64, origin: wp.vec3f, spacing: float, reach: float
     """Write the signed distance (m) to a mesh at every sample of a grid. Thread: a sample [nx, ny, nz]."""
     i, j, k = wp.tid()
     x = origin + wp.vec3f(float(i), float(j), float(k)) * spacing
+    # Sign by winding number: small holes in a user's mesh then matter little. Slow, but done once a mesh.
     found = wp.mesh_query_point_sign_winding_number(mesh, x, reach, 2.0, 0.5)
     near = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
     values[i, j, k] = found.sign * wp.length(x - near)

@@ -87,8 +87,11 @@ def mark(slots: SlotArrays, env: int, link: int, other: int, words: int, bits: w
         if slots.contact[slot] == 1 and slots.link[slot] == link:
             place = slots.place[slot, other]
             if place >= 0:
+                # One bit per geometry: a set of any size costs one atomic operation, and its order does not depend on
+                # the threads.
                 word = slot * words + place // 32
                 bit = wp.int32(1) << wp.int32(place % 32)
+                # Many contacts of one pair set the same bit; reading first spares most of the atomic operations.
                 if (bits[env, word] & bit) == 0:
                     wp.atomic_or(bits, env, word, bit)
 
@@ -227,12 +230,15 @@ def pair_kernel(apart: bool) -> Any:
                 if slots.reach[slot] > 0.0 and solids.kind[row, geometry] != wp.static(PLANE):
                     bound = solids.bound[row, geometry]
                     center = wp.transform_point(relative, slots.center[slot])
+                    # Sphere around the probes against sphere around the geometry: planes have none and always count.
                     gap = wp.length(center - wp.vec3f(bound[0], bound[1], bound[2]))
                     near = gap < bound[3] + slots.reach[slot]
                 if near:
                     if found < room:
                         other = state.velocity[env, solids.link[geometry]]
                         spin = wp.vec3f(other[3], other[4], other[5])
+                        # Velocity of the other body at the link's origin, less the link's own (4.4–4.6); each probe
+                        # adds ω × x itself.
                         lever = origin - wp.transform_get_translation(there)
                         speed = wp.vec3f(other[0], other[1], other[2]) + wp.cross(spin, lever) - own_velocity
                         at = first + found

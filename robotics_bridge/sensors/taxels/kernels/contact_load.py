@@ -62,17 +62,21 @@ def weigh_field(
     """Compare the sum of a field with its load. Thread: sensor and environment [S, B]."""
     sensor, env = wp.tid()
     span = spans[sensor]
+    # Loads come in world axes and fields in link axes. One thread adds all taxels of a sensor in a fixed order, so the
+    # total does not depend on the device; atomic additions would round differently from run to run.
     turn = wp.transform_get_rotation(state.pose[env, slots.link[span[2]]])
     load = wp.quat_rotate_inv(turn, loads[sensor, env])
     size = wp.length(load)
     total = wp.vec3f(0.0)
     for n in range(span[0], span[1]):
         total += wp.vec3f(truth[0, env, n], truth[1, env, n], truth[2, env, n])
+    # The field is scaled until its sum has the load's component along the load: s (total · load) = |load|².
     along = wp.dot(total, load)
     scale = float(0.0)
     # A field that does not oppose the load cannot be stretched into it.
     if along > 0.0:
         scale = size * size / along
+    # A lost contact force must reach the readings as NaN instead of ending as a plausible zero.
     if wp.isnan(size):
         scale = size
     scales[sensor, env] = scale

@@ -88,11 +88,15 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
         slip: wp.vec3f,
     ) -> wp.spatial_vectorf:
         """Return force and torque of the summed overlaps: ``mass`` ΣP, ``moment`` ΣP (p − x), ``slip`` ΣP v."""
+        # Equations 4.15 and 4.16 with the sums over points taken out of the law: Σ P, Σ P (p − x) and Σ P v are linear
+        # in the points, so the projection of 4.13 is applied once to the summed slip.
         push = law.stiffness * density * mass
         drag = law.coupling * density * (slip - wp.dot(slip, normal) * normal)
         turn = law.stiffness * density * wp.cross(moment, normal)
         f = push * normal + drag
         if wp.static(physical):
+            # Force on the sensor by the object: opposite to the published sign, with the torque about the link's origin
+            # rather than about the taxel.
             f = drag - push * normal
             turn = wp.cross(x, f) - turn
         return wp.spatial_vectorf(f[0], f[1], f[2], turn[0], turn[1], turn[2])
@@ -131,6 +135,8 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             episode = io.episode[env]
             noisy = radius
             if wp.static(mode != CLEAN):
+                # Both branches share one pass over the points: the query reaches as far as the larger of the two radii
+                # (4.23).
                 noisy = wp.max(radius + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode), 0.0)
             reach = wp.max(radius, noisy)
             turning = wp.vec3f(0.0)
@@ -145,10 +151,14 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                 geometry = pairs.geometry[env, at]
                 rotation = pairs.rotation[env, at]
                 here = rotation @ x + pairs.offset[env, at]
+                # Points stay in the frame of their geometry and the probe is moved there: one transform per pair, not
+                # per point.
                 own_mass = wp.vec2f(0.0)
                 lever = wp.vec3f(0.0)
                 lever_noisy = wp.vec3f(0.0)
                 if wp.static(gathered):
+                    # The list was filled in the order of the pairs, each part closed by −1, so one cursor walks through
+                    # all of it.
                     index = own.near[env, cursor]
                     cursor += 1
                     while index >= 0:
@@ -156,6 +166,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                         square = wp.dot(away, away)
                         if square < reach * reach:
                             overlaps = overlap(wp.sqrt(square), radius, noisy)
+                            # P of 4.11, and Σ P (p − x) as the lever from which torque and slip follow.
                             own_mass += overlaps
                             lever += overlaps[0] * away
                             if wp.static(mode != CLEAN):
@@ -167,6 +178,8 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                     for block in range(cloud.blocks[row, geometry]):
                         sphere = cloud.sphere[first + block]
                         gap = here - wp.vec3f(sphere[0], sphere[1], sphere[2])
+                        # Two spheres that do not meet hold no point in reach: the block of points is skipped as a
+                        # whole.
                         limit = reach + sphere[3]
                         if wp.dot(gap, gap) < limit * limit:
                             for i in range(wp.static(BLOCK)):
@@ -190,6 +203,8 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                     lever = wp.transpose(rotation) @ lever
                     mass += own_mass
                     moment += lever
+                    # Σ P v over the rigid points (4.12): v is linear in p, so two sums per geometry stand for all
+                    # velocities.
                     slip += own_mass[0] * speed + wp.cross(spin, lever)
                     if wp.static(mode != CLEAN):
                         lever_noisy = wp.transpose(rotation) @ lever_noisy
@@ -202,6 +217,8 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             fixed = wp.vec3f(1.0, 0.0, 0.0)
             if wp.static(mode != CLEAN):
                 fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
+                # The gain (4.24) scales the summed overlaps; the wrench is linear in them, so it is applied to the
+                # result.
                 signal = fixed[0] * wrench(own.laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
             lag, drift = recall_six(io, env, n, age)
             emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
@@ -239,6 +256,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                 geometry = pairs.geometry[env, at]
                 here = pairs.rotation[env, at] @ middle + pairs.offset[env, at]
                 first = cloud.first[row, geometry]
+                # Same order of blocks and points as without gathering, since sums in single precision depend on it.
                 for block in range(cloud.blocks[row, geometry]):
                     sphere = cloud.sphere[first + block]
                     gap = here - wp.vec3f(sphere[0], sphere[1], sphere[2])

@@ -149,6 +149,8 @@ def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
         if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
             points = points + 1
             center = center + state.contact_position[d]
+            # Contacts may list the two geometries in either order; normals are turned to one side before they are
+            # averaged.
             side = state.contact_normal[d]
             if wp.dot(side, state.contact_normal[c]) < float(0.0):
                 side = -side
@@ -208,6 +210,8 @@ def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
         g = float(0.0)
         if grid.published == 1:
             volume = grid.cell[0] * grid.cell[1] * grid.cell[2]
+            # 4.38 and 4.39: harmonic conductivity over the length L = V / A of the whole contact, shared among its
+            # points.
             g = float(2.0) * k_own * k_other / (k_own + k_other) * whole * area / volume
         else:
             facing = wp.quat_rotate_inv(wp.transform_get_rotation(frame), state.contact_normal[c])
@@ -215,6 +219,8 @@ def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
             across = across + wp.abs(facing[2]) * grid.cell[2]
             # The spot spreads within its cell as it does in the touched body.
             disc = float(4.0) * wp.sqrt(whole / wp.pi) / float(points)
+            # Resistances in series: half a cell and the spot within it, the interface, the touched body. A sum of
+            # resistances stays finite and positive for any pair of materials.
             resistance = float(1.0) / (k_own * (float(2.0) * area / across + disc))
             if grid.contact > float(0.0):
                 resistance = resistance + float(1.0) / (grid.contact * area)
@@ -230,6 +236,7 @@ def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
 @wp.func
 def mean_decay(x: wp.float64) -> wp.float64:
     """Return (1 − exp(−x)) / x: the mean of exp(−x s) for s from 0 to 1."""
+    # Near zero the quotient cancels; three terms of its Taylor series do not.
     if x < wp.float64(1.0e-4):
         return wp.float64(1.0) - x * (wp.float64(0.5) - x / wp.float64(6.0))
     return (wp.float64(1.0) - wp.exp(-x)) / x
@@ -268,6 +275,8 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
         total = wp.float64(g + loss)
         power = wp.float64(inflow) - wp.float64(g) * start + wp.float64(heat.source[n])
         power = power + wp.float64(loss) * (wp.float64(grid.ambient) - start)
+        # Exact solution of C dT/dt = P − G (T − T₀) over the step with constant G: a large step ends at the balance,
+        # which forward Euler (4.36, 4.39) overshoots.
         t = start + power * step * mean_decay(total * step)
     out[env, n] = t
 
@@ -290,6 +299,7 @@ def diffuse_heat(
     base = heat.offset[heat.part[n], axis] + row * length
     # Differences from the cell's own value: a level field stays level to the last digit.
     own = temperature[env, n]
+    # Row of the matrix exponential of insulated diffusion: stable at any Δt and free of loss, unlike 4.35.
     total = own
     for j in range(length):
         total = total + wp.float64(heat.matrix[base + j]) * (temperature[env, start + j * stride] - own)
@@ -304,6 +314,7 @@ def sense_temperature(heat: HeatArrays, io: ReadoutArrays, fresh: wp.array2d(dty
     t = fresh[env, n]
     heat.temperature[env, n] = t
     lagged = t
+    # The lag of 4.40 with its exact factor 1 − exp(−Δt/τ): forward Euler diverges beyond Δt = 2 τ.
     if grid.tau > float(0.0):
         before = heat.element[env, n]
         if io.age[env] == 0:
