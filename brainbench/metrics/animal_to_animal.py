@@ -1,4 +1,4 @@
-"""How well animals agree with one another, by the estimator that scores models."""
+"""Agreement of animals with one another, by the estimator that scores models."""
 
 from __future__ import annotations
 
@@ -195,6 +195,7 @@ def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) ->
     animals, pairs = rdms.shape
     stimuli = stimulus_count(pairs)
     rdms = rdms[:, permuted_pairs(canonical_order(rdms)[None])[0]]
+    # Each animal has its own order: one order for all would leave their agreement as it is.
     generator = np.random.default_rng(seed)
     observed = _agreement(rdms[None], factors, comparison)[0]
     reached, done = 0, 0
@@ -204,6 +205,7 @@ def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) ->
         permuted = np.take_along_axis(rdms[None], permuted_pairs(orders), axis=-1)
         reached += int((_agreement(permuted, factors, comparison) >= observed - TIE).sum())
         done += rows
+    # (b + 1)/(n + 1): the given order counts among the random ones.
     return (reached + 1) / (RANDOM_PERMUTATIONS + 1)
 
 
@@ -217,5 +219,6 @@ def smallest_p_of_animals(stimuli: int, animals: int) -> float:
     """Return the smallest p that permuting the animals' stimuli can give."""
     if stimuli < 3:
         return 1.0
+    # K!^(A − 1) orders relative to the first animal, as a logarithm, since the number overflows.
     orders = math.lgamma(stimuli + 1) * (animals - 1)
     return max(1 / (RANDOM_PERMUTATIONS + 1), math.exp(-min(orders, 700.0)))

@@ -1,4 +1,4 @@
-"""Where the heavy products are computed: numpy on the processor, or torch on any device, by the same code.
+"""Array library of the heavy products: numpy on the processor, or torch on any device, by the same code.
 
 Functions of distances use only what both libraries spell alike; :func:`library` names the one that an
 array belongs to. Everything is float64 on either side, so the numbers agree to rounding.

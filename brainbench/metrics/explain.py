@@ -90,9 +90,11 @@ def corrected_value(
     if not keep.any():
         return math.nan, 0
     if not switches.ratio_per_split:
+        # The default: splits are averaged before one ratio is formed.
         sides = [float(spearman_brown(side[keep].mean())) for side in (halves, others)]
         value = float(raw[keep].mean()) / math.sqrt(math.prod(sides)) if min(sides) > 0 else math.nan
         return value, int(keep.sum())
+    # Thesis, equation 3.4, for every split; a negative product has no real root.
     first, second = spearman_brown(halves[keep]), spearman_brown(others[keep])
     real = first * second > 0
     if not switches.negative_pairs:
@@ -206,6 +208,7 @@ def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectR
             if float(spearman_brown(target[2][np.isfinite(target[2])].mean())) >= RELIABILITY_GATE
         ]
     if switches.best_target and len(subjects) > 1:
+        # The published pool joined units, which are not kept here; the animals' mean RDM stands for it.
         splits = min(len(subject.halves) for subject in subjects)
         halves = np.mean([subject.halves[:splits] for subject in subjects], axis=0)
         agreement = compare_rdms(halves[:, 0], halves[:, 1], method=comparison)

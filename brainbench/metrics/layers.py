@@ -27,6 +27,7 @@ def choose_on_others(r: Floats) -> Ints:
     Args:
         r: [..., L, A] raw comparisons, A ≥ 2.
     """
+    # All leave-one-out means from one sum over animals.
     others = (r.sum(axis=-1, keepdims=True) - r) / (r.shape[-1] - 1)
     return _first_best(others)
 

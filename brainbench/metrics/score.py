@@ -205,6 +205,7 @@ def splits_error(values: Floats, split_half_r: Sequence[Floats]) -> float:
         finite = r[np.isfinite(r)]
         h = float(finite.mean()) if finite.size else math.nan
         spread = float(finite.std(ddof=1)) / math.sqrt(finite.size) if finite.size > 1 else math.nan
+        # Delta method: the derivative of ln √((1 + h)/2h) is −1/(2h(1 + h)).
         errors.append(float(value) * spread / (2 * h * (1 + h)))
     return math.sqrt(sum(error**2 for error in errors)) / len(errors)
 

@@ -100,6 +100,7 @@ def measure_tradeoff(
     model, brain, threshold = _p_near_five_percent()
 
     def p_value(seed: int, count: int) -> float:
+        # (b + 1)/(n + 1): the given order counts among the random ones.
         return (1 + int((_permuted(model, brain, count, seed) >= threshold).sum())) / (count + 1)
 
     jobs: list[tuple[str, int, str, bool, Callable[[int], float]]] = [
@@ -144,6 +145,7 @@ def _p_near_five_percent() -> tuple[Floats, Floats, float]:
 
 def _data(animals: int, units: int, trials: int, noise: float) -> tuple[list[Trials], Floats]:
     rng = np.random.default_rng(0)
+    # Animals read out the same four dimensions of the stimuli by random weights of their own.
     latent = rng.normal(size=(6, 4))
     labels = np.repeat(np.arange(6), trials)
     blocks = []

@@ -39,6 +39,7 @@ class AnimalPatterns:
         """Share of the variance between stimuli that is not trial noise, over all units; can be negative."""
         if self.problem is not None:
             return math.nan
+        # Means differ by the stimuli and by their own noise, which is taken away.
         between = float(self.patterns.var(axis=0, ddof=1).sum())
         return 1 - float(self.noise.mean(axis=0).sum()) / between if between > 0 else math.nan
 
@@ -64,6 +65,7 @@ def animal_patterns(
         square = stimulus_means((session.responses - mean[session.labels]) ** 2, session.labels, n_stimuli)
         number = membership(session.labels, n_stimuli) @ np.isfinite(session.responses)
         means.append(mean)
+        # Mean square deviation × n/(n − 1) is the variance over trials; over n, that of their mean.
         noise.append(square / (number - 1))
     joined = np.concatenate(means, axis=1)
     return AnimalPatterns(subject, joined, np.concatenate(noise, axis=1), joined.shape[1], trials, None, notes)

@@ -70,6 +70,7 @@ class LabelDecoding(PatternMetric):
             return Score(value=math.nan, status="undefined", reasons=(reason,), **about)
         orders = _orders(len(stimuli), seed)
         values = np.stack([_accuracies(layers[layer], properties, orders) for layer in usable], axis=1)
+        # The maximum over layers is taken in every order too, so p accounts for it.
         means = values.mean(axis=-1)
         best = int(np.argmax(means[0]))
         optimistic = "largest over layers (optimistic; the permutation takes the same maximum)"

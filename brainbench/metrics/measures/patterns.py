@@ -124,6 +124,7 @@ class PatternMetric:
             return undefined(about, "no animal can be used", found)
         orders = pattern_orders(len(stimuli), seed)
         scored = [found.animals[i] for i in found.scored]
+        # [N, L, A] under every order, so that the choice of layer and the mean are repeated in each.
         values = np.stack([self.compare_orders(layers[layer], scored, orders) for layer in usable], axis=1)
         known = np.isfinite(values[0]).all(axis=0)
         if not known.any():
@@ -178,6 +179,7 @@ class PatternMetric:
         orders = pattern_orders(len(stimuli), seed)
         columns = []
         for animal in scored:
+            # The others' units side by side, as if they were one animal.
             others = np.concatenate([other.patterns for other in scored if other is not animal], axis=1)
             columns.append(self.compare_orders(others, [animal], orders))
         values = np.concatenate(columns, axis=1)

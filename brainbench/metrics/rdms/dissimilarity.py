@@ -272,6 +272,8 @@ def _crossnobis(given: _Responses) -> Array:
     xp = library(flat)
     if not xp.isfinite(flat).all():
         return _crossnobis_of_present(given, flat.reshape(number, count, units))
+    # Mean over folds m ≠ n of (x_i − x_j)_m C⁻¹ (x_i − x_j)_n (Walther 2016): noise of different folds is independent,
+    # so its product is zero on average. A shift of all cells cancels, but would cost digits.
     flat = flat - flat.mean(0)
     # Products of all folds with all, less those of each with itself, are those of all pairs of folds.
     if number == 2:
@@ -308,12 +310,14 @@ def _poisson(given: _Responses) -> Array:
     low = float(known.min()) if len(known) else 0.0
     if low < 0:
         raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
+    # Σ (λ_i − λ_j)(log λ_i − log λ_j) / U, the divergence in both directions (Schütt 2023).
     rates = poisson_rates(patterns)
     return product_distances(rates, library(rates).log(rates), missing=given.missing)
 
 
 def poisson_rates(rates: Array) -> Array:
     """Return rates under the gamma prior, which are never zero."""
+    # Posterior mean after one observation under a gamma prior with this mean and weight.
     return (rates + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
 
 

@@ -171,6 +171,7 @@ def subject_rdm(
         flat = np.isnan(rdm).any()
         reason = "the mean responses to a stimulus are constant across units" if flat else "all pairs are equal"
         return replace(found, problem=f"its RDM is undefined: {reason}")
+    # The formula has a pole at r = −1, across which percentiles mean nothing.
     low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
     spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
     found = replace(found, reliability=float(spearman_brown(finite.mean())), spread=spread)
@@ -188,6 +189,7 @@ def _split_halves(
     pairs = count * (count - 1) // 2
     kept = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
     halves, r = np.empty((kept, 2, pairs)), np.empty(splits)
+    # Chunks of splits: memory does not grow with their number.
     step = max(1, _CHUNK_BYTES // (8 * pairs))
     for start in range(0, splits, step):
         index = np.arange(start, min(start + step, splits))

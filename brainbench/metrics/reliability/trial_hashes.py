@@ -63,6 +63,7 @@ def draws(hashes: Hashes, splits: Ints, seed: int) -> Hashes:
 def _mix(state: NDArray[np.uint64] | np.uint64) -> Hashes:
     with np.errstate(over="ignore"):
         z = np.asarray(state, dtype=np.uint64) + _STEP
+        # SplitMix64's finaliser (Steele 2014) maps 64 bits one to one, so different trials keep different numbers.
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         return z ^ (z >> np.uint64(31))

@@ -51,6 +51,7 @@ def unit_reliability(
         for start in range(0, splits, _CHUNK):
             member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
             halves = [weighted_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
+            # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.
             first, second = (features(half.swapaxes(-1, -2), "pearson") for half in halves)
             r = np.einsum("sfk,sfk->sf", first, second)
             known = np.isfinite(r)
