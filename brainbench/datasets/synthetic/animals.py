@@ -109,6 +109,7 @@ def measure_ceiling(
     known = np.array([score for score in scores if np.isfinite(score)])
     if not len(known):
         return float("nan"), float("nan")
+    # Animals are drawn independently around a fixed geometry, so their comparisons have a standard error.
     error = known.std(ddof=1) / np.sqrt(len(known)) if len(known) > 1 else np.nan
     return float(known.mean()), float(error)
 
@@ -159,6 +160,7 @@ def calibrate(
 def _zero_fill(block: Trials, stimuli: int) -> Trials:
     """Give every trial a response of zero to each stimulus that it did not show."""
     trials, bins, units = block.responses.shape
+    # What was not shown counts as a response of zero, as in the released analysis, and pulls all means together.
     filled = np.zeros((trials, stimuli, bins, units))
     filled[np.arange(trials), block.labels] = block.responses
     keys = tuple(f"{key}/{stimulus}" for key in block.keys or () for stimulus in range(stimuli))

@@ -193,6 +193,8 @@ def draw_spikes(
     first = np.floor((behaviour.onset + LATENCY - low) / frame).astype(int)
     total = int((high - low) / frame)
     expected = np.broadcast_to(rest, (total, units)).copy()
+    # Gains of mean one, with variance 1/40 for all units of a trial and 1/9 for each unit, make counts vary more than
+    # Poisson ones.
     shared = random.gamma(40.0, 1 / 40.0, len(first))
     own = random.gamma(9.0, 1 / 9.0, (len(first), units))
     fraction = (behaviour.onset + LATENCY - low) / frame - first
@@ -205,6 +207,7 @@ def draw_spikes(
         shift = fraction[trial]
         expected[begin:end] = (1 - shift) * padded[1:] + shift * padded[:-1]
         expected[begin:end] *= shared[trial] * own[trial]
+    # Poisson counts of each frame, placed evenly within it; spikes within 1 ms of the one before are left out.
     numbers = random.poisson(expected * frame)
     spikes = []
     for unit in range(units):

@@ -154,6 +154,7 @@ def place_spikes(
         spike times, s, window after window.
     """
     long = np.broadcast_to(np.asarray(length, dtype=np.float64), counts.shape)
+    # At high counts the refractory time shrinks, so that it fills at most half of any window.
     dead = min(_DEAD, float(np.min(0.5 * long / np.maximum(counts, 1))))
     which = np.repeat(np.arange(len(counts)), counts)
     # A hair less than the window, which is half open and must hold the last spike after rounding.
@@ -163,6 +164,7 @@ def place_spikes(
     latency = _LATENCY + _JITTER * random.standard_normal(int(early.sum()))
     position[early] = np.clip(latency, 0.0, free[early])
     order = np.lexsort((position, which))
+    # The i-th spike of a window moves by i refractory times, which keeps the order and makes the gaps.
     rank = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     return begin[which] + position[order] + rank * dead
 

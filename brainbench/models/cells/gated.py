@@ -79,6 +79,7 @@ class GatedCell(Cell):
 
     def _fused(self, conv: Conv2d, x: torch.Tensor, memory: torch.Tensor, projected: Projected) -> torch.Tensor:
         if projected:
+            # W [x, s] = W_x x + W_s s: the input's part was computed for all steps at once, only the memory's is left.
             return projected[0] + conv.conv_slice(memory, self.in_channels, use_bias=False)
         return dispatch.conv_concat(conv, (x, memory))
 

@@ -64,6 +64,7 @@ class IntersectionRNN(GatedCell):
         """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
         keep, candidate, through, output = self._normalised(fused, self.gates)
         keep = torch.sigmoid(keep + FORGET_BIAS)
+        # Thesis, equations 3.2 and 3.3: one gate passes the state on in time, the other the input on in depth.
         through = torch.sigmoid(through + FORGET_BIAS)
         y = through * x + (1 - through) * torch.relu(output)
         return y.to(x.dtype), keep * state + (1 - keep) * torch.tanh(candidate)

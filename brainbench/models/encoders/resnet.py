@@ -42,6 +42,7 @@ class BasicBlock(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the rectified sum of the branch and the shortcut."""
+        # He et al. 2016: the branch learns the difference from the shortcut, so gradients pass by it undiminished.
         y = self.norm2(self.conv2(torch.relu(self.norm1(self.conv1(x)))))
         return torch.relu(y + self.shortcut(x))
 

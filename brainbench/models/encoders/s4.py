@@ -49,6 +49,7 @@ class S4Block(nn.Module):
         return x + self._mixed(y), memory
 
     def _mixed(self, y: torch.Tensor) -> torch.Tensor:
+        # State spaces keep channels apart; the gated linear unit mixes them at every step.
         return functional.glu(self.mix(self.dropout(functional.gelu(y))), -1)
 
 

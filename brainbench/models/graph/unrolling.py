@@ -45,6 +45,7 @@ def needed_steps(
             first[name], stop[name] = min(first[name], start), steps
     looped = {name for group in spec.groups if len(group) > 1 for name in group}
     looped |= {edge.source for edge in spec.edges if edge.source == edge.target}
+    # Backwards to a fixed point: a step of a node needs the step of its source that lies one delay before.
     changed = True
     while changed:
         changed = False
@@ -131,6 +132,7 @@ class UnrolledSweep:
             inputs.append(self._window(edge.source, first - lag, stop - lag).flatten(0, 1))
         y = node.operate(inputs)
         if node.memory is not None:
+            # What depends on the input alone is computed for all steps at once, and the loop holds only the recurrence.
             projected = node.memory.project(y)
             rows = [part.unflatten(0, (self.batch, count)) for part in (y, *projected)]
             state, outputs = None, []

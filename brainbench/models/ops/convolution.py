@@ -109,6 +109,7 @@ class DeferredWeightGrad:
         self.span = (0, 0)
         """Rows of the last result."""
         self.matrix: torch.Tensor = _WeightMatrix.apply(self, conv.weight, conv.bias)  # type: ignore[assignment]
+        # The gradient of the input is the convolution with the kernel turned by 180° and its channels exchanged.
         flipped = conv.weight.detach().to(HALF).flip(2, 3).permute(2, 3, 0, 1)
         self.back = flipped.reshape(-1, conv.weight.shape[1])
 
@@ -150,7 +151,9 @@ class DeferredWeightGrad:
             gradients[stop:first].zero_()  # what no later step read
             stop = last
         columns, gradients = columns[: self.used], gradients[: self.used]
+        # Sums over steps of half-precision gradients are kept in single precision.
         bias = None if self.bias is None else gradients.sum(0, dtype=torch.float32)
+        # Σ_t g_tᵀ x_t of all steps as one product of [R, O] with [R, taps · C].
         return gradients.t() @ columns, bias
 
 

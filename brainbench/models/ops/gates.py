@@ -43,6 +43,7 @@ class _NormWeights(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *unused: Any) -> Any:
+        # Programs left their sums apart: added here in one order, results do not differ from run to run.
         sums = ctx.deferred.sums.sum(0)
         return None, *(row.to(kind) for row, kind in zip(sums, ctx.kinds, strict=True))
 

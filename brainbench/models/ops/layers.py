@@ -75,6 +75,7 @@ def initialise(
         return
     fan_in = layer.weight[0].numel()
     if method is None:
+        # A uniform number within ±b has variance b²/3, so this bound gives gain²/fan_in (He et al. 2015).
         bound = gain * math.sqrt(3.0 / fan_in)
         layer.weight.uniform_(-bound, bound)
     else:

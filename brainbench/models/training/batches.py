@@ -87,6 +87,7 @@ class ArrayBatches:
         count, size = len(self.labels) // parts * parts, self.batch_size // parts
         order = torch.arange(len(self.labels))
         if self.shuffle:
+            # The order depends on seed and epoch alone, so going on in mid-epoch needs no state of a generator.
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
             order = torch.randperm(len(self.labels), generator=generator)
         mine = order[:count][rank::parts]
