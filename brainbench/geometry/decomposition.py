@@ -147,6 +147,7 @@ def _compute(unit: Mesh, settings: DecompositionSettings, path: Path | None) -> 
         raise missing_dependency(distribution, extra=extra, purpose=purpose)
     reduced, decimated = _decimated(unit, settings.most_faces)
     pieces = tuple(convex_hull(points, unit.name) for points in _run(reduced, settings))
+    # Measured against the whole mesh; the simplified one decides what is inside, to save time.
     found = deviation(unit, pieces, inside=reduced)
     numbers = np.array([found.outward, found.inward, found.samples, decimated])
     if path is not None:

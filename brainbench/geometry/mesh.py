@@ -196,6 +196,7 @@ def face_owners(mesh: Mesh) -> NDArray[np.int64]:
     """Return the number [F] of the connected piece that each face belongs to."""
     from trimesh.graph import connected_component_labels
 
+    # Two edges of a triangle join its three vertices; pieces are the components of that graph.
     edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     return connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
 

@@ -83,6 +83,7 @@ def _close(mesh: Mesh, done: list[str]) -> Mesh:
     import trimesh
     from scipy.spatial import KDTree
 
+    # Neighbours by tree in V log V; chains of near vertices become one by connected components.
     pairs = KDTree(mesh.vertices).query_pairs(MERGE * mesh.diagonal, output_type="ndarray")
     if len(pairs):
         group = trimesh.graph.connected_component_labels(pairs, node_count=len(mesh.vertices))

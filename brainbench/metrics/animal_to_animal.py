@@ -178,6 +178,7 @@ def _against_others(
     # Halves are averaged split by split, so every animal must have them.
     splits = min(len(subjects[other].halves) for other in scored)
     halves = np.mean([other.halves[:splits] for other in others], axis=0)
+    # Both reliabilities enter the correction (thesis, equation 3.4), since the others' mean RDM is noisy too.
     return noise_corrected(
         float(compare_rdms(subjects[index].rdm, pooled, method=comparison)),
         subjects[index].split_half_by(comparison)[:splits],
@@ -194,6 +195,7 @@ def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) ->
     """Return P(mean corrected agreement ≥ observed) when every animal's stimuli are permuted independently."""
     animals, pairs = rdms.shape
     stimuli = stimulus_count(pairs)
+    # A canonical order of the stimuli, so that random permutations do not depend on how they were listed.
     rdms = rdms[:, permuted_pairs(canonical_order(rdms)[None])[0]]
     # Each animal has its own order: one order for all would leave their agreement as it is.
     generator = np.random.default_rng(seed)
@@ -211,6 +213,7 @@ def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) ->
 
 def _agreement(rdms: Floats, factors: Floats, comparison: str) -> Floats:
     """Return the mean corrected comparison [N] of each animal with the mean of the others, from [N, A, P]."""
+    # All leave-one-out means from one sum over animals.
     others = (rdms.sum(axis=1, keepdims=True) - rdms) / (rdms.shape[1] - 1)
     return compare_rdms(rdms, others, method=comparison) @ factors / len(factors)
 

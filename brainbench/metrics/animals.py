@@ -83,6 +83,7 @@ def _correction(subject: SubjectRDM, estimator: str, comparison: str) -> Correct
         return Corrected(math.nan, "undefined", subject.problem)
     if is_flat(subject.rdm):
         return Corrected(math.nan, "undefined", "its RDM has missing pairs or no differences between pairs")
+    # The correction is linear in the comparison, so the value for a comparison of 1 is the factor for any.
     return noise_corrected(1.0, subject.split_half_by(comparison), estimator=estimator)
 
 

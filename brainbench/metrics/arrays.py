@@ -68,6 +68,7 @@ def slices(values: Any, elements: int, device: Any) -> Iterator[tuple[slice, Arr
 
     The whole is never copied, so what is wider than the device's memory is computed all the same.
     """
+    # Slices of units are summed up by the caller; their number depends on the input alone, so sums are reproducible.
     rows = max(1, int(np.prod(tuple(values.shape[:-1]))))
     step = max(1, elements // rows)
     for start in range(0, values.shape[-1], step):
@@ -78,6 +79,7 @@ def slices(values: Any, elements: int, device: Any) -> Iterator[tuple[slice, Arr
 def cholesky(matrix: Array) -> Array | None:
     """Return the lower Cholesky factor [N, N], or None where the matrix has none."""
     if is_tensor(matrix):
+        # cholesky_ex reports a failure as a number instead of raising.
         factor, info = library(matrix).linalg.cholesky_ex(matrix)
         return None if int(info) else factor
     from scipy.linalg import LinAlgError

@@ -84,6 +84,7 @@ def corrected_value(
     halves = np.asarray(r_yy, dtype=np.float64).ravel()
     others = np.ones(len(halves)) if r_xx is None else np.broadcast_to(np.asarray(r_xx, dtype=np.float64), halves.shape)
     raw = np.broadcast_to(np.asarray(r_xy, dtype=np.float64), halves.shape)
+    # Splits without a correlation (a half with a flat RDM) have no say under any switch.
     keep = np.isfinite(halves) & np.isfinite(others) & np.isfinite(raw)
     if switches.drop_splits:
         keep &= halves >= THESIS_FILTER

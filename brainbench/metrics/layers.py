@@ -63,6 +63,7 @@ def first_best(values: Floats) -> int:
 
 def _first_best(values: Floats) -> Ints:
     """Return the first index along axis −2 whose value equals the largest up to rounding."""
+    # A tolerance for ties: layers with equal RDMs differ by rounding, and the first of them is to win on every machine.
     return np.argmax(values >= values.max(axis=-2, keepdims=True) - _TIE, axis=-2)
 
 

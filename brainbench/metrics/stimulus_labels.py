@@ -90,6 +90,7 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     check_finite(responses)
     member = membership(codes, count)
     present = ~np.isnan(responses)
+    # One offset for all, taken from the data, so that a large mean does not cost the digits of differences.
     shift = float(responses[present][0]) if present.any() else 0.0
     totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
     numbers = member @ present.astype(np.float64)
@@ -101,6 +102,7 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
     from scipy.sparse import csr_array
 
     rows = np.arange(len(codes))
+    # A sparse row of 1/n at its stimulus' trials: the mean is one product, with no copy of the responses.
     member = csr_array((1.0 / numbers[codes, 0], (codes, rows)), shape=(len(numbers), len(codes)))
     means = np.empty((len(numbers), responses.shape[1]))
     step = max(16, _SLICE_ELEMENTS // max(1, len(responses)))

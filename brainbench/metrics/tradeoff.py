@@ -93,6 +93,7 @@ def measure_tradeoff(
         return score_rdms({"a": layer}, subjects(seed, count), name="x", stimuli=list("abcdef")).value
 
     def interval_end(seed: int, number: int, inner: int) -> float:
+        # An interval's end rests on the few draws in its tail, so it needs more draws than a standard error does.
         found = bootstrap_score([layer], subjects(seed, 100, number, inner), draws=number, seed=seed)
         interval = found.interval("percentile")
         return float("nan") if interval is None else interval.low
@@ -132,6 +133,7 @@ def measure_tradeoff(
 def _permuted(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
     """Return comparisons [N] under random orders of the stimuli."""
     _, *chunks = label_orders(_STIMULI, seed, exact=0, draws=count)
+    # The given order, yielded first, is left out: what remains are random orders.
     orders = np.concatenate(chunks)
     return compare(model[permuted_pairs(orders)], brain)
 

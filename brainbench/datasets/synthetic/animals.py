@@ -151,6 +151,7 @@ def calibrate(
         )
     # Both ends are known: without modulation the expected comparison is zero.
     known = {0.0: -ceiling, MODULATION: highest}
+    # With the same seed at every step the ceiling depends on the modulation alone, as a root finder needs.
     found = root_scalar(
         lambda modulation: known.get(modulation) or excess(modulation), bracket=(0.0, MODULATION), xtol=_EXACT
     )

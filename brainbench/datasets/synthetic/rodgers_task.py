@@ -212,6 +212,7 @@ def draw_spikes(
     spikes = []
     for unit in range(units):
         bins = np.repeat(np.arange(total), numbers[:, unit])
+        # Evenly within a frame, then rounded to samples as a spike sorter reports them.
         times = np.sort(low + (bins + random.random(len(bins))) * frame)
         times = np.round(times * _CLOCK) / _CLOCK
         spikes.append(times[np.diff(times, prepend=-1.0) > 0.001])

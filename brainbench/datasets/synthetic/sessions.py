@@ -159,6 +159,7 @@ def place_spikes(
     which = np.repeat(np.arange(len(counts)), counts)
     # A hair less than the window, which is half open and must hold the last spike after rounding.
     free = (long[which] - counts[which] * dead) * (1 - 1e-9)
+    # Given their number, Poisson spikes lie evenly in the window; an onset response is moved to its latency below.
     position = random.random(len(which)) * free
     early = random.random(len(which)) < onset
     latency = _LATENCY + _JITTER * random.standard_normal(int(early.sum()))

@@ -211,6 +211,7 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
     check_correction(correction)
     result = np.array(p, dtype=np.float64)
     known = np.isfinite(result)
+    # Benjamini and Hochberg's step-up procedure, which controls the share of false discoveries.
     if correction == "fdr" and known.any():
         from scipy.stats import false_discovery_control
 

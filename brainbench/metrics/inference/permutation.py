@@ -226,6 +226,7 @@ def label_orders(
         return
     # Counting the given order once among the random ones is what (b+1)/(n+1) means.
     yield np.arange(stimuli)[None]
+    # One seeded stream, drawn row by row: chunks of any size give the same orders.
     generator = np.random.default_rng(seed)
     left = RANDOM_PERMUTATIONS if draws is None else draws
     while left:

@@ -186,6 +186,7 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
 
 def _statistics(model: Floats, brain: Floats, pairs: np.ndarray) -> Floats:
     """Return the mean comparison [S, N] under every order, the layer chosen on the other animals each time."""
+    # Unit vectors once per RDM; a comparison under an order is then a product of moved entries.
     left, right = features(model, "pearson"), features(brain, "pearson")
     # r is linear in the animals' unit vectors: with one layer they are averaged before the orders are taken.
     if model.shape[1] == 1:

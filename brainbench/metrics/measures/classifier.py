@@ -125,10 +125,12 @@ def _fold(matrix: Floats, rows: Ints, stimulus: int) -> _Fold:
     inside = rows != stimulus
     train, test = matrix[inside], matrix[~inside]
     mean = train.mean(axis=0)
+    # The left-out stimulus takes no part in mean and scale, or the test would leak into the training.
     train, test = train - mean, test - mean
     # One scale for all features makes the penalty independent of units and keeps the features' proportions.
     scale = math.sqrt(float((train**2).mean())) or 1.0
     if train.shape[1] > len(train):
+        # Coordinates in the span of the training rows: a penalised fit gives no weight to what is orthogonal to them.
         basis = np.linalg.svd(train, full_matrices=False)[2]
         train, test = train @ basis.T, test @ basis.T
     return _Fold(stimulus, train / scale, test / scale)

@@ -124,12 +124,14 @@ def _orders(stimuli: int, seed: int) -> Ints:
 
 def _accuracies(patterns: Floats, properties: Mapping[str, Ints], orders: Ints) -> Floats:
     """Return accuracies [N, properties] with the classes given to the stimuli in each order [N, K]."""
+    # Classes are permuted over stimuli; the folds of patterns stay and are prepared once.
     decoder = Decoder(patterns, np.arange(len(patterns)))
     return np.array([[float(np.mean(decoder(codes[order]))) for codes in properties.values()] for order in orders])
 
 
 def _smallest_p(properties: Mapping[str, Ints], orders: Ints) -> float:
     """Return the share of orders that leave together what is together, which no test can tell apart."""
+    # Orders that give the same partition of the stimuli into classes give the same accuracy.
     same = [(codes[orders][:, :, None] == codes[orders][:, None]) for codes in properties.values()]
     return float(np.mean([all((part[index] == part[0]).all() for part in same) for index in range(len(orders))]))
 

@@ -107,6 +107,7 @@ def variance_partition(
     residual = brain @ rest
     scale = ((brain - brain.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
+        # R² of each model from sums of squares: residual after the nuisances, and the projection on the model alone.
         by_nuisance = 1 - (residual**2).sum(axis=1) / scale
         partial, unique = _partial(model[None], rest, residual, scale)
         centred = model - model.mean()

@@ -126,6 +126,7 @@ class PatternMetric:
         scored = [found.animals[i] for i in found.scored]
         # [N, L, A] under every order, so that the choice of layer and the mean are repeated in each.
         values = np.stack([self.compare_orders(layers[layer], scored, orders) for layer in usable], axis=1)
+        # An animal without a value for some layer in the given order takes no part, in any order.
         known = np.isfinite(values[0]).all(axis=0)
         if not known.any():
             return undefined(about, "the metric has no value for any animal", found)
@@ -243,6 +244,7 @@ def make_score(
     **fields: Any,
 ) -> Score:
     """Return the score whose value is the first of the statistics [N] under every order of the stimuli."""
+    # The given order is the first of the orders, so the value is the first of the statistics.
     test = make_test(null, exact=len(about["stimuli"]) <= _EXACT_STIMULI, smallest=smallest)
     usable = [layer for layer in layers if layer.status != "undefined"]
     best = max(usable, key=lambda layer: layer.value, default=None)
@@ -288,4 +290,5 @@ def _chosen_layers(values: Floats) -> tuple[Ints, Floats, str]:
         rule = "maximum over layers on the only animal (optimistic; the permutation takes the same maximum)"
         return np.argmax(values[0], axis=0), values.max(axis=1), rule
     rule = "chosen on the other animals, evaluated on the animal held out"
+    # held_out chooses anew in every order; the layers that are reported are those of the given one.
     return choose_on_others(values[0]), held_out(values), rule

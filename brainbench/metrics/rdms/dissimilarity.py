@@ -210,6 +210,7 @@ def _window_mean(window: np.ndarray) -> np.ndarray:
         return window.mean(axis=1, dtype=np.float64)
     missing = np.isnan(window)
     number = (~missing).sum(axis=1)
+    # Mean over the bins that were recorded; without any it stays missing, never zero.
     total = np.where(missing, 0.0, window).sum(axis=1)
     return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
 
@@ -251,6 +252,7 @@ def _mahalanobis(given: _Responses) -> Array:
     patterns = given.placed()
     # The shift per unit must go before the product mixes units.
     centred = without_shift(patterns)
+    # (x_i − x_j) C⁻¹ (x_i − x_j) from inner products of vectors whitened by a factor of C⁻¹ (Walther 2016).
     left, right = given.sides(centred, centred)
     return products_from_gram(left @ right.T, patterns.shape[1])
 

@@ -67,6 +67,7 @@ def permuted_pairs(orders: Any) -> Any:
     # table[i, j] is the place of the pair {i, j}: permuting an RDM is one look-up, without square matrices.
     table = xp.zeros((count, count), dtype=xp.int64, **where)
     table[rows, cols] = table[cols, rows] = xp.arange(len(rows), **where)
+    # Pair (i, j) of the permuted RDM is the pair (order[i], order[j]) of the given one.
     return table[orders[..., rows], orders[..., cols]]
 
 

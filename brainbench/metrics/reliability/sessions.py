@@ -41,6 +41,7 @@ class SortedTrials(Trials):
     @classmethod
     def sort(cls, responses: Floats, labels: Ints, hashes: Hashes) -> SortedTrials:
         """Sort trials by stimulus and hash, so that the order in which they came is forgotten."""
+        # Sorted by content, sums are formed in one order, so results do not change with the order of trials.
         order = np.lexsort((hashes, labels))
         return cls(responses[order], labels[order], hashes=hashes[order])
 

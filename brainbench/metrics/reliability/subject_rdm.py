@@ -164,6 +164,7 @@ def subject_rdm(
     if distance != "poisson":
         sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     every = WeightedRDMs(sessions, [np.ones((1, len(session.labels))) for session in sessions], n_stimuli, distance)
+    # Sums over all trials are made once; halves and draws are weightings of the same sorted trials.
     rdm, halves, r = every.whole()[0], *_split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
     found = replace(empty, rdm=rdm, split_half_r=r, halves=halves)
     finite = r[np.isfinite(r)]
@@ -174,7 +175,9 @@ def subject_rdm(
     # The formula has a pole at r = −1, across which percentiles mean nothing.
     low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
     spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
+    # Correlations are averaged before the formula, which is not linear.
     found = replace(found, reliability=float(spearman_brown(finite.mean())), spread=spread)
+    # The draws are made here, once for all models, and must fit in memory.
     number = min(draws, _DRAWS_BYTES // (8 * pairs))
     if not number:
         return replace(found, draws=np.empty((0, pairs)))

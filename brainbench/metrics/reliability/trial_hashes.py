@@ -43,6 +43,7 @@ def content_hashes(responses: NDArray, codes: Ints) -> Hashes:
             stimulus = np.zeros(int(codes.max(initial=-1)) + 1, dtype=np.uint64)
             np.add.at(stimulus, codes, trial)
             trial = _mix(trial + _mix(stimulus)[codes])
+            # Sums of mixed values do not depend on order, which makes trials and units anonymous sets to one another.
             unit = _mix(_mix(values ^ trial[:, None]).sum(axis=0, dtype=np.uint64))
             trial = _mix(trial + _mix(values ^ unit).sum(axis=1, dtype=np.uint64))
         order = np.argsort(trial, kind="stable")

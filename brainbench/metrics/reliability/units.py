@@ -50,6 +50,7 @@ def unit_reliability(
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
         for start in range(0, splits, _CHUNK):
             member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
+            # Split by split, so that memory holds a chunk of splits of one session.
             halves = [weighted_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
             # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.
             first, second = (features(half.swapaxes(-1, -2), "pearson") for half in halves)

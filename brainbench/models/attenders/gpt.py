@@ -83,6 +83,7 @@ class GPTBlock(nn.Module):
             is_causal=mask is None,
             dropout_p=self.dropout if self.training else 0.0,
         )
+        # Pre-norm: the stream itself is never normalised inside the blocks, so gradients pass through them unchanged.
         x = x + self.residual_dropout(self.project(attended.transpose(1, 2).reshape(batch, tokens, width)))
         return x + self.mlp(self.norm_mlp(x)), (key, value)
 

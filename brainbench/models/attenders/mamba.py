@@ -91,6 +91,7 @@ class MambaBlock(nn.Module):
     def step(self, x: torch.Tensor, memory: MambaMemory) -> tuple[torch.Tensor, MambaMemory]:
         """Advance by one step [B, width]; return the answer and the next memory."""
         u, gate = self.expand(self.norm(x)).chunk(2, -1)
+        # The stream keeps the last inputs, so its short convolution sees what the sweep's does.
         window = torch.cat((memory.recent.to(u.dtype), u[..., None]), -1)
         weight, bias = self.convolution.weight[:, 0], cast(torch.Tensor, self.convolution.bias)
         u = functional.silu((window * weight).sum(-1) + bias)

@@ -84,6 +84,7 @@ class GatedCell(Cell):
         return dispatch.conv_concat(conv, (x, memory))
 
     def _normalised(self, fused: torch.Tensor, names: tuple[str, ...]) -> list[torch.Tensor]:
+        # One convolution gives all gates; each is normalised by itself, as gates differ in scale.
         parts = fused.chunk(len(names), 1)
         if not self.norms:
             return list(parts)

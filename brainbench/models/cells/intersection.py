@@ -66,5 +66,6 @@ class IntersectionRNN(GatedCell):
         keep = torch.sigmoid(keep + FORGET_BIAS)
         # Thesis, equations 3.2 and 3.3: one gate passes the state on in time, the other the input on in depth.
         through = torch.sigmoid(through + FORGET_BIAS)
+        # h = y x + (1 − y) n and s = p s + (1 − p) m: early in training most of input and state passes.
         y = through * x + (1 - through) * torch.relu(output)
         return y.to(x.dtype), keep * state + (1 - keep) * torch.tanh(candidate)

@@ -102,6 +102,7 @@ class ResNet18Encoder(nn.Module):
         check_sweep(x, self.input_shape, "The ResNet")
         leading = x.shape[:2]
         layers = ((name, self.get_submodule(name)) for name in self.layers)
+        # Steps are independent images here, so batch and time are one axis.
         y, activations = run_layers(x.flatten(0, 1), layers, return_activations)
         y = y.unflatten(0, leading)
         if return_activations is False:

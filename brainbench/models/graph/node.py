@@ -78,4 +78,5 @@ def _pool(pool: Pool | None) -> list[nn.Module]:
 
 
 def _resize(x: torch.Tensor, grid: Shape) -> torch.Tensor:
+    # Bilinear with antialiasing: a smaller grid averages what lies between its places instead of skipping it.
     return functional.interpolate(x, size=grid, mode="bilinear", align_corners=False, antialias=True)

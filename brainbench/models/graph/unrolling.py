@@ -115,6 +115,7 @@ class UnrolledSweep:
     def _window(self, source: str, first: int, stop: int) -> torch.Tensor:
         """Return the outputs of a node at steps first to stop [B, stop − first, ...]; before its first step, zeros."""
         start, values = self.kept.get(source, (0, self.x.new_zeros(self.batch, 0, *self.graph.shapes[source])))
+        # Before the first step every node is silent: zeros, as in a stream from the empty state.
         missing = max(0, -first)
         part = values[:, max(first, 0) - start : max(stop, 0) - start]
         if not missing:

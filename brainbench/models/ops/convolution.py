@@ -192,11 +192,13 @@ class _Convolution(torch.autograd.Function):
         deferred: DeferredWeightGrad = ctx.deferred
         place = deferred.gradient(ctx.span)
         gradient = given[0] if place is None else _maps(place, deferred.geometry)
+        # A fused kernel may have written the gradient to its place already; else it is copied there.
         if gradient.data_ptr() != given[0].data_ptr():
             gradient.copy_(given[0])
         if not any(ctx.needs_input_grad[2:]):
             return None, None, *(None for _ in ctx.inputs)
         back = deferred.geometry.reversed()
+        # Taken back by the same kernels: windows of the gradient times the turned weights.
         taken = _maps(unfolded([gradient], back) @ deferred.back, back)
         parts = taken.split([channels for channels, _ in ctx.inputs], 1)
         return None, None, *(part.to(kind) for part, (_, kind) in zip(parts, ctx.inputs, strict=True))

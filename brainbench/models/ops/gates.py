@@ -55,6 +55,7 @@ def apply_gates(
 
     In mixed precision the new state is single, otherwise of the precision of the old one.
     """
+    # A memory is added to at every step; in half precision small additions would be lost.
     kind = torch.float32 if torch.is_autocast_enabled(x.device.type) else state.dtype
     state = state.to(kind)
     if cell.deferred is not None:

@@ -102,6 +102,7 @@ class PackedMatrix:
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Return x [..., in] times the matrix, plus the bias, in the precision of ``x``."""
+        # A product with few rows is bound by reading the weights: half precision halves that, single keeps the digits.
         rounded = x.to(self.dtype)
         if self.ordered is None:
             y = functional.linear(rounded, cast(torch.Tensor, self.plain))

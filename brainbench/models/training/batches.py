@@ -90,6 +90,7 @@ class ArrayBatches:
             # The order depends on seed and epoch alone, so going on in mid-epoch needs no state of a generator.
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
             order = torch.randperm(len(self.labels), generator=generator)
+        # Every number-th sweep of one shuffled order: processes together see the batches that one process would.
         mine = order[:count][rank::parts]
         while self._batch < len(self):
             chosen = mine[self._batch * size : (self._batch + 1) * size]

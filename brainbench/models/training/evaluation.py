@@ -65,6 +65,7 @@ def topk(answers: torch.Tensor, labels: torch.Tensor, k: int) -> int:
     Ties count against the network: a constant answer knows nothing. NaN answers are wrong.
     """
     own = answers.gather(1, labels[:, None])
+    # The label's own answer is among those not smaller, so it is taken off.
     ahead = (answers >= own).sum(1) - 1
     return int(((ahead < k) & torch.isfinite(own[:, 0])).sum())
 

@@ -203,6 +203,7 @@ class _Run:
         factor = rate_factor(
             config.schedule, self.at.step / steps, epochs=config.epochs, warmup_epochs=config.warmup_epochs
         )
+        # The rate is a function of the step alone, so a resumed run needs no state of a scheduler.
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * factor
         found = self.gradients(views, labels)
@@ -374,11 +375,13 @@ class _Run:
     def _precision(self) -> Any:
         if self.config.precision == "float32":
             return nullcontext()
+        # bfloat16 has the range of single precision, so losses need no scaling.
         return torch.autocast(self.where.device.type, dtype=torch.bfloat16)
 
 
 def _generator(seed: int, step: int, view: int) -> torch.Generator:
     """Return random numbers that depend on nothing but where training stands, so that no state need be kept."""
+    # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
     return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)
 
 

@@ -77,6 +77,7 @@ def unfold_kernel(
     window, c = unit // WIDTH, (unit % WIDTH).to(tl.int32)
     r, tap = window // (KERNEL_H * KERNEL_W), (window % (KERNEL_H * KERNEL_W)).to(tl.int32)
     stimulus, place = r // (OUT_H * OUT_W), (r % (OUT_H * OUT_W)).to(tl.int32)
+    # Place of the input under this tap; taps outside the grid read the zeros of the padding.
     h, w = place // OUT_W - TOP + tap // KERNEL_W, place % OUT_W - LEFT + tap % KERNEL_W
     there = inside & (h >= 0) & (h < H) & (w >= 0) & (w < W)
     value = _from(x0, stimulus, batch0, h, w, row0, place0, c, there, 0, C0, UNIT)
