@@ -108,6 +108,7 @@ class Mesh:
         counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
         open_edges = int((counts != 2).sum())
         consistent = bool(solid.is_winding_consistent)
+        # Corners sorted: copies of a triangle count whichever way they are turned.
         distinct = len(np.unique(np.sort(self.faces, axis=1), axis=0))
         return Diagnosis(
             open_edges=open_edges,

@@ -92,6 +92,7 @@ def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
     values = np.array([animals.corrections[i].reliability for i in animals.scored])
     if not values.size:
         return math.nan, None
+    # One animal has no interval over animals; the spread over its splits stands in and says so.
     if len(values) == 1:
         return float(values[0]), animals.subjects[animals.scored[0]].spread
     return float(values.mean()), t_interval(values)

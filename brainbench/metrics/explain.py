@@ -212,6 +212,7 @@ def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectR
         # The published pool joined units, which are not kept here; the animals' mean RDM stands for it.
         splits = min(len(subject.halves) for subject in subjects)
         halves = np.mean([subject.halves[:splits] for subject in subjects], axis=0)
+        # Halves are averaged split by split over animals, so the pool's halves hold different trials too.
         agreement = compare_rdms(halves[:, 0], halves[:, 1], method=comparison)
         targets.append(("the pool", np.mean([subject.rdm for subject in subjects], axis=0), agreement))
     if not targets:

@@ -201,6 +201,7 @@ def splits_error(values: Floats, split_half_r: Sequence[Floats]) -> float:
     Splits are independent draws given the trials, so the mean split-half correlation h has standard
     error s/√S, and value ∝ √((1 + h)/2h) turns it into value · se / (2h(1 + h)).
     """
+    # Errors of the score by the random splits alone: the trials are held fixed.
     errors = []
     for value, r in zip(values, split_half_r, strict=True):
         finite = r[np.isfinite(r)]

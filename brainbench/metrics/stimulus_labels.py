@@ -15,7 +15,7 @@ from brainbench.metrics.rdms.pairs import Floats, Ints
 _SLICE_ELEMENTS = 1 << 20
 
 _OFFSET = 1e3
-"""Where means are this many times their spread over stimuli, sums are taken about a value within the data."""
+"""Ratio of means to their spread over stimuli above which sums are taken about a value within the data."""
 
 
 def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, tuple[str, ...]]:

@@ -237,6 +237,7 @@ def draw_contacts(
         rows = [np.zeros((0, 2))]
         for onset, stimulus in zip(behaviour.onset, behaviour.stimulus, strict=True):
             if stimulus >= 0:
+                # A jitter of 1 ms keeps the contacts of equal trials from being exactly equal.
                 jitter = random.normal(0.0, 0.001, (len(per_stimulus[stimulus]), 1))
                 rows.append(per_stimulus[stimulus] + onset + jitter)
             if random.random() < 0.15:

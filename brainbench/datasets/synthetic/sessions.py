@@ -184,6 +184,7 @@ def _session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
     # The margins keep the refractory time between the spikes of a window and those around it.
     opened = np.concatenate([[0.0], choice]) + _DEAD
     pause = np.concatenate([begin, [end]]) - _DEAD - opened
+    # The rate between windows is the same for all stimuli: a reader that mistakes the window loses the geometry.
     rest = _REST * drawn.expected.mean(axis=0)
     spikes = []
     for unit in range(drawn.counts.shape[1]):

@@ -64,7 +64,7 @@ class PairTest:
     p_corrected: float
     """Corrected for the number of pairs."""
     reason: str = ""
-    """Why there is no p."""
+    """Reason for a missing p; empty otherwise."""
 
 
 @dataclass(frozen=True)

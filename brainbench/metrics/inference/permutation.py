@@ -51,7 +51,7 @@ class PermutationTest:
     null: Floats
     """[count] statistics, first the observed one."""
     reason: str = ""
-    """Why p is undefined."""
+    """Reason for an undefined p; empty otherwise."""
 
     @property
     def status(self) -> Status:

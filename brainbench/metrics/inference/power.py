@@ -95,7 +95,7 @@ class Power:
     mean_score: float = math.nan
     """Mean raw comparison in the simulated experiments, after the choice of layer."""
     reason: str = ""
-    """Why no simulation was needed."""
+    """Reason for doing without simulations; empty otherwise."""
 
 
 def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:

@@ -69,6 +69,7 @@ class LabelDecoding(PatternMetric):
             reason = "activations of every layer are not finite" if properties else _no_property(stimuli)
             return Score(value=math.nan, status="undefined", reasons=(reason,), **about)
         orders = _orders(len(stimuli), seed)
+        # [N, L, properties]: every layer meets the same assignments of classes.
         values = np.stack([_accuracies(layers[layer], properties, orders) for layer in usable], axis=1)
         # The maximum over layers is taken in every order too, so p accounts for it.
         means = values.mean(axis=-1)

@@ -46,7 +46,7 @@ class VariancePartition:
     """Mean unique share of the model under permutation: what fitting few pairs gives for nothing."""
     nuisances: tuple[str, ...]
     reason: str = ""
-    """Why p is undefined."""
+    """Reason for an undefined p; empty otherwise."""
 
 
 def nuisance_rdm(values: ArrayLike, labels: ArrayLike) -> Floats:

@@ -138,6 +138,7 @@ class PatternMetric:
         status: Status = "ok" if found.reliable else "unreliable"
         return make_score(
             about,
+            # The score under every order, with the layer chosen anew in each; the first is the observed one.
             held.mean(axis=-1),
             seed,
             {"layer_tests": layer_table(usable, values.mean(axis=-1))} | self.statistics(layers[layer], scored, seed),
@@ -182,6 +183,7 @@ class PatternMetric:
         for animal in scored:
             # The others' units side by side, as if they were one animal.
             others = np.concatenate([other.patterns for other in scored if other is not animal], axis=1)
+            # Every order moves the stimuli of the others together, as those of one model.
             columns.append(self.compare_orders(others, [animal], orders))
         values = np.concatenate(columns, axis=1)
         by_subject: dict[str, tuple[float, str | None]] = {

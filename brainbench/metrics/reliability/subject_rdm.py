@@ -70,7 +70,7 @@ class SubjectRDM:
     seed: int = 0
     """Seed of splits and draws."""
     problem: str | None = None
-    """Why the animal has no usable RDM, in words."""
+    """Reason for having no usable RDM, in words; None otherwise."""
     notes: tuple[str, ...] = ()
     """Sessions and units that were left out, in words."""
     draws: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)

@@ -58,6 +58,7 @@ def unit_reliability(
             known = np.isfinite(r)
             total += np.where(known, r, 0.0).sum(axis=0)
             number += known.sum(axis=0)
+        # Splits are averaged before Spearman and Brown's formula, as for RDMs.
         mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
         found.append(spearman_brown(mean))
     return tuple(found)

@@ -44,7 +44,7 @@ class IntersectionRNN(GatedCell):
             )
         super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
         self.deferred: DeferredNormGrad | None = None
-        """Where the steps of a pass leave the gradients of the norms; None outside of such a pass."""
+        """Place for the gradients of the norms of each step; None outside of a deferring pass."""
 
     def forward(
         self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()

@@ -84,6 +84,7 @@ class ResNet18Encoder(nn.Module):
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one step of one stimulus."""
         _, rows, columns = self.input_shape
+        # The first convolution and the pool halve the grid, as does every layer from the second on.
         size = (_halved(_halved(rows)), _halved(_halved(columns)))
         first, *_ = (module for module in self.conv1 if isinstance(module, Conv2d))
         total = first.weight.numel() * _halved(rows) * _halved(columns)

@@ -150,6 +150,7 @@ class UnrolledSweep:
         previous = {name: self.x.new_zeros(1, *graph.shapes[name]) for name in group}
         memories: dict[str, torch.Tensor] = {}
         history: dict[str, list[torch.Tensor]] = {name: [] for name in group if name in read}
+        # Nodes of a loop need one another's last outputs, so time is the outer loop here.
         for t in range(max(self.steps[name][1] for name in group)):
             current: dict[str, torch.Tensor] = {}
             for name in group:

@@ -55,6 +55,7 @@ def unfolded(
     from brainbench.models.ops.kernels.intersection import channels_innermost
     from brainbench.models.ops.kernels.unfold import unfold_into
 
+    # im2col: a convolution of a small grid is one matrix product of all its windows.
     rows = len(inputs[0]) * math.prod(geometry.out)
     if out is None:
         width = math.prod(geometry.kernel) * sum(x.shape[1] for x in inputs)

@@ -77,6 +77,7 @@ class ArrayBatches:
 
     def __len__(self) -> int:
         """Count the batches of an epoch."""
+        # Every process gets equally many sweeps (the rest is left out), or one would wait for the others for ever.
         return math.ceil(len(self.labels) // self.part[1] / (self.batch_size // self.part[1]))
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:

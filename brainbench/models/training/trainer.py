@@ -231,6 +231,7 @@ class _Run:
         self.at.total, self.at.count = 0.0, 0
         self.log.write("epoch", self.at.step, epoch=self.at.epoch, loss=loss)
         score = self._validate(loss)
+        # Strictly better, so of equal epochs the first is kept, and a NaN never is.
         if score < self.at.best:
             self.at.best, self.at.best_epoch = score, self.at.epoch
             if self.where.first:

@@ -116,6 +116,7 @@ def unfold_into(
     # Largest common divisor of strides and channels, up to 8 numbers: 16 bytes in half precision, one access to memory.
     unit = math.gcd(8, *channels, *(value for axis in strides for value in axis))
     total = out.numel() // unit
+    # The kernel takes its index apart as a 32-bit number, which limits one launch.
     if total >= 2**32:
         raise ValueError(f"{out.numel():,} numbers of windows are too many for one kernel; compute fewer at a time.")
     block = TILE // unit
