@@ -130,6 +130,7 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cach
     found = _read(path, mesh.name)
     pieces, numbers = found or _compute(unit, settings, path)
     outward, inward, samples, decimated = (float(value) for value in numbers)
+    # Convexity and relative deviation do not change with scale, so the unit pieces are only scaled back.
     placed = tuple(Mesh(piece.vertices * diagonal + centre, piece.faces, mesh.name) for piece in pieces)
     return Decomposition(
         pieces=placed,
@@ -147,7 +148,9 @@ def _compute(unit: Mesh, settings: DecompositionSettings, path: Path | None) -> 
         raise missing_dependency(distribution, extra=extra, purpose=purpose)
     reduced, decimated = _decimated(unit, settings.most_faces)
     pieces = tuple(convex_hull(points, unit.name) for points in _run(reduced, settings))
+    # Measured against the whole mesh; the simplified one decides what is inside, to save time.
     found = deviation(unit, pieces, inside=reduced)
+    # Relative to a diagonal of 1, so that the cached numbers serve every size.
     numbers = np.array([found.outward, found.inward, found.samples, decimated])
     if path is not None:
         _write(path, pieces, numbers)

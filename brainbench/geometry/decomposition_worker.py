@@ -28,6 +28,7 @@ def _limit(memory: int) -> None:
         import resource
     except ImportError:  # Windows
         return
+    # A limit of the address space: an allocation beyond it fails in the library instead of filling the machine.
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
 
 

@@ -60,6 +60,7 @@ def deviation(
     for piece, share in zip(pieces, shares, strict=True):
         surface = sample_surface(piece, share, rng)
         some = surface[: max(4, share // 4)]
+        # A chord between two points of a convex piece lies inside it, so it finds a hollow that the piece fills.
         chords = some - rng.random((len(some), 1)) * (some - rng.permutation(surface)[: len(some)])
         points += [surface, chords, piece.vertices]
     outward = _farthest_outside(solid, inside or solid, np.concatenate(points), rng)
@@ -85,6 +86,8 @@ def winding_number(mesh: Mesh, points: ArrayLike) -> NDArray[np.float64]:
     total = np.zeros(len(points))
     block = max(1, _BLOCK // len(triangles) // 9)
     for start in range(0, len(points), block):
+        # tan(Ω/2) = a·(b × c) / (|a||b||c| + (a·b)|c| + (b·c)|a| + (c·a)|b|), van Oosterom & Strackee 1983; arctan2
+        # gives Ω/2 with its sign, so the sum over 2π is that of Ω over 4π. Blocks of points bound the memory.
         a, b, c = np.moveaxis(triangles[None] - points[start : start + block, None, None], 2, 0)
         la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
         ab, bc, ca = (np.einsum("nfi,nfi->nf", u, v) for u, v in ((a, b), (b, c), (c, a)))
@@ -152,6 +155,7 @@ def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
         return 0.0
     points, bounds = points[left], bounds[left]
     best = np.full(len(points), np.inf)
+    # Exact distances for the four pieces with the smallest lower bounds alone, among which the nearest is expected.
     for index in np.argsort(bounds, axis=1)[:, : min(4, len(pieces))].T:
         for chosen in np.unique(index):
             mine = np.flatnonzero(index == chosen)
@@ -179,6 +183,7 @@ def _areas(mesh: Mesh) -> NDArray[np.float64]:
 
 def _sample(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return points [count, 3] and the faces [count] they lie on."""
+    # Faces are drawn by area; (1 − √u, √u (1 − v), √u v) is then uniform on a triangle.
     ends = np.cumsum(_areas(mesh))
     face = np.minimum(np.searchsorted(ends, rng.random(count) * ends[-1]), len(ends) - 1)
     u, v = np.sqrt(rng.random((count, 1))), rng.random((count, 1))

@@ -104,9 +104,11 @@ class Mesh:
         """Faults of this mesh as a solid."""
         solid = self.to_trimesh()
         edges = solid.edges_sorted.astype(np.int64)
+        # Both vertices of an edge make one integer, so that one sort counts all edges.
         counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
         open_edges = int((counts != 2).sum())
         consistent = bool(solid.is_winding_consistent)
+        # Corners sorted: copies of a triangle count whichever way they are turned.
         distinct = len(np.unique(np.sort(self.faces, axis=1), axis=0))
         return Diagnosis(
             open_edges=open_edges,
@@ -120,6 +122,7 @@ class Mesh:
     @cached_property
     def volume(self) -> float:
         """Signed volume inside a closed surface [m³]; negative when it is inside out, meaningless when open."""
+        # Divergence theorem: signed tetrahedra a·(b × c)/6, seen from the middle, since a far origin would cost digits.
         a, b, c = np.moveaxis(self.vertices[self.faces] - self.bounds.mean(axis=0), 1, 0)
         return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
 
@@ -176,6 +179,7 @@ def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
     """
     from scipy.spatial import ConvexHull
 
+    # The third singular value of centred points is their extent across the plane that fits them best.
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < 1e-9 * spread[0]:
         raise DataError(f"The mesh {name!r} has no volume: its points lie in a plane.")
@@ -193,6 +197,7 @@ def face_owners(mesh: Mesh) -> NDArray[np.int64]:
     """Return the number [F] of the connected piece that each face belongs to."""
     from trimesh.graph import connected_component_labels
 
+    # Two edges of a triangle join its three vertices; pieces are the components of that graph.
     edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     return connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
 

@@ -70,6 +70,7 @@ def _drop(mesh: Mesh, done: list[str]) -> Mesh:
         faces, ordered = faces[whole], ordered[whole]
     if not len(faces):
         raise DataError(f"The mesh {mesh.name!r} has no triangle with an area.")
+    # The first of equal triangles stays, and the order of the file is kept.
     first = np.sort(np.unique(ordered, axis=0, return_index=True)[1])
     if len(first) < len(faces):
         done.append(f"{_count(len(faces) - len(first), 'duplicate triangle')} removed")
@@ -82,6 +83,7 @@ def _close(mesh: Mesh, done: list[str]) -> Mesh:
     import trimesh
     from scipy.spatial import KDTree
 
+    # Neighbours by tree in V log V; chains of near vertices become one by connected components.
     pairs = KDTree(mesh.vertices).query_pairs(MERGE * mesh.diagonal, output_type="ndarray")
     if len(pairs):
         group = trimesh.graph.connected_component_labels(pairs, node_count=len(mesh.vertices))
@@ -148,6 +150,8 @@ def _within_another(bodies: Mapping[int, Mesh], label: int) -> bool:
         for other, body in bodies.items()
         if other != label and ((corner > body.bounds[0]) & (corner < body.bounds[1])).all()
     ]
+    # A winding number above one half is inside (Jacobson et al. 2013), and shells in shells alternate
+    # between wall and cavity.
     return sum(abs(float(winding_number(body, corner)[0])) > 0.5 for body in around) % 2 == 1
 
 

@@ -1,4 +1,4 @@
-"""How well animals agree with one another, by the estimator that scores models."""
+"""Agreement of animals with one another, by the estimator that scores models."""
 
 from __future__ import annotations
 
@@ -178,6 +178,7 @@ def _against_others(
     # Halves are averaged split by split, so every animal must have them.
     splits = min(len(subjects[other].halves) for other in scored)
     halves = np.mean([other.halves[:splits] for other in others], axis=0)
+    # Both reliabilities enter the correction (thesis, equation 3.4), since the others' mean RDM is noisy too.
     return noise_corrected(
         float(compare_rdms(subjects[index].rdm, pooled, method=comparison)),
         subjects[index].split_half_by(comparison)[:splits],
@@ -194,7 +195,9 @@ def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) ->
     """Return P(mean corrected agreement ≥ observed) when every animal's stimuli are permuted independently."""
     animals, pairs = rdms.shape
     stimuli = stimulus_count(pairs)
+    # A canonical order of the stimuli, so that random permutations do not depend on how they were listed.
     rdms = rdms[:, permuted_pairs(canonical_order(rdms)[None])[0]]
+    # Each animal has its own order: one order for all would leave their agreement as it is.
     generator = np.random.default_rng(seed)
     observed = _agreement(rdms[None], factors, comparison)[0]
     reached, done = 0, 0
@@ -204,11 +207,13 @@ def _permutation_p(rdms: Floats, factors: Floats, comparison: str, seed: int) ->
         permuted = np.take_along_axis(rdms[None], permuted_pairs(orders), axis=-1)
         reached += int((_agreement(permuted, factors, comparison) >= observed - TIE).sum())
         done += rows
+    # (b + 1)/(n + 1): the given order counts among the random ones.
     return (reached + 1) / (RANDOM_PERMUTATIONS + 1)
 
 
 def _agreement(rdms: Floats, factors: Floats, comparison: str) -> Floats:
     """Return the mean corrected comparison [N] of each animal with the mean of the others, from [N, A, P]."""
+    # All leave-one-out means from one sum over animals.
     others = (rdms.sum(axis=1, keepdims=True) - rdms) / (rdms.shape[1] - 1)
     return compare_rdms(rdms, others, method=comparison) @ factors / len(factors)
 
@@ -217,5 +222,6 @@ def smallest_p_of_animals(stimuli: int, animals: int) -> float:
     """Return the smallest p that permuting the animals' stimuli can give."""
     if stimuli < 3:
         return 1.0
+    # K!^(A − 1) orders relative to the first animal, as a logarithm, since the number overflows.
     orders = math.lgamma(stimuli + 1) * (animals - 1)
     return max(1 / (RANDOM_PERMUTATIONS + 1), math.exp(-min(orders, 700.0)))

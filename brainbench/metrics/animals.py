@@ -83,6 +83,7 @@ def _correction(subject: SubjectRDM, estimator: str, comparison: str) -> Correct
         return Corrected(math.nan, "undefined", subject.problem)
     if is_flat(subject.rdm):
         return Corrected(math.nan, "undefined", "its RDM has missing pairs or no differences between pairs")
+    # The correction is linear in the comparison, so the value for a comparison of 1 is the factor for any.
     return noise_corrected(1.0, subject.split_half_by(comparison), estimator=estimator)
 
 
@@ -91,6 +92,7 @@ def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
     values = np.array([animals.corrections[i].reliability for i in animals.scored])
     if not values.size:
         return math.nan, None
+    # One animal has no interval over animals; the spread over its splits stands in and says so.
     if len(values) == 1:
         return float(values[0]), animals.subjects[animals.scored[0]].spread
     return float(values.mean()), t_interval(values)

@@ -1,4 +1,4 @@
-"""Where the heavy products are computed: numpy on the processor, or torch on any device, by the same code.
+"""Array library of the heavy products: numpy on the processor, or torch on any device, by the same code.
 
 Functions of distances use only what both libraries spell alike; :func:`library` names the one that an
 array belongs to. Everything is float64 on either side, so the numbers agree to rounding.
@@ -68,6 +68,7 @@ def slices(values: Any, elements: int, device: Any) -> Iterator[tuple[slice, Arr
 
     The whole is never copied, so what is wider than the device's memory is computed all the same.
     """
+    # Slices of units are summed up by the caller; their number depends on the input alone, so sums are reproducible.
     rows = max(1, int(np.prod(tuple(values.shape[:-1]))))
     step = max(1, elements // rows)
     for start in range(0, values.shape[-1], step):
@@ -78,6 +79,7 @@ def slices(values: Any, elements: int, device: Any) -> Iterator[tuple[slice, Arr
 def cholesky(matrix: Array) -> Array | None:
     """Return the lower Cholesky factor [N, N], or None where the matrix has none."""
     if is_tensor(matrix):
+        # cholesky_ex reports a failure as a number instead of raising.
         factor, info = library(matrix).linalg.cholesky_ex(matrix)
         return None if int(info) else factor
     from scipy.linalg import LinAlgError

@@ -84,15 +84,18 @@ def corrected_value(
     halves = np.asarray(r_yy, dtype=np.float64).ravel()
     others = np.ones(len(halves)) if r_xx is None else np.broadcast_to(np.asarray(r_xx, dtype=np.float64), halves.shape)
     raw = np.broadcast_to(np.asarray(r_xy, dtype=np.float64), halves.shape)
+    # Splits without a correlation (a half with a flat RDM) have no say under any switch.
     keep = np.isfinite(halves) & np.isfinite(others) & np.isfinite(raw)
     if switches.drop_splits:
         keep &= halves >= THESIS_FILTER
     if not keep.any():
         return math.nan, 0
     if not switches.ratio_per_split:
+        # The default: splits are averaged before one ratio is formed.
         sides = [float(spearman_brown(side[keep].mean())) for side in (halves, others)]
         value = float(raw[keep].mean()) / math.sqrt(math.prod(sides)) if min(sides) > 0 else math.nan
         return value, int(keep.sum())
+    # Thesis, equation 3.4, for every split; a negative product has no real root.
     first, second = spearman_brown(halves[keep]), spearman_brown(others[keep])
     real = first * second > 0
     if not switches.negative_pairs:
@@ -206,8 +209,10 @@ def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectR
             if float(spearman_brown(target[2][np.isfinite(target[2])].mean())) >= RELIABILITY_GATE
         ]
     if switches.best_target and len(subjects) > 1:
+        # The published pool joined units, which are not kept here; the animals' mean RDM stands for it.
         splits = min(len(subject.halves) for subject in subjects)
         halves = np.mean([subject.halves[:splits] for subject in subjects], axis=0)
+        # Halves are averaged split by split over animals, so the pool's halves hold different trials too.
         agreement = compare_rdms(halves[:, 0], halves[:, 1], method=comparison)
         targets.append(("the pool", np.mean([subject.rdm for subject in subjects], axis=0), agreement))
     if not targets:

@@ -27,6 +27,7 @@ def choose_on_others(r: Floats) -> Ints:
     Args:
         r: [..., L, A] raw comparisons, A ≥ 2.
     """
+    # All leave-one-out means from one sum over animals.
     others = (r.sum(axis=-1, keepdims=True) - r) / (r.shape[-1] - 1)
     return _first_best(others)
 
@@ -62,6 +63,7 @@ def first_best(values: Floats) -> int:
 
 def _first_best(values: Floats) -> Ints:
     """Return the first index along axis −2 whose value equals the largest up to rounding."""
+    # A tolerance for ties: layers with equal RDMs differ by rounding, and the first of them is to win on every machine.
     return np.argmax(values >= values.max(axis=-2, keepdims=True) - _TIE, axis=-2)
 
 

@@ -174,6 +174,7 @@ def _statistics(
         found["layer_tests"] = layer_table(names, np.concatenate(choice.layer_null))
     held = min(len(subject.draws) for subject in scored)
     if estimator == "default" and held and all(subject.comparison == comparison for subject in scored):
+        # The draws of sessions and trials were made with the animals' RDMs and are shared by all models.
         boot = bootstrap_animals(rdms, animals, comparison, draws=held, levels="all", seed=seed)
         found["bootstrap"] = {
             "levels": boot.levels,
@@ -200,12 +201,15 @@ def splits_error(values: Floats, split_half_r: Sequence[Floats]) -> float:
     Splits are independent draws given the trials, so the mean split-half correlation h has standard
     error s/√S, and value ∝ √((1 + h)/2h) turns it into value · se / (2h(1 + h)).
     """
+    # Errors of the score by the random splits alone: the trials are held fixed.
     errors = []
     for value, r in zip(values, split_half_r, strict=True):
         finite = r[np.isfinite(r)]
         h = float(finite.mean()) if finite.size else math.nan
         spread = float(finite.std(ddof=1)) / math.sqrt(finite.size) if finite.size > 1 else math.nan
+        # Delta method: the derivative of ln √((1 + h)/2h) is −1/(2h(1 + h)).
         errors.append(float(value) * spread / (2 * h * (1 + h)))
+    # Splits of different animals are independent, so squared errors add up in the mean over animals.
     return math.sqrt(sum(error**2 for error in errors)) / len(errors)
 
 
@@ -253,6 +257,7 @@ def _choose(
 
     def statistic(x: Floats) -> Floats:
         """Return the score [N] of comparisons [N, L, A], and keep every layer's mean on the way."""
+        # Layers are tested from the same permutations as the score, so their means are kept on the way.
         means.append((x * factors).mean(axis=-1))
         if estimator != "default":
             return means[-1].max(axis=-1)

@@ -15,7 +15,7 @@ from brainbench.metrics.rdms.pairs import Floats, Ints
 _SLICE_ELEMENTS = 1 << 20
 
 _OFFSET = 1e3
-"""Where means are this many times their spread over stimuli, sums are taken about a value within the data."""
+"""Ratio of means to their spread over stimuli above which sums are taken about a value within the data."""
 
 
 def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, tuple[str, ...]]:
@@ -90,6 +90,7 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     check_finite(responses)
     member = membership(codes, count)
     present = ~np.isnan(responses)
+    # One offset for all, taken from the data, so that a large mean does not cost the digits of differences.
     shift = float(responses[present][0]) if present.any() else 0.0
     totals = member @ np.where(present, responses.astype(np.float64) - shift, 0.0)
     numbers = member @ present.astype(np.float64)
@@ -101,6 +102,7 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
     from scipy.sparse import csr_array
 
     rows = np.arange(len(codes))
+    # A sparse row of 1/n at its stimulus' trials: the mean is one product, with no copy of the responses.
     member = csr_array((1.0 / numbers[codes, 0], (codes, rows)), shape=(len(numbers), len(codes)))
     means = np.empty((len(numbers), responses.shape[1]))
     step = max(16, _SLICE_ELEMENTS // max(1, len(responses)))

@@ -93,6 +93,7 @@ def measure_tradeoff(
         return score_rdms({"a": layer}, subjects(seed, count), name="x", stimuli=list("abcdef")).value
 
     def interval_end(seed: int, number: int, inner: int) -> float:
+        # An interval's end rests on the few draws in its tail, so it needs more draws than a standard error does.
         found = bootstrap_score([layer], subjects(seed, 100, number, inner), draws=number, seed=seed)
         interval = found.interval("percentile")
         return float("nan") if interval is None else interval.low
@@ -100,6 +101,7 @@ def measure_tradeoff(
     model, brain, threshold = _p_near_five_percent()
 
     def p_value(seed: int, count: int) -> float:
+        # (b + 1)/(n + 1): the given order counts among the random ones.
         return (1 + int((_permuted(model, brain, count, seed) >= threshold).sum())) / (count + 1)
 
     jobs: list[tuple[str, int, str, bool, Callable[[int], float]]] = [
@@ -131,6 +133,7 @@ def measure_tradeoff(
 def _permuted(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
     """Return comparisons [N] under random orders of the stimuli."""
     _, *chunks = label_orders(_STIMULI, seed, exact=0, draws=count)
+    # The given order, yielded first, is left out: what remains are random orders.
     orders = np.concatenate(chunks)
     return compare(model[permuted_pairs(orders)], brain)
 
@@ -144,6 +147,7 @@ def _p_near_five_percent() -> tuple[Floats, Floats, float]:
 
 def _data(animals: int, units: int, trials: int, noise: float) -> tuple[list[Trials], Floats]:
     rng = np.random.default_rng(0)
+    # Animals read out the same four dimensions of the stimuli by random weights of their own.
     latent = rng.normal(size=(6, 4))
     labels = np.repeat(np.arange(6), trials)
     blocks = []

@@ -109,6 +109,7 @@ def measure_ceiling(
     known = np.array([score for score in scores if np.isfinite(score)])
     if not len(known):
         return float("nan"), float("nan")
+    # Animals are drawn independently around a fixed geometry, so their comparisons have a standard error.
     error = known.std(ddof=1) / np.sqrt(len(known)) if len(known) > 1 else np.nan
     return float(known.mean()), float(error)
 
@@ -150,6 +151,7 @@ def calibrate(
         )
     # Both ends are known: without modulation the expected comparison is zero.
     known = {0.0: -ceiling, MODULATION: highest}
+    # With the same seed at every step the ceiling depends on the modulation alone, as a root finder needs.
     found = root_scalar(
         lambda modulation: known.get(modulation) or excess(modulation), bracket=(0.0, MODULATION), xtol=_EXACT
     )
@@ -159,6 +161,7 @@ def calibrate(
 def _zero_fill(block: Trials, stimuli: int) -> Trials:
     """Give every trial a response of zero to each stimulus that it did not show."""
     trials, bins, units = block.responses.shape
+    # What was not shown counts as a response of zero, as in the released analysis, and pulls all means together.
     filled = np.zeros((trials, stimuli, bins, units))
     filled[np.arange(trials), block.labels] = block.responses
     keys = tuple(f"{key}/{stimulus}" for key in block.keys or () for stimulus in range(stimuli))

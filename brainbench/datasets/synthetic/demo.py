@@ -115,9 +115,11 @@ def make_demo(
         done, total = 0, sum(map(len, plans))
         for index, own in enumerate(plans):
             random = np.random.default_rng([seed, VERSION, index])
+            # Animals weigh afferents log-normally around the shared tuning, so they agree in part.
             emphasis = np.exp(_INDIVIDUAL * random.standard_normal(afferents.values.shape[2:]))
             for number, plan in enumerate(own):
                 random = np.random.default_rng([seed, VERSION, index, number])
+                # Units are drawn anew for each session from the animal's own weighting of afferents.
                 population = draw_population(random, afferents, plan.units, emphasis, plan.depth)
                 rates = population.rates(afferents)
                 session = draw_session(

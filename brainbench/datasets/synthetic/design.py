@@ -113,23 +113,30 @@ def _draw_session(
     absent = [which for owner, which in design.missing if owner == animal]
     if any(not 0 <= which < stimuli for which in absent):
         raise UsageError(f"Missing stimuli are numbered 0 to {stimuli - 1}; received {absent} for animal {animal}.")
+    # One stream for each animal and each session: a larger design begins with the animals of a smaller one.
     own = np.random.default_rng([*seed, animal])
     random = np.random.default_rng([*seed, animal, session])
+    # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
     tuning = np.sqrt(1 - design.individual) * _project(geometry.directions, design.units, random)
     if design.individual:
         private = own.standard_normal((stimuli, stimuli + 1))
         private /= np.linalg.norm(private, axis=1, keepdims=True)
         tuning += np.sqrt(design.individual) * _project(private, design.units, random)
+    # Log-normal over units with the mean rate kept, since E exp(σz − σ²/2) = 1.
     mean = design.rate * np.exp(design.spread * random.standard_normal(design.units) - design.spread**2 / 2)
     mean *= np.exp(design.session_gain * random.standard_normal())
+    # Rectified-linear rates b max(0, 1 + m w·x): their covariance over units follows the cosines of the geometry.
     expected = mean * np.maximum(0.0, 1.0 + design.modulation * tuning)
     labels = _labels(design, stimuli, absent, random)
+    # Drift is linear from the first trial to the last, with a mean of one.
     gain = np.linspace(1 - design.drift / 2, 1 + design.drift / 2, len(labels))[:, None]
     if design.shared_gain:
+        # A gamma with shape 1/σ² and scale σ² has mean one and standard deviation σ.
         shape = design.shared_gain**-2
         gain = gain * random.gamma(shape, 1 / shape, (len(labels), 1))
     rates = expected[labels] * gain
     if design.dispersion:
+        # A Poisson count with a gamma rate is negative binomial: variance = mean + φ mean².
         rates *= random.gamma(1 / design.dispersion, design.dispersion, rates.shape)
     counts = random.poisson(rates * design.window)
     return DrawnSession(

@@ -69,6 +69,8 @@ class ResponseGeometry:
         pairs = np.triu_indices(stimuli, 1)
         products = np.eye(stimuli)
         products[pairs] = products.T[pairs] = 1.0 - distances
+        # Unit vectors with inner products 1 − d, from the eigenvectors of that matrix; negative eigenvalues belong to
+        # no vectors and are dropped, after which lengths are made one again.
         values, vectors = np.linalg.eigh(products)
         kept = values > 1e-12 * values[-1]
         directions = vectors[:, kept] * np.sqrt(values[kept])

@@ -193,6 +193,8 @@ def draw_spikes(
     first = np.floor((behaviour.onset + LATENCY - low) / frame).astype(int)
     total = int((high - low) / frame)
     expected = np.broadcast_to(rest, (total, units)).copy()
+    # Gains of mean one, with variance 1/40 for all units of a trial and 1/9 for each unit, make counts vary more than
+    # Poisson ones.
     shared = random.gamma(40.0, 1 / 40.0, len(first))
     own = random.gamma(9.0, 1 / 9.0, (len(first), units))
     fraction = (behaviour.onset + LATENCY - low) / frame - first
@@ -205,10 +207,12 @@ def draw_spikes(
         shift = fraction[trial]
         expected[begin:end] = (1 - shift) * padded[1:] + shift * padded[:-1]
         expected[begin:end] *= shared[trial] * own[trial]
+    # Poisson counts of each frame, placed evenly within it; spikes within 1 ms of the one before are left out.
     numbers = random.poisson(expected * frame)
     spikes = []
     for unit in range(units):
         bins = np.repeat(np.arange(total), numbers[:, unit])
+        # Evenly within a frame, then rounded to samples as a spike sorter reports them.
         times = np.sort(low + (bins + random.random(len(bins))) * frame)
         times = np.round(times * _CLOCK) / _CLOCK
         spikes.append(times[np.diff(times, prepend=-1.0) > 0.001])
@@ -233,6 +237,7 @@ def draw_contacts(
         rows = [np.zeros((0, 2))]
         for onset, stimulus in zip(behaviour.onset, behaviour.stimulus, strict=True):
             if stimulus >= 0:
+                # A jitter of 1 ms keeps the contacts of equal trials from being exactly equal.
                 jitter = random.normal(0.0, 0.001, (len(per_stimulus[stimulus]), 1))
                 rows.append(per_stimulus[stimulus] + onset + jitter)
             if random.random() < 0.15:

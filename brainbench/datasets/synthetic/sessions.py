@@ -154,15 +154,18 @@ def place_spikes(
         spike times, s, window after window.
     """
     long = np.broadcast_to(np.asarray(length, dtype=np.float64), counts.shape)
+    # At high counts the refractory time shrinks, so that it fills at most half of any window.
     dead = min(_DEAD, float(np.min(0.5 * long / np.maximum(counts, 1))))
     which = np.repeat(np.arange(len(counts)), counts)
     # A hair less than the window, which is half open and must hold the last spike after rounding.
     free = (long[which] - counts[which] * dead) * (1 - 1e-9)
+    # Given their number, Poisson spikes lie evenly in the window; an onset response is moved to its latency below.
     position = random.random(len(which)) * free
     early = random.random(len(which)) < onset
     latency = _LATENCY + _JITTER * random.standard_normal(int(early.sum()))
     position[early] = np.clip(latency, 0.0, free[early])
     order = np.lexsort((position, which))
+    # The i-th spike of a window moves by i refractory times, which keeps the order and makes the gaps.
     rank = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     return begin[which] + position[order] + rank * dead
 
@@ -181,6 +184,7 @@ def _session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
     # The margins keep the refractory time between the spikes of a window and those around it.
     opened = np.concatenate([[0.0], choice]) + _DEAD
     pause = np.concatenate([begin, [end]]) - _DEAD - opened
+    # The rate between windows is the same for all stimuli: a reader that mistakes the window loses the geometry.
     rest = _REST * drawn.expected.mean(axis=0)
     spikes = []
     for unit in range(drawn.counts.shape[1]):

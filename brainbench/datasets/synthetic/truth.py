@@ -82,4 +82,5 @@ def correlation_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the correlation distances [P] between rows [K, U]; NaN for rows without variance."""
     rows, columns = np.triu_indices(len(responses), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Distance 1 − Pearson r over units, upper triangle row by row, as the metrics compute it.
         return 1.0 - np.atleast_2d(np.corrcoef(responses))[rows, columns]

@@ -82,6 +82,7 @@ class Population:
             late = self.delay == delay
             before[:, delay:, late] = before[:, :-delay, late]
             before[:, :delay, late] = 0.0
+        # The geometric mean asks for both inputs, present and earlier; the exponent then sharpens the tuning.
         drive = _unit_scale(np.sqrt(now * before)) ** _EXPONENT
         # Rounding keeps the spikes equal where two machines simulate stimuli that differ in the last bits.
         return np.round(self.baseline + self.gain * drive / (1 + drive / 8), 4)
@@ -105,12 +106,15 @@ def make_afferents(stimuli: xr.Dataset) -> Afferents:
     scale = np.sqrt(np.mean(wrench[:, :, tracked] ** 2, axis=(0, 1, 2)))
     if not np.any(scale > 0):
         raise DataError("The stimuli exert no force on the whiskers, so there is nothing for neurons to encode.")
+    # An afferent answers to one direction of a channel (half-wave rectification) and saturates as x/(x + 1).
     signal = wrench / np.where(scale > 0, scale, np.inf)
     halves = np.concatenate([np.maximum(signal, 0.0), np.maximum(-signal, 0.0)], axis=3)
     halves = halves / (halves + _COMPRESSION)
+    # Fast adaptation: what exceeds the last 30 ms, so onsets. Slow adaptation: divided by the mean of the last 200 ms.
     fast = np.maximum(halves - _smooth(halves, _FAST, frame), 0.0)
     slow = halves / (0.5 + _smooth(halves, _SLOW, frame))
     afferents = np.concatenate([_ONSET * fast, slow], axis=3)
+    # Divisive normalisation by all tracked whiskers: the encoding compares contacts instead of adding up forces.
     surround = afferents[:, :, tracked].mean(axis=(2, 3), keepdims=True)
     position = np.stack([stimuli["row"].values, stimuli["col"].values], axis=1).astype(np.float64)
     return Afferents(afferents / (0.3 + surround), names, position, frame)
@@ -152,6 +156,7 @@ def window_rates(
     """Return the mean rate [K, U] from ``first`` [K] to each of ``last`` [N] (s after onset), averaged over N."""
     frames = rates.shape[1]
     edges = np.arange(frames + 1) * frame + LATENCY
+    # The running integral is read between frames by interpolation, exact for rates constant within a frame.
     total = np.concatenate([np.zeros_like(rates[:, :1]), np.cumsum(rates, axis=1) * frame], axis=1)
     result = np.empty((rates.shape[0], rates.shape[2]))
     for stimulus, begin in enumerate(first):
@@ -184,5 +189,6 @@ def _smooth(values: NDArray[np.float64], seconds: float, frame: float) -> NDArra
     """First-order low-pass along axis 1, starting from rest."""
     from scipy.signal import lfilter
 
+    # y ← y + (1 − e^(−Δt/τ))(x − y), exact for an input constant within a frame.
     share = 1.0 - np.exp(-frame / seconds)
     return np.asarray(lfilter([share], [1.0, share - 1.0], values, axis=1))

@@ -1,2 +1,2 @@
-"""What can be concluded: ``permutation`` tests, the ``bootstrap`` and its ``intervals``, ``multiple`` models or layers,
+"""Inference: ``permutation`` tests, the ``bootstrap`` and its ``intervals``, ``multiple`` models or layers,
 ``equivalence`` with the animals, and the ``power`` of a planned experiment."""

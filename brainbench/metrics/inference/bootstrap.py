@@ -95,6 +95,7 @@ class Bootstrap:
         size = len(self.draws) // _BATCHES
         if size < _BATCHES:
             return math.nan
+        # Batch means: batches are independent, so the spread of their ends over √batches is the error of the whole.
         parts = [
             Bootstrap(self.estimate, part, self.values, self.jackknife, self.levels).interval(method, level)
             for part in np.split(self.draws[: size * _BATCHES], _BATCHES)
@@ -150,6 +151,7 @@ def bootstrap_animals(
     number = len(scored)
     r = compare_all(rdms, animals.rdms(animals.scored), method=comparison)[:, None]
     factors = animals.factors(animals.scored)[None]
+    # Counts of animals stand for the data (ones), for the jackknife (one zero each) and for draws alike.
     estimate = float(drawn_scores(r, factors, np.ones((1, number)))[0])
     jackknife = drawn_scores(r, factors, 1.0 - np.eye(number)) if number > 1 else np.empty(0)
     values = _animal_values(r, factors)
@@ -173,6 +175,7 @@ def bootstrap_animals(
 
 def animal_counts(generator: np.random.Generator, animals: int, draws: int) -> Floats:
     """Return how often each animal [D, A] was drawn with replacement."""
+    # Only how often an animal was drawn matters, and that is multinomial.
     return generator.multinomial(animals, np.full(animals, 1 / animals), size=draws).astype(np.float64)
 
 
@@ -227,6 +230,7 @@ def ceilings(rdms: Floats, counts: Floats, method: str) -> Floats:
             own = np.diag(gram)
             pooled = counts @ gram
             size = np.einsum("da,da->d", pooled, counts)[:, None]
+            # ‖Σ n p − n_a p_a‖² and the product of p_a with it, from the inner products of the animals.
             others = size - 2 * counts * pooled + counts**2 * own
             length = np.sqrt(own * np.where(others > _NOTHING * size, others, np.nan))
             lower, upper = (pooled - counts * own) / length, pooled / np.sqrt(own * size)
@@ -254,6 +258,7 @@ _LINEAR = {"pearson": _centred_gram, "cosine": _gram}
 
 def noise_factors(split_half_r: Floats) -> Floats:
     """Return noise corrections [D]; NaN without positive reliability."""
+    # Spearman's (1904) correction of one side for attenuation: 1/√reliability.
     reliability = spearman_brown(split_half_r)
     return 1 / np.sqrt(np.where(reliability > 0, reliability, np.nan))
 
@@ -272,6 +277,7 @@ def drawn_scores(r: Floats, factors: Floats, counts: Floats) -> Floats:
             # One animal has no others to choose on; its layer is the one of all its trials.
             best = int(np.argmax(filled[:, 0, 0]))
             return np.where(total > 0, filled[best, :, 0] * scale[:, 0], np.nan)
+        # Mean over the other animals drawn, all copies of one left out: (Σ n r − n_a r_a)/(Σ n − n_a).
         weighted = filled * counts
         left = total[:, None] - counts
         others = (weighted.sum(axis=-1, keepdims=True) - weighted) / left

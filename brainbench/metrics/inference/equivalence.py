@@ -80,12 +80,15 @@ def equivalence_test(
     model, animals = np.asarray(values, dtype=np.float64).ravel(), np.asarray(consistency, dtype=np.float64).ravel()
     if len(model) != len(animals):
         raise UsageError(f"Values are paired by animal; received {len(model)} and {len(animals)}.")
+    # Differences are paired by animal, so an animal without either value is left out.
     both = np.isfinite(model) & np.isfinite(animals)
     difference = (model - animals)[both]
     count = len(difference)
     if count < 2:
         reason = f"{count} animals have both a model's value and a consistency; at least 2 are needed"
         return EquivalenceTest(math.nan, margin, None, math.nan, math.nan, math.nan, "undecided", "undefined", reason)
+    # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error with A − 1 degrees of freedom. Both reject at
+    # level α exactly when the interval at level 1 − 2α lies within ±margin.
     mean, interval = float(difference.mean()), t_interval(difference, 1 - 2 * alpha)
     error = float(difference.std(ddof=1)) / math.sqrt(count)
     lower, upper = (_tail(distance, error, count) for distance in (mean + margin, margin - mean))
@@ -121,6 +124,7 @@ def _tail(distance: float, error: float, count: int) -> float:
     """Return P(t ≥ distance/error) with count − 1 degrees of freedom."""
     from scipy.special import stdtr
 
+    # Without spread the t statistic is infinite; the sign of the distance alone decides.
     if error == 0:
         return 0.0 if distance > 0 else 1.0
     return float(stdtr(count - 1, -distance / error))

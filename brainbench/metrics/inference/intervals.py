@@ -45,6 +45,7 @@ def percentile_interval(
     finite = _finite(draws)
     if not finite.size:
         return None
+    # Draws without a value are left out: they say nothing about where the score lies.
     low, high = np.quantile(finite, [(1 - level) / 2, (1 + level) / 2])
     return Interval(float(low), float(high), level, what)
 
@@ -76,10 +77,13 @@ def bca_interval(
     below = float((finite < estimate).mean() + 0.5 * (finite == estimate).mean())
     if not 0 < below < 1:
         return None
+    # Bias correction z₀ = Φ⁻¹(share of draws below the estimate).
     shift = float(ndtri(below))
+    # Acceleration a = Σd³ / (6 (Σd²)^1.5) of jackknife differences d; zero where they are symmetric.
     spread = left_out.mean() - left_out
     square = float((spread**2).sum())
     acceleration = float((spread**3).sum()) / (6 * square**1.5) if square > 0 else 0.0
+    # Quantiles at Φ(z₀ + w/(1 − a w)) with w = z₀ + z; at the pole of that map there is no interval.
     edges = shift + ndtri(np.array([(1 - level) / 2, (1 + level) / 2]))
     slope = 1 - acceleration * edges
     if (slope <= 0).any():

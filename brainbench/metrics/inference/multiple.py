@@ -64,7 +64,7 @@ class PairTest:
     p_corrected: float
     """Corrected for the number of pairs."""
     reason: str = ""
-    """Why there is no p."""
+    """Reason for a missing p; empty otherwise."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,7 @@ def compare_models(
         name: score_with_test(layers, subjects, name, stimuli, "default", compare, seed, device)
         for name, layers in models.items()
     }
+    # All models met the same permutations, so the maximum over models keeps the correlations between them.
     tested = {name: test.null for name, (_, test) in found.items() if test is not None and math.isfinite(test.p)}
     corrected = dict(zip(tested, step_down(np.stack(list(tested.values()))), strict=True)) if tested else {}
     scores = {name: score for name, (score, _) in found.items()}
@@ -164,6 +165,7 @@ def layer_tests(
     if not len(usable) or not animals.scored or rdms.shape[1] < SMALLEST_STIMULI * (SMALLEST_STIMULI - 1) // 2:
         return tuple(nothing)
     factors = animals.factors(animals.scored)
+    # Every permutation is corrected by the same factors as the data, so p belongs to the values that are reported.
     values = permuted_values(
         rdms[usable],
         animals.rdms(animals.scored),
@@ -190,6 +192,7 @@ def step_down(null: Floats) -> Floats:
     for index in order[::-1]:
         largest = np.maximum(largest, null[index])
         result[index] = tail_p(largest, null[index, 0])
+    # A larger statistic may not have the larger p (step-down of Westfall & Young 1993).
     result[order] = np.maximum.accumulate(result[order])
     return result
 
@@ -208,6 +211,7 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
     check_correction(correction)
     result = np.array(p, dtype=np.float64)
     known = np.isfinite(result)
+    # Benjamini and Hochberg's step-up procedure, which controls the share of false discoveries.
     if correction == "fdr" and known.any():
         from scipy.stats import false_discovery_control
 
@@ -237,6 +241,7 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
         return math.nan
     # Sums do not depend on the order of animals up to rounding, which the tie absorbs.
     d = np.sort(d)
+    # Under symmetry about zero all 2^A signs are equally likely; the bits of 0 … 2^A − 1 list them, all plus first.
     if len(d) <= EXACT_ANIMALS:
         signs = 1.0 - 2.0 * ((np.arange(2 ** len(d))[:, None] >> np.arange(len(d))) & 1)
     else:

@@ -51,7 +51,7 @@ class PermutationTest:
     null: Floats
     """[count] statistics, first the observed one."""
     reason: str = ""
-    """Why p is undefined."""
+    """Reason for an undefined p; empty otherwise."""
 
     @property
     def status(self) -> Status:
@@ -83,6 +83,7 @@ def tail_p(null: Floats, observed: ArrayLike | None = None) -> Floats:
 
     The given order of labels counts among the random ones, which is (b+1)/(n+1).
     """
+    # Ties within a relative tolerance count as reached, so that rounding cannot make p smaller.
     reached = null[0] if observed is None else np.asarray(observed)
     return (null >= reached - TIE * np.maximum(1.0, np.abs(reached))).mean(axis=0)
 
@@ -182,6 +183,7 @@ def permuted_values(
     Orders depend on the brain's RDMs and the seed alone, so entry n of two models is the same permutation.
     """
     layers, brain = _canonical(layers, brain)
+    # Chunks bound the permuted RDMs [N, L, P]; of each only the statistics are kept.
     step = max(1, _CHUNK_ELEMENTS // layers.size)
     chunks = label_orders(stimulus_count(layers.shape[-1]), seed, step=step)
     found = permuted_comparisons(layers, brain, chunks, method, device=find_device(device))
@@ -193,6 +195,7 @@ def layer_p(null: Floats) -> tuple[Floats, Floats]:
 
     The first row is the observed one; the correction is the maximum statistic (Nichols & Holmes 2002).
     """
+    # The maximum over layers in each permutation keeps the family-wise error, however layers depend on one another.
     return tail_p(null), tail_p(null.max(axis=1, keepdims=True), null[0])
 
 
@@ -223,6 +226,7 @@ def label_orders(
         return
     # Counting the given order once among the random ones is what (b+1)/(n+1) means.
     yield np.arange(stimuli)[None]
+    # One seeded stream, drawn row by row: chunks of any size give the same orders.
     generator = np.random.default_rng(seed)
     left = RANDOM_PERMUTATIONS if draws is None else draws
     while left:

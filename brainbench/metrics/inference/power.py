@@ -95,7 +95,7 @@ class Power:
     mean_score: float = math.nan
     """Mean raw comparison in the simulated experiments, after the choice of layer."""
     reason: str = ""
-    """Why no simulation was needed."""
+    """Reason for doing without simulations; empty otherwise."""
 
 
 def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
@@ -116,6 +116,7 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
         reason = f"{design.stimuli} stimuli allow no p below {smallest:.3g}, whatever is true"
         return Power(design, 0.0, None, 0, smallest, reason=reason)
     generator = np.random.default_rng(seed)
+    # All experiments share their orders of the stimuli, so pairs are looked up once.
     orders = label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=_ORDERS)
     pairs = permuted_pairs(np.concatenate(list(orders)))
     found, total = 0, 0.0
@@ -155,6 +156,7 @@ def needed(
 
 def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator[int]:
     pairs = design.stimuli * (design.stimuli - 1) // 2
+    # Bounds the comparisons that are held at once, over experiments, orders, layers and animals.
     step = max(
         1, _CHUNK_ELEMENTS // (orders * max(pairs, design.layers * (design.animals if design.layers > 1 else 1)))
     )
@@ -173,6 +175,7 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
         return -upper(patterns @ patterns.swapaxes(-1, -2)) * math.sqrt(_DIMENSIONS - 1)
 
     c, q = design.consistency, design.reliability
+    # The three equations of the module's text; weights x and √(1 − x²) keep every RDM at unit variance.
     weight = design.effect / math.sqrt(c) if c else 0.0
     shared = rdms(size, 1)
     model = rdms(size, design.layers)
@@ -183,7 +186,9 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
 
 def _statistics(model: Floats, brain: Floats, pairs: np.ndarray) -> Floats:
     """Return the mean comparison [S, N] under every order, the layer chosen on the other animals each time."""
+    # Unit vectors once per RDM; a comparison under an order is then a product of moved entries.
     left, right = features(model, "pearson"), features(brain, "pearson")
+    # r is linear in the animals' unit vectors: with one layer they are averaged before the orders are taken.
     if model.shape[1] == 1:
         return np.einsum("snp,sp->sn", left[:, 0][:, pairs], right.mean(axis=1))
     r = np.einsum("slnp,sap->snla", left[:, :, pairs], right, optimize=True)

@@ -29,7 +29,7 @@ class AnimalPatterns:
     units: int = 0
     trials: int = 0
     problem: str | None = None
-    """Why the animal cannot be used."""
+    """Reason for not using the animal; None otherwise."""
     notes: tuple[str, ...] = ()
     nuisances: Mapping[str, Floats] = field(default_factory=dict, repr=False)
     """Name → RDM [P] of what else was measured in the trials; see :mod:`brainbench.metrics.measures.nuisance`."""
@@ -39,6 +39,7 @@ class AnimalPatterns:
         """Share of the variance between stimuli that is not trial noise, over all units; can be negative."""
         if self.problem is not None:
             return math.nan
+        # Means differ by the stimuli and by their own noise, which is taken away.
         between = float(self.patterns.var(axis=0, ddof=1).sum())
         return 1 - float(self.noise.mean(axis=0).sum()) / between if between > 0 else math.nan
 
@@ -62,8 +63,10 @@ def animal_patterns(
     for session in sessions:
         mean = stimulus_means(session.responses, session.labels, n_stimuli)
         square = stimulus_means((session.responses - mean[session.labels]) ** 2, session.labels, n_stimuli)
+        # Trials counted by unit, since a unit may be missing in some of them.
         number = membership(session.labels, n_stimuli) @ np.isfinite(session.responses)
         means.append(mean)
+        # Mean square deviation × n/(n − 1) is the variance over trials; over n, that of their mean.
         noise.append(square / (number - 1))
     joined = np.concatenate(means, axis=1)
     return AnimalPatterns(subject, joined, np.concatenate(noise, axis=1), joined.shape[1], trials, None, notes)
@@ -84,6 +87,7 @@ def gather_patterns(animals: Sequence[AnimalPatterns], corrected: bool) -> Patte
     if not animals:
         raise UsageError("There are no animals to score against; give at least one.")
     ordered = tuple(sorted(animals, key=lambda animal: animal.subject))
+    # A correction divides by explainable variance, so it needs some; raw values are reported whatever the noise.
     least = 0.0 if corrected else -math.inf
     usable = [i for i, animal in enumerate(ordered) if animal.problem is None and animal.reliability > least]
     good = [i for i in usable if ordered[i].reliability >= RELIABILITY_GATE]

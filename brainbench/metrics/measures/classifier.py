@@ -77,6 +77,7 @@ def decode(
     assignments = class_assignments(codes, seed)
     decoder = Decoder(matrix, rows, penalty=penalty)
     accuracy = np.array([decoder(assignment) for assignment in assignments])
+    # The given assignment is one of those counted, so p is never zero; 1e-12 lets equal accuracies tie.
     means = accuracy.mean(axis=1)
     return Decoding(
         accuracy=float(means[0]),
@@ -124,9 +125,12 @@ def _fold(matrix: Floats, rows: Ints, stimulus: int) -> _Fold:
     inside = rows != stimulus
     train, test = matrix[inside], matrix[~inside]
     mean = train.mean(axis=0)
+    # The left-out stimulus takes no part in mean and scale, or the test would leak into the training.
     train, test = train - mean, test - mean
+    # One scale for all features makes the penalty independent of units and keeps the features' proportions.
     scale = math.sqrt(float((train**2).mean())) or 1.0
     if train.shape[1] > len(train):
+        # Coordinates in the span of the training rows: a penalised fit gives no weight to what is orthogonal to them.
         basis = np.linalg.svd(train, full_matrices=False)[2]
         train, test = train @ basis.T, test @ basis.T
     return _Fold(stimulus, train / scale, test / scale)
@@ -150,6 +154,7 @@ def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) ->
         both = flat.reshape(width + 1, classes)
         weight, bias = both[:-1], both[-1]
         log_p = log_softmax(features @ weight + bias, axis=1)
+        # Gradient Xᵀ(softmax − wanted) + w/C; the logarithm of the softmax stays finite for large scores.
         rest = np.exp(log_p) - wanted
         value = float(-log_p[wanted].sum() + (weight**2).sum() / (2 * penalty))
         gradient = np.concatenate([features.T @ rest + weight / penalty, rest.sum(axis=0, keepdims=True)])
@@ -168,6 +173,7 @@ def _partition(codes: Ints) -> tuple[int, ...]:
 def class_assignments(codes: Ints, seed: int) -> list[Ints]:
     """Return ways to give the classes to the stimuli, the given one first: all up to 200, else 200 random ones."""
     counts = np.bincount(codes)
+    # Multinomial coefficient: how many assignments differ.
     number = math.factorial(len(codes)) // math.prod(math.factorial(int(count)) for count in counts)
     if number <= ORDERS:
         found = {tuple(codes.tolist())}

@@ -69,7 +69,9 @@ class LabelDecoding(PatternMetric):
             reason = "activations of every layer are not finite" if properties else _no_property(stimuli)
             return Score(value=math.nan, status="undefined", reasons=(reason,), **about)
         orders = _orders(len(stimuli), seed)
+        # [N, L, properties]: every layer meets the same assignments of classes.
         values = np.stack([_accuracies(layers[layer], properties, orders) for layer in usable], axis=1)
+        # The maximum over layers is taken in every order too, so p accounts for it.
         means = values.mean(axis=-1)
         best = int(np.argmax(means[0]))
         optimistic = "largest over layers (optimistic; the permutation takes the same maximum)"
@@ -123,12 +125,14 @@ def _orders(stimuli: int, seed: int) -> Ints:
 
 def _accuracies(patterns: Floats, properties: Mapping[str, Ints], orders: Ints) -> Floats:
     """Return accuracies [N, properties] with the classes given to the stimuli in each order [N, K]."""
+    # Classes are permuted over stimuli; the folds of patterns stay and are prepared once.
     decoder = Decoder(patterns, np.arange(len(patterns)))
     return np.array([[float(np.mean(decoder(codes[order]))) for codes in properties.values()] for order in orders])
 
 
 def _smallest_p(properties: Mapping[str, Ints], orders: Ints) -> float:
     """Return the share of orders that leave together what is together, which no test can tell apart."""
+    # Orders that give the same partition of the stimuli into classes give the same accuracy.
     same = [(codes[orders][:, :, None] == codes[orders][:, None]) for codes in properties.values()]
     return float(np.mean([all((part[index] == part[0]).all() for part in same) for index in range(len(orders))]))
 

@@ -1,4 +1,4 @@
-"""What else could explain the animals' geometry: nuisance RDMs, partial correlation, shared variance, partial RSA.
+"""Rival explanations of the animals' geometry: nuisance RDMs, partial correlation, shared variance, partial RSA.
 
 Stimuli also differ in how often they were touched, licked for or chosen. An animal's mean of each over a stimulus
 makes an RDM, which is a rival model. :func:`variance_partition` says how much of each animal's RDM the model explains
@@ -46,7 +46,7 @@ class VariancePartition:
     """Mean unique share of the model under permutation: what fitting few pairs gives for nothing."""
     nuisances: tuple[str, ...]
     reason: str = ""
-    """Why p is undefined."""
+    """Reason for an undefined p; empty otherwise."""
 
 
 def nuisance_rdm(values: ArrayLike, labels: ArrayLike) -> Floats:
@@ -100,16 +100,19 @@ def variance_partition(
     if pairs < len(rivals) + 3:
         raise DataError(f"{pairs} pairs are too few to fit {len(rivals)} nuisances and a model; use fewer nuisances.")
     stimuli = stimulus_count(pairs)
+    # In an order of the stimuli that the data fix, random permutations do not depend on how stimuli were listed.
     order = permuted_pairs(canonical_order(brain)[None])[0]
     model, brain, rivals = model[order], brain[:, order], rivals[:, order]
     rest = _without(rivals)
     residual = brain @ rest
     scale = ((brain - brain.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
+        # R² of each model from sums of squares: residual after the nuisances, and the projection on the model alone.
         by_nuisance = 1 - (residual**2).sum(axis=1) / scale
         partial, unique = _partial(model[None], rest, residual, scale)
         centred = model - model.mean()
         by_model = (brain @ centred) ** 2 / (centred @ centred) / scale
+    # R² of both = R² of the nuisances + unique share of the model; the other shares are differences.
     total = by_nuisance + unique[0]
     reason, p, chance = "", math.nan, math.nan
     if stimuli < SMALLEST_STIMULI:
@@ -142,6 +145,7 @@ def partial_correlations(models: Floats, nuisances: Floats, brain: Floats) -> Fl
 
     NaN where nothing is left of either, or where the pairs are too few for so many nuisances.
     """
+    # Intercept, nuisances and model must leave one degree of freedom.
     if len(brain) < len(nuisances) + 3:
         return np.full(len(models), np.nan)
     rest = _without(nuisances)
@@ -157,6 +161,7 @@ def _without(rivals: Floats) -> Floats:
     pairs = rivals.shape[1]
     basis = np.concatenate([np.ones((1, pairs)), rivals - rivals.mean(axis=1, keepdims=True)])
     basis /= np.maximum(np.linalg.norm(basis, axis=1, keepdims=True), np.finfo(float).tiny)
+    # 1 − UUᵀ with an orthonormal basis U of intercept and nuisances; the SVD drops collinear ones.
     left, values, _ = np.linalg.svd(basis.T, full_matrices=False)
     left = left[:, values > values[0] * 1e-10]
     return np.eye(pairs) - left @ left.T
@@ -164,6 +169,7 @@ def _without(rivals: Floats) -> Floats:
 
 def _partial(models: Floats, rest: Floats, residual: Floats, scale: Floats) -> tuple[Floats, Floats]:
     """Return partial correlations and unique shares [N, A] of models [N, P] with animals' residuals [A, P]."""
+    # With residuals a, b: r = a·b/(|a||b|), and R² grows by (a·b)²/(|a|² Σ(y − ȳ)²) when the model is added.
     left = models @ rest
     size = (left**2).sum(axis=1)[:, None]
     size = np.where(size > 1e-20 * (models**2).sum(axis=1)[:, None], size, np.nan)

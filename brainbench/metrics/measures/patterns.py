@@ -124,7 +124,9 @@ class PatternMetric:
             return undefined(about, "no animal can be used", found)
         orders = pattern_orders(len(stimuli), seed)
         scored = [found.animals[i] for i in found.scored]
+        # [N, L, A] under every order, so that the choice of layer and the mean are repeated in each.
         values = np.stack([self.compare_orders(layers[layer], scored, orders) for layer in usable], axis=1)
+        # An animal without a value for some layer in the given order takes no part, in any order.
         known = np.isfinite(values[0]).all(axis=0)
         if not known.any():
             return undefined(about, "the metric has no value for any animal", found)
@@ -136,6 +138,7 @@ class PatternMetric:
         status: Status = "ok" if found.reliable else "unreliable"
         return make_score(
             about,
+            # The score under every order, with the layer chosen anew in each; the first is the observed one.
             held.mean(axis=-1),
             seed,
             {"layer_tests": layer_table(usable, values.mean(axis=-1))} | self.statistics(layers[layer], scored, seed),
@@ -178,7 +181,9 @@ class PatternMetric:
         orders = pattern_orders(len(stimuli), seed)
         columns = []
         for animal in scored:
+            # The others' units side by side, as if they were one animal.
             others = np.concatenate([other.patterns for other in scored if other is not animal], axis=1)
+            # Every order moves the stimuli of the others together, as those of one model.
             columns.append(self.compare_orders(others, [animal], orders))
         values = np.concatenate(columns, axis=1)
         by_subject: dict[str, tuple[float, str | None]] = {
@@ -241,6 +246,7 @@ def make_score(
     **fields: Any,
 ) -> Score:
     """Return the score whose value is the first of the statistics [N] under every order of the stimuli."""
+    # The given order is the first of the orders, so the value is the first of the statistics.
     test = make_test(null, exact=len(about["stimuli"]) <= _EXACT_STIMULI, smallest=smallest)
     usable = [layer for layer in layers if layer.status != "undefined"]
     best = max(usable, key=lambda layer: layer.value, default=None)
@@ -286,4 +292,5 @@ def _chosen_layers(values: Floats) -> tuple[Ints, Floats, str]:
         rule = "maximum over layers on the only animal (optimistic; the permutation takes the same maximum)"
         return np.argmax(values[0], axis=0), values.max(axis=1), rule
     rule = "chosen on the other animals, evaluated on the animal held out"
+    # held_out chooses anew in every order; the layers that are reported are those of the given one.
     return choose_on_others(values[0]), held_out(values), rule

@@ -35,6 +35,7 @@ class Procrustes(PatternMetric):
 
     def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
         """Return values [N, A] with the model's stimuli in each order [N, K]."""
+        # Moving the model's stimuli is moving the animals' products [K, K] by the inverse order.
         place = np.argsort(orders, axis=1)
         left = _unit(model)
         columns = [_similarities(left, _unit(a.patterns)[place[:, :, None], place[:, None, :]]) for a in animals]
@@ -72,6 +73,8 @@ def _similarities(left: Floats, right: Floats) -> Floats:
     """Return tr √(√L R √L) [N], the sum of singular values, from products [K, K] and [N, K, K]."""
     if not np.isfinite(left).all() or not np.isfinite(right).all():
         return np.full(len(right), np.nan)
+    # With L = XXᵀ and R = YYᵀ the matrices are K × K, however many features and units there are; eigenvalues below zero
+    # are rounding.
     values, vectors = np.linalg.eigh(left)
     root = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
     inner = np.linalg.eigvalsh(root @ right @ root)

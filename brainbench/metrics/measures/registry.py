@@ -1,4 +1,4 @@
-"""What a metric is, and the registry of metrics.
+"""Protocol and registry of metrics.
 
 A metric prepares each animal once (:meth:`Metric.animal`) and then scores any number of models against
 them. A new one needs a single file: subclass :class:`brainbench.metrics.measures.patterns.PatternMetric`, write

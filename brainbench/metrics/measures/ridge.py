@@ -56,12 +56,15 @@ class RidgeEncoding(PatternMetric):
         base = np.zeros(len(moved))
         for fold in np.unique(folds):
             test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
+            # Nested cross-validation: each training stimulus is left out in turn, and the penalty with the least
+            # squared error over them serves the outer fold, chosen anew for every order.
             inner = np.stack([_squares(kernel, np.delete(train, t), train[t : t + 1]) for t in range(len(train))])
             chosen = np.argmin(moved @ inner.sum(axis=0).reshape(len(PENALTIES), -1).T, axis=1)
             outer = _squares(kernel, train, test).reshape(len(PENALTIES), -1)
             error += (moved @ outer.T)[np.arange(len(moved)), chosen]
             base += moved @ _residual_squares(_means(count, train, test)).ravel()
         total_noise = np.repeat(noise.sum(axis=1), len(orders))
+        # The equation of the module's text; there is no value where noise explains all.
         with np.errstate(invalid="ignore", divide="ignore"):
             explainable = base - total_noise
             value = 1 - (error - total_noise) / np.where(explainable > 0, explainable, np.nan)
@@ -79,9 +82,11 @@ def _means(count: int, train: Ints, test: Ints) -> Floats:
 def _squares(kernel: Floats, train: Ints, test: Ints) -> Floats:
     """Return, per penalty, the matrix [Λ, K, K] whose product with Y Yᵀ is the squared error on ``test``."""
     count, size = len(kernel), len(train)
+    # Centring by the training mean is the intercept, which is not penalised.
     centre = np.eye(size) - 1 / size
     inside = centre @ kernel[np.ix_(train, train)] @ centre
     across = (kernel[np.ix_(test, train)] - kernel[np.ix_(train, train)].mean(axis=0)) @ centre
+    # ŷ = k (K + λ·1)⁻¹ y: one eigendecomposition of the kernel serves all penalties.
     values, vectors = np.linalg.eigh(inside)
     scale = max(float(np.trace(inside)) / size, np.finfo(float).tiny)
     found = np.empty((len(PENALTIES), count, count))

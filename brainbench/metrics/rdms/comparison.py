@@ -164,6 +164,7 @@ def _rho_a(rdms: Floats) -> Floats:
     count = rdms.shape[-1]
     if count < 2:
         return np.full(rdms.shape, np.nan)
+    # Squared centred ranks without ties add up to (P³ − P)/12; with it ties count as their mean over random breaking.
     return _centred(_ranks(rdms)) * np.sqrt(12.0 / (count**3 - count))
 
 
@@ -174,15 +175,18 @@ def _signs(rdms: Floats) -> Floats:
 
 def _tau_a(rdms: Floats) -> Floats:
     count = rdms.shape[-1]
+    # Kendall's τ-a: mean product of the signs of all differences between pairs; tied ones are zero.
     return _signs(rdms) / np.sqrt(count * (count - 1) / 2) if count > 1 else np.full((*rdms.shape[:-1], 1), np.nan)
 
 
 def _tau_b(rdms: Floats) -> Floats:
+    # τ-b divides by the root of each side's untied differences, which is the length of its vector of signs.
     return _unit(_signs(rdms)) if rdms.shape[-1] > 1 else np.full((*rdms.shape[:-1], 1), np.nan)
 
 
 def _second_moment(rdms: Floats) -> Floats:
     """Return the doubly centred −½D, flattened: its inner product is dᵀV⁻¹d up to a constant."""
+    # G = −½ H D H with the centring matrix H; so the covariance V [P, P] of distances is never formed.
     matrix = -0.5 * square(rdms)
     matrix -= matrix.mean(axis=-1, keepdims=True)
     matrix -= matrix.mean(axis=-2, keepdims=True)
@@ -250,6 +254,8 @@ def _whitened_present(a: Floats, b: Floats, keep: np.ndarray, *, centre: bool) -
     from scipy.linalg import cho_factor, cho_solve
 
     rows, cols = np.triu_indices(stimulus_count(len(keep)), k=1)
+    # A row has +1 and −1 at its pair's stimuli; V = C Cᵀ squared entry by entry, since noise of two distances is
+    # correlated where they share a stimulus.
     contrast = np.zeros((int(keep.sum()), stimulus_count(len(keep))))
     contrast[np.arange(len(contrast)), rows[keep]] = 1.0
     contrast[np.arange(len(contrast)), cols[keep]] = -1.0
@@ -275,6 +281,7 @@ def _sorted_tau_b(x: Floats, y: Floats) -> float:
 
 
 def _sorted_tau_a(x: Floats, y: Floats) -> float:
+    # scipy's τ-b in P log P, times what it divides by: the root of each side's share of untied differences.
     pairs = len(x) * (len(x) - 1) // 2
     untied = [pairs - sum(n * (n - 1) // 2 for n in np.unique(v, return_counts=True)[1].tolist()) for v in (x, y)]
     return _sorted_tau_b(x, y) * float(np.sqrt(untied[0] / pairs) * np.sqrt(untied[1] / pairs)) if all(untied) else 0.0

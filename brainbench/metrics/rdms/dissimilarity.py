@@ -210,6 +210,7 @@ def _window_mean(window: np.ndarray) -> np.ndarray:
         return window.mean(axis=1, dtype=np.float64)
     missing = np.isnan(window)
     number = (~missing).sum(axis=1)
+    # Mean over the bins that were recorded; without any it stays missing, never zero.
     total = np.where(missing, 0.0, window).sum(axis=1)
     return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
 
@@ -251,6 +252,7 @@ def _mahalanobis(given: _Responses) -> Array:
     patterns = given.placed()
     # The shift per unit must go before the product mixes units.
     centred = without_shift(patterns)
+    # (x_i − x_j) C⁻¹ (x_i − x_j) from inner products of vectors whitened by a factor of C⁻¹ (Walther 2016).
     left, right = given.sides(centred, centred)
     return products_from_gram(left @ right.T, patterns.shape[1])
 
@@ -272,6 +274,8 @@ def _crossnobis(given: _Responses) -> Array:
     xp = library(flat)
     if not xp.isfinite(flat).all():
         return _crossnobis_of_present(given, flat.reshape(number, count, units))
+    # Mean over folds m ≠ n of (x_i − x_j)_m C⁻¹ (x_i − x_j)_n (Walther 2016): noise of different folds is independent,
+    # so its product is zero on average. A shift of all cells cancels, but would cost digits.
     flat = flat - flat.mean(0)
     # Products of all folds with all, less those of each with itself, are those of all pairs of folds.
     if number == 2:
@@ -308,12 +312,14 @@ def _poisson(given: _Responses) -> Array:
     low = float(known.min()) if len(known) else 0.0
     if low < 0:
         raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
+    # Σ (λ_i − λ_j)(log λ_i − log λ_j) / U, the divergence in both directions (Schütt 2023).
     rates = poisson_rates(patterns)
     return product_distances(rates, library(rates).log(rates), missing=given.missing)
 
 
 def poisson_rates(rates: Array) -> Array:
     """Return rates under the gamma prior, which are never zero."""
+    # Posterior mean after one observation under a gamma prior with this mean and weight.
     return (rates + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
 
 

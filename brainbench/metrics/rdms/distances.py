@@ -35,6 +35,7 @@ def correlation_distances(patterns: Array, *, missing: bool = False, device: Any
         rest: Any = 0.0
         for _, part in slices(patterns, _SLICE_ELEMENTS, device):
             total = total + part.sum(-1)
+        # Two passes, mean first: Σx² − (Σx)²/U in one pass loses the digits of a large offset.
         mean = total / units
         for _, part in slices(patterns, _SLICE_ELEMENTS, device):
             centred = part - mean[..., None]
@@ -108,6 +109,7 @@ def _products_of_present(left: Array, right: Array) -> Array:
     a = xp.where(present, left - _unit_mean(left, present, weight), 0.0)
     b = xp.where(present, right - _unit_mean(right, present, weight), 0.0)
     turned = weight.swapaxes(-1, -2)
+    # Σ (a_i − a_j)(b_i − b_j) over the units of both = own_ij + own_ji − cross_ij − cross_ji, over their number.
     both, own, cross = weight @ turned, (a * b) @ turned, a @ b.swapaxes(-1, -2)
     total = own + own.swapaxes(-1, -2) - cross - cross.swapaxes(-1, -2)
     return upper(xp.where(both > 0, total / xp.where(both > 0, both, 1.0), np.nan))
@@ -132,6 +134,7 @@ def _correlation_of_present(patterns: Array) -> Array:
     mean = (filled.sum(-1) / weight.sum(-1).clip(1.0))[..., None]
     x = xp.where(present, patterns - mean, 0.0)
     turned = weight.swapaxes(-1, -2)
+    # Over the units that a pair shares: n, Σx, Σx² − (Σx)²/n and Σxy − Σx Σy/n, all pairs by matrix products.
     both = weight @ turned
     sums = x @ turned
     scatter = (x * x) @ turned - sums**2 / both

@@ -59,9 +59,11 @@ class NoiseModel:
         if not self.weight:
             return left, right / self.ridge
         if not self.dual:
+            # a C⁻¹ b = (L⁻¹a)·(L⁻¹b) with C = L Lᵀ: triangular systems, no inverse is formed.
             factor = self._factor()
             first = solve_lower(factor, left.T).T
             return first, first if same else solve_lower(factor, right.T).T
+        # Woodbury's identity of the module's text: a factor [R, R] in place of one [U, U].
         xp, factor = library(left), self._dual_factor()
         first = solve_lower(factor, self.trials @ left.T).T
         second = first if same else solve_lower(factor, self.trials @ right.T).T
@@ -78,6 +80,7 @@ class NoiseModel:
         if not self.weight:
             inner = eye / self.ridge
         elif self.dual:
+            # C⁻¹ = (1 − HᵀH)/α with H = L⁻¹Z, by the same identity.
             half = solve_lower(self._dual_factor(), self.trials)
             inner = (eye - half.T @ half) / self.ridge
         else:
@@ -149,6 +152,7 @@ def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device:
     complete = ~np.isnan(trials).any(axis=1)
     if not complete.all():
         trials, codes = trials[complete], codes[complete]
+    # Every stimulus' mean takes one degree of freedom.
     freedom = len(trials) - len(np.unique(codes))
     if freedom < 1:
         raise DataError(
@@ -184,6 +188,7 @@ def _shrinkage_diag(residuals: Array, freedom: int) -> NoiseModel:
     scaled = residuals / deviation
     squares = scaled * scaled
     own, fourth = squares.sum(0), float((squares * squares).sum())
+    # λ = Σ Var(r_ij) / Σ r_ij² over pairs of units i ≠ j, limited to 0 … 1; both sums come from products of trials.
     signal = max(_pair_sum(scaled) - float((own * own).sum()), 0.0) / (count - 1) ** 2
     together = float((squares.sum(1) ** 2).sum()) - fourth
     spread = count / freedom**2 * (together / (count - 1) - signal)
@@ -195,6 +200,7 @@ def _shrinkage_eye(residuals: Array, freedom: int) -> NoiseModel:
     """Shrink to a multiple of the identity (Ledoit & Wolf 2004)."""
     count, units = residuals.shape
     squares = residuals * residuals
+    # m = tr S/U, d² = ‖S − m·1‖², b² = mean ‖z zᵀ − S‖²/R; the amount is min(b², d²)/d² (Ledoit & Wolf 2004).
     target = float(squares.sum()) / count / units
     square = _pair_sum(residuals) / count**2
     distance = max(square - units * target**2, 0.0)
@@ -218,6 +224,7 @@ def _pair_sum(residuals: Array) -> float:
 def _inverse(factor: Array) -> Array:
     if is_tensor(factor):
         return library(factor).cholesky_inverse(factor)
+    # potri inverts from the factor and fills the lower triangle alone.
     from scipy.linalg import get_lapack_funcs
 
     (invert,) = get_lapack_funcs(("potri",), (factor,))

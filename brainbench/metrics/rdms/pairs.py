@@ -26,6 +26,7 @@ def stimulus_count(pairs: int) -> int:
     Raises:
         UsageError: ``pairs`` is not such a number.
     """
+    # Positive root of K² − K − 2P = 0, in integers, so that rounding accepts no wrong P.
     count = (1 + math.isqrt(1 + 8 * pairs)) // 2
     if pairs < 1 or count * (count - 1) // 2 != pairs:
         raise UsageError(
@@ -63,8 +64,10 @@ def permuted_pairs(orders: Any) -> Any:
     xp, count = library(orders), orders.shape[-1]
     rows, cols = _pair_indices(count, orders)
     where = {"device": orders.device} if is_tensor(orders) else {}
+    # table[i, j] is the place of the pair {i, j}: permuting an RDM is one look-up, without square matrices.
     table = xp.zeros((count, count), dtype=xp.int64, **where)
     table[rows, cols] = table[cols, rows] = xp.arange(len(rows), **where)
+    # Pair (i, j) of the permuted RDM is the pair (order[i], order[j]) of the given one.
     return table[orders[..., rows], orders[..., cols]]
 
 

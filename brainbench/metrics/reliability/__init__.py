@@ -1,2 +1,2 @@
-"""How reliable an animal's RDM is: ``sessions`` sorts trials, ``whitening`` divides by their noise, ``halves`` and
+"""Reliability of an animal's RDM: ``sessions`` sorts trials, ``whitening`` divides by their noise, ``halves`` and
 ``resampling`` make RDMs of parts of them, ``subject_rdm`` joins these; ``noise_correction`` and ``ceiling`` use it."""

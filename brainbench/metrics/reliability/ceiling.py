@@ -23,7 +23,7 @@ class NoiseCeiling(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Why the bounds are NaN; empty when they are not."""
+        """Reason for bounds that are NaN; empty when they are not."""
         if math.isfinite(self.lower) and math.isfinite(self.upper):
             return ""
         return "a noise ceiling needs at least two animals whose RDMs share pairs that differ"
@@ -47,6 +47,8 @@ def noise_ceiling(rdms: ArrayLike, *, method: str = "pearson") -> NoiseCeiling:
         return NoiseCeiling(math.nan, math.nan)
     parts = np.full(animals.shape, np.nan)
     parts[:, shared] = pooling(method)(animals[:, shared])
+    # Nili et al. 2014: each animal against the mean of the others (lower bound), and of all with itself (upper bound).
+    # The mean of unit vectors has the largest mean cosine with them; for rank correlations this is approximate.
     total = parts.sum(axis=0)
     others = (total - parts) / (len(animals) - 1)
     comparable = np.where(shared, animals, np.nan)

@@ -74,6 +74,7 @@ class WeightedRDMs:
         with np.errstate(invalid="ignore", divide="ignore"):
             for index, part in enumerate(sums):
                 number = np.where(part.number > 0, part.number, np.nan)
+                # Inner products of mean patterns, s_k·s_l / (n_k n_l); sessions add up, since their units are joined.
                 own = part.gram / (number[:, :, None] * number[:, None, :])
                 if self._method == "crossnobis":
                     # The product of a trial with itself holds its noise; those of different trials do not.
@@ -132,6 +133,7 @@ class _Sums:
         self.patterns = np.empty((len(weights), count, factor.shape[1]))
         for stimulus, rows in enumerate(groups):
             np.matmul(weights[:, rows], factor[rows], out=self.patterns[:, stimulus])
+        # Trials are sorted by stimulus, so one pass of reduceat sums each of them.
         starts = [rows.start for rows in groups]
         own = np.einsum("ru,ru->r", factor, factor)
         self.number = np.add.reduceat(weights, starts, axis=1)
@@ -143,6 +145,7 @@ class _Sums:
     def without(self, half: _Sums) -> _Sums:
         """Return the sums of the other half, whose inner products need no second pass over its patterns."""
         other = object.__new__(_Sums)
+        # (S − H)(S − H)ᵀ = SSᵀ − SHᵀ − HSᵀ + HHᵀ for the sums S of all trials and H of one half.
         cross = self.patterns @ half.patterns.swapaxes(-1, -2)
         other.gram = self.gram - cross - cross.swapaxes(-1, -2) + half.gram
         for name in ("number", "number_squared", "units", "squares"):
@@ -156,6 +159,7 @@ def _unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
     With ``variances`` [..., K, F] of the patterns (sample variance over trials / trials) this is the
     crossnobis distance with every trial as its own fold; units without either value are left out of a pair.
     """
+    # E‖x̂_i − x̂_j‖² = ‖x_i − x_j‖² + v_i + v_j: the noise of both means is taken away, over the units that both have.
     present = np.isfinite(patterns) & np.isfinite(variances)
     weight = present.astype(np.float64)
     own = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)

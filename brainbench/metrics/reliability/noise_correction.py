@@ -52,6 +52,7 @@ class Corrected:
 
 def spearman_brown(r: ArrayLike) -> Floats:
     """Return the reliability 2r/(1 + r) of all trials from the correlation of their halves; r = −1 is NaN."""
+    # Spearman and Brown's formula for a test of twice the length (thesis, section 3.3.4).
     half = np.asarray(r, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(half == -1.0, np.nan, 2 * half / (1 + half))
@@ -65,6 +66,7 @@ def corrected_splits(
     As published, two negative reliabilities have a positive product and pass.
     """
     other = 1.0 if other_split_half_r is None else spearman_brown(other_split_half_r)
+    # Thesis, equation 3.4, split by split; a negative product has no real root.
     product = spearman_brown(split_half_r) * other
     denominator = np.sqrt(np.where(product > 0, product, np.nan))
     return np.asarray(r_xy, dtype=np.float64) / denominator, denominator
@@ -125,6 +127,7 @@ def noise_corrected(
 
 
 def _default(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
+    # Correlations are averaged before the ratio is formed, so that no split with a denominator near zero dominates.
     sides = [float(spearman_brown(finite_mean(side))) for side in (halves, others) if side is not None]
     lowest = min(sides) if not any(map(math.isnan, sides)) else math.nan
     if math.isnan(lowest):
@@ -136,6 +139,7 @@ def _default(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float
 
 def _thesis(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
     ratio, _ = corrected_splits(r_xy, halves, others)
+    # As published for models: splits below the filter are dropped, which keeps the lucky ones.
     kept = ratio[np.broadcast_to(halves >= THESIS_FILTER, ratio.shape) & np.isfinite(ratio)]
     if not kept.size:
         return math.nan, 0, f"no split half has a raw correlation of at least {THESIS_FILTER}"
@@ -144,6 +148,7 @@ def _thesis(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float,
 
 def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
     ratio, _ = corrected_splits(r_xy, halves, others)
+    # As published for the raw input: imaginary ratios vanish, and the median is taken of the others.
     kept = ratio[np.isfinite(ratio)]
     if not kept.size:
         return math.nan, 0, "no split half has a positive reliability"

@@ -45,6 +45,7 @@ def trial_counts(session: SortedTrials, count: int, draws: int, seed: int) -> Fl
     """Return how often each trial [D, R] was drawn among those of its stimulus."""
     parts = []
     for stimulus in range(count):
+        # Seeded by the sum of the trials' hashes, which does not depend on their order.
         hashes = session.hashes[session.group(stimulus)]
         parts.append(_drawn(np.random.default_rng([seed, int(hashes.sum(dtype=np.uint64))]), len(hashes), draws))
     return np.concatenate(parts, axis=1).astype(np.float64)
@@ -52,12 +53,14 @@ def trial_counts(session: SortedTrials, count: int, draws: int, seed: int) -> Fl
 
 def _drawn(generator: np.random.Generator, number: int, draws: int) -> Ints:
     """Return how often each of ``number`` things [D, number] was drawn with replacement."""
+    # Numbers of draw d are moved by d · number, so that one count serves all draws.
     drawn = generator.integers(0, number, (draws, number)) + number * np.arange(draws)[:, None]
     return np.bincount(drawn.ravel(), minlength=draws * number).reshape(draws, number)
 
 
 def _splittable(session: SortedTrials, counts: Floats, members: Floats, count: int, method: str) -> NDArray[np.bool_]:
     """Return where both halves [D, S] have enough different trials of every stimulus."""
+    # The variance of a mean needs two different trials; one trial drawn twice holds its noise once.
     drawn, needed = (counts > 0).astype(np.float64), 2 if method == "crossnobis" else 1
     enough = np.ones((len(counts), len(members)), dtype=bool)
     for stimulus in range(count):

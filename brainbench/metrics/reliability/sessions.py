@@ -41,6 +41,7 @@ class SortedTrials(Trials):
     @classmethod
     def sort(cls, responses: Floats, labels: Ints, hashes: Hashes) -> SortedTrials:
         """Sort trials by stimulus and hash, so that the order in which they came is forgotten."""
+        # Sorted by content, sums are formed in one order, so results do not change with the order of trials.
         order = np.lexsort((hashes, labels))
         return cls(responses[order], labels[order], hashes=hashes[order])
 
@@ -59,6 +60,7 @@ class SortedTrials(Trials):
         """[R, ≤ R] patterns with the same inner products as the trials' responses, and no more columns than trials."""
         if self.responses.shape[1] <= len(self.labels):
             return self.responses
+        # Rᵀ of responsesᵀ = Q R keeps the inner products of trials, and work then grows with trials, not with units.
         return np.asarray(np.linalg.qr(self.responses.T, mode="r")).T
 
     def group(self, stimulus: int) -> slice:
@@ -100,6 +102,7 @@ def usable_sessions(
                 f"fewer than {least} trials of {', '.join(few[:4])}" + (" and others" if len(few) > 4 else "")
             )
             continue
+        # Both halves need recorded trials of every stimulus in each unit that is kept.
         splittable = (membership(codes, count) @ np.isfinite(responses) >= least).all(axis=0)
         dropped += int((~splittable).sum())
         if splittable.any():

@@ -70,7 +70,7 @@ class SubjectRDM:
     seed: int = 0
     """Seed of splits and draws."""
     problem: str | None = None
-    """Why the animal has no usable RDM, in words."""
+    """Reason for having no usable RDM, in words; None otherwise."""
     notes: tuple[str, ...] = ()
     """Sessions and units that were left out, in words."""
     draws: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
@@ -164,6 +164,7 @@ def subject_rdm(
     if distance != "poisson":
         sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     every = WeightedRDMs(sessions, [np.ones((1, len(session.labels))) for session in sessions], n_stimuli, distance)
+    # Sums over all trials are made once; halves and draws are weightings of the same sorted trials.
     rdm, halves, r = every.whole()[0], *_split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
     found = replace(empty, rdm=rdm, split_half_r=r, halves=halves)
     finite = r[np.isfinite(r)]
@@ -171,9 +172,12 @@ def subject_rdm(
         flat = np.isnan(rdm).any()
         reason = "the mean responses to a stimulus are constant across units" if flat else "all pairs are equal"
         return replace(found, problem=f"its RDM is undefined: {reason}")
+    # The formula has a pole at r = −1, across which percentiles mean nothing.
     low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
     spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
+    # Correlations are averaged before the formula, which is not linear.
     found = replace(found, reliability=float(spearman_brown(finite.mean())), spread=spread)
+    # The draws are made here, once for all models, and must fit in memory.
     number = min(draws, _DRAWS_BYTES // (8 * pairs))
     if not number:
         return replace(found, draws=np.empty((0, pairs)))
@@ -188,6 +192,7 @@ def _split_halves(
     pairs = count * (count - 1) // 2
     kept = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
     halves, r = np.empty((kept, 2, pairs)), np.empty(splits)
+    # Chunks of splits: memory does not grow with their number.
     step = max(1, _CHUNK_BYTES // (8 * pairs))
     for start in range(0, splits, step):
         index = np.arange(start, min(start + step, splits))

@@ -43,6 +43,7 @@ def content_hashes(responses: NDArray, codes: Ints) -> Hashes:
             stimulus = np.zeros(int(codes.max(initial=-1)) + 1, dtype=np.uint64)
             np.add.at(stimulus, codes, trial)
             trial = _mix(trial + _mix(stimulus)[codes])
+            # Sums of mixed values do not depend on order, which makes trials and units anonymous sets to one another.
             unit = _mix(_mix(values ^ trial[:, None]).sum(axis=0, dtype=np.uint64))
             trial = _mix(trial + _mix(values ^ unit).sum(axis=1, dtype=np.uint64))
         order = np.argsort(trial, kind="stable")
@@ -63,6 +64,7 @@ def draws(hashes: Hashes, splits: Ints, seed: int) -> Hashes:
 def _mix(state: NDArray[np.uint64] | np.uint64) -> Hashes:
     with np.errstate(over="ignore"):
         z = np.asarray(state, dtype=np.uint64) + _STEP
+        # SplitMix64's finaliser (Steele 2014) maps 64 bits one to one, so different trials keep different numbers.
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         return z ^ (z >> np.uint64(31))

@@ -50,12 +50,15 @@ def unit_reliability(
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
         for start in range(0, splits, _CHUNK):
             member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
+            # Split by split, so that memory holds a chunk of splits of one session.
             halves = [weighted_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
+            # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.
             first, second = (features(half.swapaxes(-1, -2), "pearson") for half in halves)
             r = np.einsum("sfk,sfk->sf", first, second)
             known = np.isfinite(r)
             total += np.where(known, r, 0.0).sum(axis=0)
             number += known.sum(axis=0)
+        # Splits are averaged before Spearman and Brown's formula, as for RDMs.
         mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
         found.append(spearman_brown(mean))
     return tuple(found)

@@ -55,6 +55,7 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
         return session, ""
     if noise not in NOISE_METHODS:
         raise unknown_name("noise covariance method", noise, ("none", *NOISE_METHODS))
+    # Noise is what trials differ by from their stimulus' mean; below the rounding of its values a unit has none.
     residuals = session.responses - stimulus_means(session.responses, session.labels, count)[session.labels]
     largest = np.nanmax(np.abs(session.responses), axis=0)
     varies = np.nanmax(np.abs(residuals), axis=0) > 8 * np.finfo(np.float64).eps * largest
@@ -69,6 +70,7 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     responses = session.responses[:, usable]
     if noise == "diag":
         rest = residuals[:, usable]
+        # ν = trials − stimuli, per unit; for Gaussian noise E[σ²/σ̂²] = ν/(ν − 2).
         freedom = np.isfinite(rest).sum(axis=0) - count
         scaled = responses / np.sqrt(np.nansum(rest**2, axis=0) / freedom)
         # Units with two degrees of freedom or fewer have no expected factor; four is the least anyone has.
@@ -78,6 +80,7 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
         precision = estimate_noise(responses, session.labels, count, noise).precision()
     except DataError as error:
         return None, str(error).rstrip(".")
+    # With the precision P̂ = L Lᵀ, trials times L have noise of unit covariance.
     inflation = _inflation(responses, session.labels, noise, count)
     return replace(session, responses=responses @ np.linalg.cholesky(precision), inflation=inflation), told
 
@@ -85,6 +88,7 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
 def _inflation(responses: Floats, codes: Ints, noise: str, count: int) -> float:
     """Return tr(P̂ S) of a precision P̂ and the covariance S of other trials, over that of its own trials."""
     units, freedom = responses.shape[1], len(codes) - count
+    # Mean of an inverse Wishart matrix: E[Σ̂⁻¹] = Σ⁻¹ ν/(ν − U − 1), exact for Gaussian noise.
     if noise == "full":
         return freedom / (freedom - units - 1) if freedom > units + 1 else 1.0
     residuals = responses - stimulus_means(responses, codes, count)[codes]

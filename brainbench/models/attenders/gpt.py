@@ -51,6 +51,7 @@ class GPTBlock(nn.Module):
         super().__init__()
         self.heads = heads
         self.dropout = dropout
+        # Two branches of each block add to the stream: 2 · depth of them in all (GPT-2, Radford et al. 2019).
         residual = 1.0 / math.sqrt(2.0 * depth)
         self.norm_attention = nn.LayerNorm(width)
         self.query_key_value = Linear(width, 3 * width)
@@ -72,6 +73,7 @@ class GPTBlock(nn.Module):
         if past is not None:
             seen = past[0].shape[2]
             key, value = torch.cat((past[0], key), 2), torch.cat((past[1], value), 2)
+            # New tokens attend to all that came before and to themselves: a triangle moved by the tokens seen.
             mask = torch.ones(tokens, seen + tokens, dtype=torch.bool, device=x.device).tril(seen)
         attended = functional.scaled_dot_product_attention(
             query,
@@ -81,6 +83,7 @@ class GPTBlock(nn.Module):
             is_causal=mask is None,
             dropout_p=self.dropout if self.training else 0.0,
         )
+        # Pre-norm: the stream itself is never normalised inside the blocks, so gradients pass through them unchanged.
         x = x + self.residual_dropout(self.project(attended.transpose(1, 2).reshape(batch, tokens, width)))
         return x + self.mlp(self.norm_mlp(x)), (key, value)
 
@@ -187,5 +190,6 @@ class GPTAttender(nn.Module):
                 f"The GPT attender remembers at most {self.max_steps} steps (context {self.context} tokens, two per "
                 f"step); received step {start // 2 + steps}. Shorten the sweep or start again from init_state."
             )
+        # x₀, a, x₁, a, …: answers are read at the odd places, where the token itself carries no stimulus.
         pairs = torch.stack((x, self.action.to(x.dtype).expand(batch, steps, features)), 2)
         return self.dropout(self.embed(pairs.flatten(1, 2)) + self.positions[start : start + 2 * steps])

@@ -65,6 +65,7 @@ class MambaBlock(nn.Module):
         if not self.skip.is_meta:
             with torch.no_grad():
                 low, high = map(math.log, _STEP_RANGE)
+                # Δ is drawn log-uniformly; its inverse softplus is Δ + log(1 − e^−Δ).
                 size = torch.empty(inner).uniform_(low, high).exp()
                 # The softplus of this bias is the step size.
                 self.step_size.bias.copy_(size + torch.log(-torch.expm1(-size)))
@@ -78,6 +79,7 @@ class MambaBlock(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Process a sweep [B, T, width]."""
         u, gate = self.expand(self.norm(x)).chunk(2, -1)
+        # Zeros before the first step alone make the short convolution causal.
         padded = functional.pad(u.transpose(1, 2), (self.convolution.kernel_size[0] - 1, 0))
         u = functional.silu(self.convolution(padded).transpose(1, 2))
         if (scan := dispatch.selective_scan(u)) is not None:
@@ -89,6 +91,7 @@ class MambaBlock(nn.Module):
     def step(self, x: torch.Tensor, memory: MambaMemory) -> tuple[torch.Tensor, MambaMemory]:
         """Advance by one step [B, width]; return the answer and the next memory."""
         u, gate = self.expand(self.norm(x)).chunk(2, -1)
+        # The stream keeps the last inputs, so its short convolution sees what the sweep's does.
         window = torch.cat((memory.recent.to(u.dtype), u[..., None]), -1)
         weight, bias = self.convolution.weight[:, 0], cast(torch.Tensor, self.convolution.bias)
         u = functional.silu((window * weight).sum(-1) + bias)
@@ -102,6 +105,7 @@ class MambaBlock(nn.Module):
         # Products of many decays need more digits than half floats have.
         exact = torch.promote_types(u.dtype, torch.float32)
         size = functional.softplus(self.step_size(size)).to(exact)
+        # exp(Δ A) with A = −exp(log_decay) < 0, so no state can grow; the input enters by Δ B (Gu & Dao 2023).
         decay = torch.exp(size[..., None] * -torch.exp(self.log_decay.to(exact)))
         return decay, (size * u.to(exact))[..., None] * drive.to(exact)[..., None, :], readout.to(exact)
 

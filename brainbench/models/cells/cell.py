@@ -23,6 +23,7 @@ class ChannelNorm(nn.LayerNorm):
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Normalise [B, C, ...] over C."""
+        # Layer norm (Ba et al. 2016) of each place by itself, so that a touch at one whisker does not scale the others.
         return super().forward(input.movedim(1, -1)).movedim(-1, 1)
 
 

@@ -79,10 +79,12 @@ class GatedCell(Cell):
 
     def _fused(self, conv: Conv2d, x: torch.Tensor, memory: torch.Tensor, projected: Projected) -> torch.Tensor:
         if projected:
+            # W [x, s] = W_x x + W_s s: the input's part was computed for all steps at once, only the memory's is left.
             return projected[0] + conv.conv_slice(memory, self.in_channels, use_bias=False)
         return dispatch.conv_concat(conv, (x, memory))
 
     def _normalised(self, fused: torch.Tensor, names: tuple[str, ...]) -> list[torch.Tensor]:
+        # One convolution gives all gates; each is normalised by itself, as gates differ in scale.
         parts = fused.chunk(len(names), 1)
         if not self.norms:
             return list(parts)

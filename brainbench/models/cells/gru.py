@@ -59,9 +59,11 @@ class GRU(GatedCell):
     def reset(self, fused: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (r s, u) from the gates' pre-activations."""
         reset, keep = self._normalised(fused, self.gates)
+        # The +1 lets the old state into the candidate early in training; the update gate has none.
         return torch.sigmoid(reset + FORGET_BIAS) * state, torch.sigmoid(keep)
 
     def update(self, fused: torch.Tensor, keep: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         """Return the next state from the candidate's pre-activation and the update gate u."""
         (candidate,) = self._normalised(fused, ("c",))
+        # s ← u s + (1 − u) c (Cho et al. 2014): old state and candidate mix, so the state stays within ±1.
         return keep * state + (1 - keep) * torch.tanh(candidate)

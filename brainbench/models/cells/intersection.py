@@ -44,7 +44,7 @@ class IntersectionRNN(GatedCell):
             )
         super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
         self.deferred: DeferredNormGrad | None = None
-        """Where the steps of a pass leave the gradients of the norms; None outside of such a pass."""
+        """Place for the gradients of the norms of each step; None outside of a deferring pass."""
 
     def forward(
         self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
@@ -64,6 +64,8 @@ class IntersectionRNN(GatedCell):
         """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
         keep, candidate, through, output = self._normalised(fused, self.gates)
         keep = torch.sigmoid(keep + FORGET_BIAS)
+        # Thesis, equations 3.2 and 3.3: one gate passes the state on in time, the other the input on in depth.
         through = torch.sigmoid(through + FORGET_BIAS)
+        # h = y x + (1 − y) n and s = p s + (1 − p) m: early in training most of input and state passes.
         y = through * x + (1 - through) * torch.relu(output)
         return y.to(x.dtype), keep * state + (1 - keep) * torch.tanh(candidate)

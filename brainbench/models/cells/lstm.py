@@ -49,6 +49,7 @@ class LSTM(GatedCell):
         del x
         memory = state.chunk(2, 1)[0]
         write, candidate, keep, read = self._normalised(fused, self.gates)
+        # The +1 on the forget gate keeps the memory early in training; c is normalised before it is read and stored.
         memory = memory * torch.sigmoid(keep + FORGET_BIAS) + torch.sigmoid(write) * torch.tanh(candidate)
         (memory,) = self._normalised(memory, ("c",))
         hidden = torch.tanh(memory) * torch.sigmoid(read)

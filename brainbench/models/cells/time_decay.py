@@ -52,5 +52,6 @@ class TimeDecay(Cell):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, C, ...]."""
         del projected
+        # s_t = x_t + τ s_{t−1}: linear, so the trace of one input decays as τ to the power of the steps since.
         state = x + self.tau * self._check(x, state)
         return self.norm(state), state

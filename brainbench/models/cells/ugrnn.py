@@ -21,6 +21,7 @@ class UGRNN(GatedCell):
         self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
+        # Thesis, equation 3.1 and the text after it; the +1 favours keeping the state early in training.
         keep, candidate = self._normalised(fused, self.gates)
         keep = torch.sigmoid(keep + FORGET_BIAS)
         state = keep * state + (1 - keep) * torch.tanh(candidate)

@@ -42,6 +42,7 @@ class BasicBlock(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the rectified sum of the branch and the shortcut."""
+        # He et al. 2016: the branch learns the difference from the shortcut, so gradients pass by it undiminished.
         y = self.norm2(self.conv2(torch.relu(self.norm1(self.conv1(x)))))
         return torch.relu(y + self.shortcut(x))
 
@@ -83,6 +84,7 @@ class ResNet18Encoder(nn.Module):
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one step of one stimulus."""
         _, rows, columns = self.input_shape
+        # The first convolution and the pool halve the grid, as does every layer from the second on.
         size = (_halved(_halved(rows)), _halved(_halved(columns)))
         first, *_ = (module for module in self.conv1 if isinstance(module, Conv2d))
         total = first.weight.numel() * _halved(rows) * _halved(columns)
@@ -101,6 +103,7 @@ class ResNet18Encoder(nn.Module):
         check_sweep(x, self.input_shape, "The ResNet")
         leading = x.shape[:2]
         layers = ((name, self.get_submodule(name)) for name in self.layers)
+        # Steps are independent images here, so batch and time are one axis.
         y, activations = run_layers(x.flatten(0, 1), layers, return_activations)
         y = y.unflatten(0, leading)
         if return_activations is False:

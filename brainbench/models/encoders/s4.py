@@ -49,6 +49,7 @@ class S4Block(nn.Module):
         return x + self._mixed(y), memory
 
     def _mixed(self, y: torch.Tensor) -> torch.Tensor:
+        # State spaces keep channels apart; the gated linear unit mixes them at every step.
         return functional.glu(self.mix(self.dropout(functional.gelu(y))), -1)
 
 
@@ -85,6 +86,7 @@ class S4Encoder(nn.Module):
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one streamed step: linear layers, and 12 per conjugate pair of the recurrence."""
+        # For each pair: 4 for the transition, 2 each for row, column, input and readout.
         linear = sum(module.weight.numel() for module in self.modules() if isinstance(module, Linear))
         return linear + sum(12 * block.memory.frequency.numel() for block in self.blocks)
 

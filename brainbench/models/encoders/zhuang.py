@@ -60,8 +60,10 @@ class ZhuangEncoder:
             Node(name, Convolution(self._width(width), padding="valid" if name == "conv1" else "same"), memory)
             for name, width in zip(names, _FULL, strict=True)
         ]
+        # Gated memories are convolutional and need a grid, which dense layers lack; a trace needs none.
         dense = Memory() if self.cell == "time-decay" and not self.feedforward else None
         nodes += [Node("fc7", Dense(self._width(1024)), dense), Node("fc8", Dense(self.features), dense)]
+        # Skips bring early responses to the dense layers before the last convolution has answered.
         forward = [*pairwise(names), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
         edges = [Edge(*ends) for ends in (*forward, ("fc7", "fc8"))]
         if not self.feedforward:

@@ -34,6 +34,7 @@ class NodeModule(nn.Module):
     def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
         """Join the resized inputs on channels and operate on them; return what the memory sees [B, ...]."""
         inputs = self.resized(inputs)
+        # Kernels join the inputs while they read them; dropout needs them joined before.
         if isinstance(self.operation, Conv2d) and not (self.training and self.dropout.p):
             return self.before(dispatch.conv_concat(self.operation, inputs))
         x = self.dropout(inputs[0] if len(inputs) == 1 else torch.cat(inputs, 1))
@@ -56,6 +57,7 @@ def _operation(node: Node, shape: Shape) -> tuple[nn.Module, int]:
             **options,
         )
         return layer, what.channels
+    # Gain √2 as for convolutions (He et al. 2015), since a rectifier follows.
     return Linear(math.prod(shape), what.features, gain=RECTIFIER_GAIN, **options), what.features
 
 
@@ -78,4 +80,5 @@ def _pool(pool: Pool | None) -> list[nn.Module]:
 
 
 def _resize(x: torch.Tensor, grid: Shape) -> torch.Tensor:
+    # Bilinear with antialiasing: a smaller grid averages what lies between its places instead of skipping it.
     return functional.interpolate(x, size=grid, mode="bilinear", align_corners=False, antialias=True)

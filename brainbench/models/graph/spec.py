@@ -318,6 +318,7 @@ class GraphSpec:
     def first_response(self, unroll: Unroll = "biological") -> dict[str, int]:
         """Return for each node the step at which it first responds to the stimulus at step 0."""
         delay = self.delays(unroll)
+        # Shortest path in steps (Bellman-Ford): after as many passes as nodes no shorter one is left.
         first = dict.fromkeys(self.inputs, 0)
         for _ in self.nodes:
             for edge in self.edges:
@@ -333,6 +334,7 @@ class GraphSpec:
             return None
         if any(edge.source == edge.target for edge in self.edges):
             return None
+        # Longest path in steps, which exists because loops and memories were excluded above.
         last = dict.fromkeys(self.inputs, 1)
         for name in (name for group in self.groups for name in group):
             for edge in self.predecessors[name]:
@@ -342,6 +344,7 @@ class GraphSpec:
     @cached_property
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Strongly connected components in the order in which they can be computed."""
+        # Reach of every node by as many passes as nodes; two nodes that reach one another are in one loop.
         reach = {node.name: {node.name} for node in self.nodes}
         for _ in self.nodes:
             for edge in self.edges:

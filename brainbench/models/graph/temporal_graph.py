@@ -181,6 +181,7 @@ class TemporalGraph(nn.Module):
         for name, node in self.named_nodes():
             places = math.prod(self.memory_grid(name))
             if isinstance(node.operation, (Conv2d, Linear)):
+                # A convolution uses each weight once at every place of its output.
                 total += node.operation.weight.numel() * places
             if node.memory is not None:
                 total += sum(m.weight.numel() for m in node.memory.modules() if isinstance(m, Conv2d)) * places
@@ -240,6 +241,7 @@ class TemporalGraph(nn.Module):
         for name in self.layers:
             inputs = [x] if name in self.spec.inputs else []
             for edge in self.spec.predecessors[name]:
+                # In the biological unrolling every connection takes one step; else feedback alone does.
                 delayed = unroll == "biological" or edge.feedback
                 inputs.append((state.outputs if delayed else outputs)[edge.source])
             outputs[name] = self.advance(name, self.node(name).operate(inputs), state.memories, memories)

@@ -45,6 +45,7 @@ def needed_steps(
             first[name], stop[name] = min(first[name], start), steps
     looped = {name for group in spec.groups if len(group) > 1 for name in group}
     looped |= {edge.source for edge in spec.edges if edge.source == edge.target}
+    # Backwards to a fixed point: a step of a node needs the step of its source that lies one delay before.
     changed = True
     while changed:
         changed = False
@@ -114,6 +115,7 @@ class UnrolledSweep:
     def _window(self, source: str, first: int, stop: int) -> torch.Tensor:
         """Return the outputs of a node at steps first to stop [B, stop − first, ...]; before its first step, zeros."""
         start, values = self.kept.get(source, (0, self.x.new_zeros(self.batch, 0, *self.graph.shapes[source])))
+        # Before the first step every node is silent: zeros, as in a stream from the empty state.
         missing = max(0, -first)
         part = values[:, max(first, 0) - start : max(stop, 0) - start]
         if not missing:
@@ -131,6 +133,7 @@ class UnrolledSweep:
             inputs.append(self._window(edge.source, first - lag, stop - lag).flatten(0, 1))
         y = node.operate(inputs)
         if node.memory is not None:
+            # What depends on the input alone is computed for all steps at once, and the loop holds only the recurrence.
             projected = node.memory.project(y)
             rows = [part.unflatten(0, (self.batch, count)) for part in (y, *projected)]
             state, outputs = None, []
@@ -147,6 +150,7 @@ class UnrolledSweep:
         previous = {name: self.x.new_zeros(1, *graph.shapes[name]) for name in group}
         memories: dict[str, torch.Tensor] = {}
         history: dict[str, list[torch.Tensor]] = {name: [] for name in group if name in read}
+        # Nodes of a loop need one another's last outputs, so time is the outer loop here.
         for t in range(max(self.steps[name][1] for name in group)):
             current: dict[str, torch.Tensor] = {}
             for name in group:

@@ -55,6 +55,7 @@ def unfolded(
     from brainbench.models.ops.kernels.intersection import channels_innermost
     from brainbench.models.ops.kernels.unfold import unfold_into
 
+    # im2col: a convolution of a small grid is one matrix product of all its windows.
     rows = len(inputs[0]) * math.prod(geometry.out)
     if out is None:
         width = math.prod(geometry.kernel) * sum(x.shape[1] for x in inputs)
@@ -109,6 +110,7 @@ class DeferredWeightGrad:
         self.span = (0, 0)
         """Rows of the last result."""
         self.matrix: torch.Tensor = _WeightMatrix.apply(self, conv.weight, conv.bias)  # type: ignore[assignment]
+        # The gradient of the input is the convolution with the kernel turned by 180° and its channels exchanged.
         flipped = conv.weight.detach().to(HALF).flip(2, 3).permute(2, 3, 0, 1)
         self.back = flipped.reshape(-1, conv.weight.shape[1])
 
@@ -150,7 +152,9 @@ class DeferredWeightGrad:
             gradients[stop:first].zero_()  # what no later step read
             stop = last
         columns, gradients = columns[: self.used], gradients[: self.used]
+        # Sums over steps of half-precision gradients are kept in single precision.
         bias = None if self.bias is None else gradients.sum(0, dtype=torch.float32)
+        # Σ_t g_tᵀ x_t of all steps as one product of [R, O] with [R, taps · C].
         return gradients.t() @ columns, bias
 
 
@@ -189,11 +193,13 @@ class _Convolution(torch.autograd.Function):
         deferred: DeferredWeightGrad = ctx.deferred
         place = deferred.gradient(ctx.span)
         gradient = given[0] if place is None else _maps(place, deferred.geometry)
+        # A fused kernel may have written the gradient to its place already; else it is copied there.
         if gradient.data_ptr() != given[0].data_ptr():
             gradient.copy_(given[0])
         if not any(ctx.needs_input_grad[2:]):
             return None, None, *(None for _ in ctx.inputs)
         back = deferred.geometry.reversed()
+        # Taken back by the same kernels: windows of the gradient times the turned weights.
         taken = _maps(unfolded([gradient], back) @ deferred.back, back)
         parts = taken.split([channels for channels, _ in ctx.inputs], 1)
         return None, None, *(part.to(kind) for part, (_, kind) in zip(parts, ctx.inputs, strict=True))

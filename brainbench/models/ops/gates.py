@@ -43,6 +43,7 @@ class _NormWeights(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *unused: Any) -> Any:
+        # Programs left their sums apart: added here in one order, results do not differ from run to run.
         sums = ctx.deferred.sums.sum(0)
         return None, *(row.to(kind) for row, kind in zip(sums, ctx.kinds, strict=True))
 
@@ -54,6 +55,7 @@ def apply_gates(
 
     In mixed precision the new state is single, otherwise of the precision of the old one.
     """
+    # A memory is added to at every step; in half precision small additions would be lost.
     kind = torch.float32 if torch.is_autocast_enabled(x.device.type) else state.dtype
     state = state.to(kind)
     if cell.deferred is not None:

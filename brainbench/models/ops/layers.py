@@ -75,6 +75,7 @@ def initialise(
         return
     fan_in = layer.weight[0].numel()
     if method is None:
+        # A uniform number within ±b has variance b²/3, so this bound gives gain²/fan_in (He et al. 2015).
         bound = gain * math.sqrt(3.0 / fan_in)
         layer.weight.uniform_(-bound, bound)
     else:
@@ -101,6 +102,7 @@ class PackedMatrix:
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Return x [..., in] times the matrix, plus the bias, in the precision of ``x``."""
+        # A product with few rows is bound by reading the weights: half precision halves that, single keeps the digits.
         rounded = x.to(self.dtype)
         if self.ordered is None:
             y = functional.linear(rounded, cast(torch.Tensor, self.plain))
@@ -134,7 +136,7 @@ class Conv2d(nn.Conv2d):
         self._extra: tuple[int, int, int, int] | None = None
         self._packed: PackedMatrix | None = None
         self.deferred: DeferredWeightGrad | None = None
-        """Where the steps of a pass leave what the gradient of the weights needs; None outside of such a pass."""
+        """Place for what the gradient of the weights needs of each step; None outside of a deferring pass."""
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":
             left, right, top, bottom = same_padding(kernel_size)
@@ -172,6 +174,7 @@ class Conv2d(nn.Conv2d):
 
     def pack(self, dtype: torch.dtype) -> None:
         """Keep a copy of the weights in the order in which one stimulus is multiplied with them fastest, on the CPU."""
+        # Channels innermost, as the windows of the input are read.
         rows = self.weight.detach().permute(0, 2, 3, 1).flatten(1)
         self._packed = PackedMatrix(rows, self.bias, dtype)
 
@@ -196,6 +199,7 @@ class Conv2d(nn.Conv2d):
             return self._conv_forward(padded, weight, bias)
         # The convolutions of CPUs rearrange their weights at every call, which for one stimulus takes longest.
         columns = functional.unfold(padded, self.kernel_size, padding=_two(self.padding), stride=_two(self.stride))
+        # im2col and one matrix product read the weights where they lie.
         y = weight.flatten(1) @ columns[0]
         y = y if bias is None else y + bias[:, None]
         return y.view(1, -1, *self.output_grid(*input.shape[2:]))

@@ -31,6 +31,7 @@ class _LinearScan(torch.autograd.Function):
         following = torch.cat((a[:, 1:], torch.zeros_like(a[:, :1])), 1)
         adjoint = _solve(following.flip(1), grad.flip(1)).flip(1)
         before = torch.cat((torch.zeros_like(h[:, :1]), h[:, :-1]), 1)
+        # ∂L/∂a_t = g_t h_{t−1} and ∂L/∂b_t = g_t.
         return adjoint * before, adjoint
 
 
@@ -41,10 +42,12 @@ def _solve(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     pairs = steps // 2
     first_a, second_a = a[:, : 2 * pairs : 2], a[:, 1 : 2 * pairs : 2]
     first_b, second_b = b[:, : 2 * pairs : 2], b[:, 1 : 2 * pairs : 2]
+    # Two steps are one, (a₂ a₁, a₂ b₁ + b₂), so odd steps obey a recurrence of half the length.
     odd = _solve(second_a * first_a, torch.addcmul(second_b, second_a, first_b))
     h = torch.empty_like(b)
     h[:, 1 : 2 * pairs : 2] = odd
     h[:, 0] = b[:, 0]
+    # Each even step follows from the odd step before it.
     count = (steps - 1) // 2
     if count:
         h[:, 2::2] = torch.addcmul(b[:, 2::2], a[:, 2::2], odd[:, :count])

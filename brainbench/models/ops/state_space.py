@@ -80,6 +80,7 @@ class StateSpace(nn.Module):
         with torch.autocast(u.device.type, enabled=False):
             kernel = self.kernel(length).to(torch.float32)
             signal = u.to(torch.float32).transpose(1, 2)
+            # Padding to 2 L makes the circular convolution of the FFT a linear one.
             spectrum = torch.fft.rfft(signal, n=2 * length) * torch.fft.rfft(kernel, n=2 * length)
             y = torch.fft.irfft(spectrum, n=2 * length)[..., :length].transpose(1, 2)
             y = y + self.skip.to(torch.float32) * u.to(torch.float32)
@@ -115,6 +116,7 @@ class StateSpace(nn.Module):
 
     def step(self, u: torch.Tensor, memory: torch.Tensor, system: System) -> tuple[torch.Tensor, torch.Tensor]:
         """Advance by one step of input [B, H]; return the answer [B, H] and the next memory [B, H, N, 2]."""
+        # x ← Ā x + B̄ u with Ā diagonal less rank one; twice the real part stands for the conjugate states.
         seen = 2 * _real_product(system.right, memory).sum(-1)
         memory = (
             _product(system.decay, memory) - system.left * seen[..., None, None] + system.drive * u[..., None, None]
@@ -153,8 +155,10 @@ def _kernel(
         return (pair[:, 0] @ inverse + pair[:, 1] @ mirrored)[:, 0]
 
     row = low_rank.conj()
+    # Sherman-Morrison with c = Δ/2 (1 + z): (D + c P P*)⁻¹ = D⁻¹ − c D⁻¹P P*D⁻¹ / (1 + c P*D⁻¹P).
     correction = half / (1.0 + half * total(row * low_rank))
     response = total(readout * drive) - correction * total(readout * low_rank) * total(row * drive)
+    # The samples on the circle are the transform of K_k |z|^k: transformed back, the damping is divided out.
     wrapped = torch.fft.irfft(step[:, None] * response, n=points)[:, :length]
     return wrapped * radius ** -torch.arange(length, device=step.device, dtype=torch.float64)
 
@@ -190,6 +194,7 @@ def _legs(pairs: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     low_rank = scale / math.sqrt(2.0)
     matrix = -np.tril(np.outer(scale, scale), -1) - np.diag(order + 1.0)
     skew = matrix + np.outer(low_rank, low_rank) + 0.5 * np.eye(2 * pairs)
+    # −i times a real skew-symmetric matrix is Hermitian: real frequencies in pairs ±ω and a unitary basis.
     frequencies, basis = np.linalg.eigh(-1j * skew)
     kept = frequencies > 0
     into = basis.conj().T[kept]

@@ -129,6 +129,7 @@ def mask_steps(x: torch.Tensor, share: float, draw: SampledAugmentation) -> torc
     """Set a share of the time steps of each sample to zero (rounded to whole steps, at least one step stays)."""
     batch, steps = x.shape[:2]
     count = min(round(share * steps), steps - 1)
+    # A random order of the steps: those numbered below ``count`` go, exactly as many in every sample.
     order = draw.uniform(batch, steps).argsort(1)
     kept = (order >= count).to(device=x.device, dtype=x.dtype)
     return x * kept.view(batch, steps, *(1,) * (x.ndim - 2))
@@ -207,6 +208,7 @@ def _image(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
     y = torch.where(draw.coins(x, 0.8), y * (0.6 + 0.8 * gain) + 0.4 * spread * (2 * offset - 1), y)
     y = torch.where(draw.coins(x, 0.2), y.mean(2, keepdim=True).expand_as(y), y)
     kernel = _constant((1.0, 2.0, 1.0), x.device).to(x.dtype)
+    # Binomial blur [1 2 1]ᵀ[1 2 1]/16, each channel by itself.
     kernel = (kernel[:, None] * kernel / 16.0).expand(x.shape[2], 1, 3, 3)
     blurred = functional.conv2d(y.flatten(0, 1), kernel, padding=1, groups=x.shape[2]).unflatten(0, x.shape[:2])
     y = torch.where(draw.coins(x), blurred, y)

@@ -77,6 +77,7 @@ class ArrayBatches:
 
     def __len__(self) -> int:
         """Count the batches of an epoch."""
+        # Every process gets equally many sweeps (the rest is left out), or one would wait for the others for ever.
         return math.ceil(len(self.labels) // self.part[1] / (self.batch_size // self.part[1]))
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
@@ -87,8 +88,10 @@ class ArrayBatches:
         count, size = len(self.labels) // parts * parts, self.batch_size // parts
         order = torch.arange(len(self.labels))
         if self.shuffle:
+            # The order depends on seed and epoch alone, so going on in mid-epoch needs no state of a generator.
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
             order = torch.randperm(len(self.labels), generator=generator)
+        # Every number-th sweep of one shuffled order: processes together see the batches that one process would.
         mine = order[:count][rank::parts]
         while self._batch < len(self):
             chosen = mine[self._batch * size : (self._batch + 1) * size]

@@ -65,6 +65,7 @@ def topk(answers: torch.Tensor, labels: torch.Tensor, k: int) -> int:
     Ties count against the network: a constant answer knows nothing. NaN answers are wrong.
     """
     own = answers.gather(1, labels[:, None])
+    # The label's own answer is among those not smaller, so it is taken off.
     ahead = (answers >= own).sum(1) - 1
     return int(((ahead < k) & torch.isfinite(own[:, 0])).sum())
 
@@ -116,6 +117,7 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
         raise DataError("There is nothing to evaluate on: the data set gave no batch.")
     spread = math.nan
     if moments:
+        # A coordinate of a random unit vector in F dimensions has standard deviation 1/√F, so × √F makes it 1.
         mean, square = moments[0] / seen
         spread = float((square - mean.square()).clamp_min(0).sqrt().mean() * math.sqrt(len(mean)))
     reason = collapse(len(predictions), len(labelled), spread)
@@ -171,6 +173,7 @@ def fit_probe(
     generator = torch.Generator().manual_seed(seed)
     layer = Linear(features.shape[1], classes).to(features.device)
     with torch.no_grad():
+        # Variance 1/fan_in from a generator of its own, so that the probe does not depend on what was drawn before.
         bound = (3.0 / features.shape[1]) ** 0.5
         layer.weight.copy_((2 * torch.rand(layer.weight.shape, generator=generator) - 1) * bound)
     optimizer = make_optimizer(PROBE.optimizer, layer.parameters(), PROBE.learning_rate)
@@ -182,6 +185,7 @@ def fit_probe(
             functional.cross_entropy(layer(features[chosen]), labels[chosen]).backward()
             optimizer.step()
     with torch.no_grad():
+        # w·(x − m)/s + b = (w/s)·x + (b − (w/s)·m): standardisation becomes part of the layer.
         layer.weight.div_(scale)
         layer.bias.sub_(layer.weight @ mean)
     model.decoder = layer

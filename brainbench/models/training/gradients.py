@@ -109,12 +109,14 @@ class Gradients:
         with self.autocast():
             loss, _ = self.forward(given[:-1], given[-1])
         loss.backward()
+        # One norm over all tensors keeps the direction of the step; an infinite limit measures it alone.
         trained = [parameter for parameter in self.parameters if parameter.grad is not None]
         return loss.detach(), torch.nn.utils.clip_grad_norm_(trained, self.clip or float("inf"))
 
     def _record(self, given: tuple[torch.Tensor, ...]) -> None:
         device = given[0].device
         self._inputs = tuple(item.clone() for item in given)
+        # The runs before a recording draw random numbers and move averages of batch norm; both are put back after it.
         buffers = {name: value.clone() for name, value in self.module.named_buffers()} if self.module else {}
         random = torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()
 

@@ -35,18 +35,22 @@ def nt_xent(first: torch.Tensor, second: torch.Tensor, *, temperature: float = T
     # Mixed precision would round cosines to three digits before they are divided by the temperature.
     with torch.autocast(own.device.type, enabled=False):
         similarity = own @ every.T / temperature
+    # A view is no candidate of its own: the softmax runs over the 2 B − 1 others.
     similarity = similarity.index_put((row, itself), torch.full((), -torch.inf, device=own.device).expand(len(own)))
+    # Both views of a sweep stand side by side, so indices of partners differ in the last bit.
     return functional.cross_entropy(similarity, itself ^ 1)
 
 
 def simsiam_loss(p1: torch.Tensor, z1: torch.Tensor, p2: torch.Tensor, z2: torch.Tensor) -> torch.Tensor:
     """Return −½ (cos(p1, stop(z2)) + cos(p2, stop(z1))), averaged over [B, D] (Chen & He 2021, equation 4)."""
+    # No gradient flows into z: that keeps both branches from one constant answer (Chen & He 2021).
     first = functional.cosine_similarity(p1.float(), z2.detach().float()).mean()
     return -0.5 * (first + functional.cosine_similarity(p2.float(), z1.detach().float()).mean())
 
 
 def autoencoder_loss(reconstruction: torch.Tensor, target: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
     """Return .5 mean squared error + 1e-4 mean |latent| (thesis, chapter 3)."""
+    # The mean of absolute values makes the latent representation sparse, as the thesis asks (section 3.3.3).
     error = functional.mse_loss(reconstruction.float(), target.float())
     return RECONSTRUCTION_WEIGHT * error + SPARSITY_WEIGHT * latent.float().abs().mean()
 

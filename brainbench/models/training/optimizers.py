@@ -64,6 +64,7 @@ class LARS(Optimizer):
                 if weight.grad is None:
                     continue
                 update = weight.grad
+                # Trust ratio η ‖w‖/‖g + λ w‖ of each tensor (You, Gitman & Ginsburg 2017); 1 where either is zero.
                 if weight.ndim > 1:
                     update = update + group["weight_decay"] * weight
                     size, length = weight.norm(), update.norm()
@@ -117,13 +118,16 @@ def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int 
     if schedule == "constant":
         return 1.0
     if schedule == "step":
+        # StepLR (thesis, table 3.2): a tenth every 30 epochs, constant within them.
         return STEP_FACTOR ** (int(epoch) // STEP_EPOCHS)
     if schedule != "cosine":
         raise unknown_name("schedule", schedule, SCHEDULES)
     # A run shorter than the published one keeps the share of its warm-up below half.
     warmup = min(warmup_epochs, epochs / 2)
+    # Linear rise from the warm-up ratio of table 3.2: steps stay small while gradients are still large.
     if epoch < warmup:
         return WARMUP_RATIO + (1 - WARMUP_RATIO) * epoch / warmup
+    # Cosine annealing ½(1 + cos πt) to zero, with t from the end of the warm-up (thesis, table 3.2).
     done = (epoch - warmup) / max(epochs - warmup, 1e-9)
     return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
 

@@ -203,6 +203,7 @@ class _Run:
         factor = rate_factor(
             config.schedule, self.at.step / steps, epochs=config.epochs, warmup_epochs=config.warmup_epochs
         )
+        # The rate is a function of the step alone, so a resumed run needs no state of a scheduler.
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * factor
         found = self.gradients(views, labels)
@@ -230,6 +231,7 @@ class _Run:
         self.at.total, self.at.count = 0.0, 0
         self.log.write("epoch", self.at.step, epoch=self.at.epoch, loss=loss)
         score = self._validate(loss)
+        # Strictly better, so of equal epochs the first is kept, and a NaN never is.
         if score < self.at.best:
             self.at.best, self.at.best_epoch = score, self.at.epoch
             if self.where.first:
@@ -374,11 +376,13 @@ class _Run:
     def _precision(self) -> Any:
         if self.config.precision == "float32":
             return nullcontext()
+        # bfloat16 has the range of single precision, so losses need no scaling.
         return torch.autocast(self.where.device.type, dtype=torch.bfloat16)
 
 
 def _generator(seed: int, step: int, view: int) -> torch.Generator:
     """Return random numbers that depend on nothing but where training stands, so that no state need be kept."""
+    # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
     return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)
 
 

@@ -31,6 +31,7 @@ def _normalised(
     inverse = tl.full((rows.shape[0],), 1.0, tl.float32)
     hat = value
     if NORM:
+        # Layer norm over channels; the row is in registers, so the mean is taken first and no digits cancel.
         mean = tl.sum(value, 1) / C
         centred = tl.where(inside, value - mean[:, None], 0.0)
         inverse = 1.0 / tl.sqrt(tl.sum(centred * centred, 1) / C + EPS)
@@ -43,6 +44,7 @@ def _normalised(
 
 @triton.jit
 def _tanh(x):
+    # tanh v = 2σ(2v) − 1, which saturates without overflow.
     return 2.0 * tl.sigmoid(2.0 * x) - 1.0
 
 
@@ -81,12 +83,14 @@ def gates_kernel(
     output, _, _ = _normalised(fused, norms, rows, c, inside, 3, C, NORM, EPS)
     seen = tl.load(_at(x, rows, c, x_batch, PLACES, X_PLACE), mask=inside, other=0.0).to(tl.float32)
     to = (rows.to(tl.int64) * C)[:, None] + c[None, :]
+    # Output of the cell, h = y x + (1 − y) n (thesis, text after equation 3.3).
     answer = through * seen + (1.0 - through) * tl.maximum(output, 0.0)
     tl.store(y + to, answer.to(y.dtype.element_ty), mask=inside)
     keep, _, _ = _normalised(fused, norms, rows, c, inside, 0, C, NORM, EPS)
     keep = tl.sigmoid(keep + 1.0)
     candidate, _, _ = _normalised(fused, norms, rows, c, inside, 1, C, NORM, EPS)
     old = tl.load(_at(state, rows, c, state_batch, PLACES, STATE_PLACE), mask=inside, other=0.0).to(tl.float32)
+    # State of the cell, s = p s + (1 − p) m (thesis, text after equation 3.3).
     new = keep * old + (1.0 - keep) * _tanh(candidate)
     tl.store(after + to, new.to(after.dtype.element_ty), mask=inside)
 
@@ -98,6 +102,7 @@ def _store_gate(
     """Write the gradient of a gate's pre-activation from that of its normalised form."""
     if NORM:
         weight = tl.load(norms + GATE * C + c, mask=c < C, other=0.0).to(tl.float32)
+        # Layer norm taken back: (g − mean g − x̂ mean(g x̂))/σ with g the scaled gradient and x̂ the normalised value.
         scaled = gradient * weight[None, :]
         mean = tl.sum(scaled, 1) / C
         along = tl.sum(scaled * hat, 1) / C
@@ -161,6 +166,7 @@ def gates_backward_kernel(
         through = tl.sigmoid(through + 1.0)
         seen = tl.load(_at(x, rows, c, x_batch, PLACES, X_PLACE), mask=inside, other=0.0).to(tl.float32)
         tl.store(d_x + to, (got * through).to(d_x.dtype.element_ty), mask=inside)
+        # With σ' = σ(1 − σ): the output gate gets ∂L/∂h (x − n) y (1 − y), its candidate ∂L/∂h (1 − y) where n > 0.
         gradient = got * (seen - tl.maximum(output, 0.0)) * through * (1.0 - through)
         _store_gate(d_fused, norms, gradient, through_hat, through_inverse, rows, c, inside, 2, C, NORM)
         if NORM:
@@ -179,6 +185,7 @@ def gates_backward_kernel(
         keep, candidate = tl.sigmoid(keep + 1.0), _tanh(candidate)
         old = tl.load(_at(state, rows, c, state_batch, PLACES, STATE_PLACE), mask=inside, other=0.0).to(tl.float32)
         tl.store(d_state + to, (got * keep).to(d_state.dtype.element_ty), mask=inside)
+        # The state gate gets ∂L/∂s (s − m) p (1 − p), its candidate ∂L/∂s (1 − p)(1 − m²).
         gradient = got * (old - candidate) * keep * (1.0 - keep)
         _store_gate(d_fused, norms, gradient, keep_hat, keep_inverse, rows, c, inside, 0, C, NORM)
         if NORM:

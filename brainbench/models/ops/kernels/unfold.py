@@ -73,9 +73,11 @@ def unfold_kernel(
     inner = tl.arange(0, BLOCK)
     unit = (start + inner).to(tl.uint32)
     inside = start + inner < total
+    # The flat index is (stimulus, place, tap, channel), channels innermost.
     window, c = unit // WIDTH, (unit % WIDTH).to(tl.int32)
     r, tap = window // (KERNEL_H * KERNEL_W), (window % (KERNEL_H * KERNEL_W)).to(tl.int32)
     stimulus, place = r // (OUT_H * OUT_W), (r % (OUT_H * OUT_W)).to(tl.int32)
+    # Place of the input under this tap; taps outside the grid read the zeros of the padding.
     h, w = place // OUT_W - TOP + tap // KERNEL_W, place % OUT_W - LEFT + tap % KERNEL_W
     there = inside & (h >= 0) & (h < H) & (w >= 0) & (w < W)
     value = _from(x0, stimulus, batch0, h, w, row0, place0, c, there, 0, C0, UNIT)
@@ -111,8 +113,10 @@ def unfold_into(
     channels = [x.shape[1] for x in inputs] + [0] * (SLOTS - len(inputs))
     used = [*inputs, *(inputs[0] for _ in range(SLOTS - len(inputs)))]
     strides = [[x.stride(axis) for x in used] for axis in (0, 2, 3)]
+    # Largest common divisor of strides and channels, up to 8 numbers: 16 bytes in half precision, one access to memory.
     unit = math.gcd(8, *channels, *(value for axis in strides for value in axis))
     total = out.numel() // unit
+    # The kernel takes its index apart as a 32-bit number, which limits one launch.
     if total >= 2**32:
         raise ValueError(f"{out.numel():,} numbers of windows are too many for one kernel; compute fewer at a time.")
     block = TILE // unit
