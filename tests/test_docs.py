@@ -191,7 +191,8 @@ def test_the_notebook_runs_and_gives_what_is_shown(tmp_path: Path, monkeypatch: 
 def test_the_metric_of_the_statistics_page_scores(tmp_path: Path):
     import numpy as np
 
-    from brainbench.metrics import Trials, get_metric
+    from brainbench.core.trials import Trials
+    from brainbench.metrics import get_metric
 
     (block,) = _blocks("docs/statistics.md", "python")
     path = tmp_path / "mine.py"
