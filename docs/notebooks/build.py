@@ -19,16 +19,16 @@ CELLS: tuple[tuple[str, str], ...] = (
         "markdown",
         """# From simulation to leaderboard
 
-One pass through brainbench in Python: whiskers brush an object, networks receive the forces, their geometry is compared
-with that of (synthetic) animals, and the scores become a leaderboard. Nothing here needs a network connection; the
-recordings are made up, so ranks on them say nothing about brains.""",
+This notebook shows the main steps of brainbench in Python: whiskers touch an object, networks process the forces, the
+networks' activity is compared with that of (synthetic) animals, and the scores become a leaderboard. No network connection
+is needed. The recordings are synthetic, so the scores are no evidence about real brains.""",
     ),
     (
         "markdown",
         """## 1. Whiskers on an object
 
-A scene is an array, objects and a motion. Four whiskers of row C whisk against a pole; everything is SI inside, lengths in
-scene files are mm.""",
+A scene is an array, objects and a motion. Four whiskers of row C whisk against a pole. Lengths in scene
+files are in mm; all results are in SI units.""",
     ),
     (
         "code",
@@ -70,8 +70,8 @@ print(dict(felt["wrench"].sizes), felt["wrench"].units)""",
     ),
     (
         "markdown",
-        """What is recorded is the action of each whisker on its base: three forces and three moments. Here is the bending moment of
-the whisker that feels most, for both distances.""",
+        """The result is the force (three components) and the moment (three components) of each whisker on its base. Here is the moment
+of the whisker with the largest one, for both distances.""",
     ),
     (
         "code",
@@ -91,10 +91,10 @@ plt.show()""",
     ),
     (
         "markdown",
-        """## 2. A network feels
+        """## 2. A network processes the forces
 
 The recipe `rodgers` is six stimuli: a convex and a concave shape at three distances, as in a published experiment. A model
-maps [B, T, C, H, W] to a decision; every layer on the way is a candidate for comparison.""",
+maps [B, T, C, H, W] to a class; each of its layers can be compared with the animals.""",
     ),
     (
         "code",
@@ -117,8 +117,8 @@ RDM(rdm(values), stimuli.labels, title="encoder.fc7")""",
         "markdown",
         """## 3. The score
 
-Model and animals meet: the layer is chosen on the other animals, the comparison is corrected for the animal's noise, and
-the permutation p repeats the choice for every order of the six stimuli.""",
+Now the model is compared with the animals. For each animal the layer is chosen on the other animals, and the comparison is
+corrected for noise in its recordings. The permutation p repeats the choice of layer for every order of the six stimuli.""",
     ),
     (
         "code",
@@ -135,10 +135,10 @@ for item in record.score.provenance["statistics"]["layer_tests"]:
     ),
     (
         "markdown",
-        """## 4. What the animals do
+        """## 4. The animals
 
 The demo recordings have the layout of a real experiment. Each animal has an RDM and a reliability: how well random halves
-of its trials agree. Nothing is compared with an animal that does not agree with itself.""",
+of its trials agree. Animals with a low reliability are left out.""",
     ),
     (
         "code",
@@ -150,11 +150,12 @@ RDM(record.score.brain_rdm, record.score.stimuli, title="mean over animals")""",
     ("code", """RDM(record.score.model_rdm, record.score.stimuli, title=f"model, {record.score.layer}")"""),
     (
         "markdown",
-        """As much like the animals as they are like one another? And beyond how often the whiskers touched?""",
+        """Is the model as similar to the animals as they are to one another? And how similar is it if the effect of the number of
+contacts is removed?""",
     ),
     (
         "code",
-        """from brainbench.metrics import turing_test
+        """from brainbench.metrics.inference.equivalence import turing_test
 
 print(turing_test(record.score, record.animal_to_animal).summary())
 beyond = score_record("zhuang-intersection-ln-small", metric="rsa-partial", baselines=False)
@@ -165,7 +166,7 @@ print(beyond.score.provenance["statistics"]["variance_partition"])""",
         "markdown",
         """## 5. A leaderboard
 
-A record is one JSON file per score, named by its content. A folder of them is a leaderboard.""",
+Each score is saved as a record, one JSON file. A folder of records is a leaderboard.""",
     ),
     (
         "code",
@@ -185,7 +186,7 @@ sorted(str(path) for path in Path("site").rglob("*.html"))""",
     ),
     (
         "markdown",
-        """Open `site/index.html` in a browser. From here: [real recordings](../recordings.md), [your own
+        """Open `site/index.html` in a browser. Next steps: [real recordings](../recordings.md), [your own
 network](../add-a-model.md), [training](../models.md), [what the statistics claim](../statistics.md).""",
     ),
 )

@@ -16,6 +16,7 @@ OUTSIDE = {
     "results.md": "benchmarks/RESULTS.md",
     "contributing.md": "CONTRIBUTING.md",
     "changes.md": "CHANGELOG.md",
+    "releasing.md": "RELEASING.md",
 }
 """Page → the file of the repository that it shows."""
 NOTEBOOKS = {"notebooks/from-simulation-to-leaderboard.md": "docs/notebooks/from-simulation-to-leaderboard.ipynb"}
