@@ -231,10 +231,10 @@ def environment(gpu: int | None) -> dict[str, str]:
 def make_plan(args: argparse.Namespace, gpus: int) -> Any:
     from brainbench.stimuli import Fidelity
     from brainbench.stimuli.objects.collections import resolve_objects
-    from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+    from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
-    settings = Settings(
+    settings = GenerationSettings(
         fidelity=Fidelity(links=args.links, time_step=args.step),
         backend="rod",
         device="cuda" if gpus else "cpu",
@@ -268,12 +268,14 @@ def make_data(args: argparse.Namespace, gpus: int) -> Path:
 
 def make_shards(args: argparse.Namespace) -> None:
     """Make every n-th shard of the data set."""
-    from brainbench.stimuli.sweeps.manifest import is_whole
+    from brainbench.stimuli.sweeps.manifest import is_complete
     from brainbench.stimuli.sweeps.running import run_here
 
     index, count = map(int, args.shards.split("/"))
     folder = args.work / "data"
-    missing = [task for task in make_plan(args, count).shards[index::count] if not is_whole(folder / task.name, task)]
+    missing = [
+        task for task in make_plan(args, count).shards[index::count] if not is_complete(folder / task.name, task)
+    ]
     if missing:
         run_here(missing, folder, max(1, (os.cpu_count() or 1) // count), lambda done: None)
 

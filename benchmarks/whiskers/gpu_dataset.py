@@ -18,7 +18,7 @@ from brainbench.datasets.whisking.separability import separability
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.generation import generate
-from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
 
@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     folder = args.out or Path(tempfile.mkdtemp())
-    settings = Settings(
+    settings = GenerationSettings(
         fidelity=Fidelity(links=args.links, time_step=args.step),
         backend="rod",
         device=args.device,

@@ -28,7 +28,7 @@ from brainbench.stimuli.objects.collections import NamedObject, resolve_objects
 from brainbench.stimuli.objects.primitives import box
 from brainbench.stimuli.sweeps import running, shards
 from brainbench.stimuli.sweeps.generation import generate
-from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.shards import _write_all, prepare_shard
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
@@ -65,7 +65,7 @@ def plan_published() -> list[list[str]]:
     """Plan the published high-variation set: 9981 objects, 208 sweeps each."""
     items = list(resolve_objects(["procedural-24:416"], surfaces=True).items())[:9981]
     plan = GenerationPlan(
-        "thesis-high", GRIDS["thesis-high"], dict(items), Settings(Fidelity(), backend="rod", device="cuda")
+        "thesis-high", GRIDS["thesis-high"], dict(items), GenerationSettings(Fidelity(), backend="rod", device="cuda")
     )
     took = seconds(lambda: plan.shards, 1)
     return [
@@ -110,7 +110,7 @@ def write_set(folder: Path, sweeps: int) -> list[list[str]]:
         name: NamedObject(name, "box", "made up", partial(box, (1.0, 1.0, 1.0)))
         for name in (f"box-{index}" for index in range(sweeps // 16))
     }
-    plan = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, Settings(Fidelity(), shard_size=2048))
+    plan = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, GenerationSettings(Fidelity(), shard_size=2048))
     run, running.run_here = (
         running.run_here,
         lambda tasks, where, workers, done: running.run_pipelined(tasks, where, 1, done),

@@ -8,7 +8,7 @@ import math
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
 GRID = dataclasses.replace(
@@ -32,7 +32,7 @@ def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):
 def small_plan(objects=("brick:2", "cone:2"), *, whiskers="C3", grid=GRID, fidelity=None, **settings):
     found = resolve_objects(objects, collision="hull")
     # An engine that takes sweeps as any other scenes, and refuses none of these.
-    chosen = Settings(fidelity or Fidelity.preset("fast"), **{"backend": "mujoco", **settings})
+    chosen = GenerationSettings(fidelity or Fidelity.preset("fast"), **{"backend": "mujoco", **settings})
     return GenerationPlan("small", grid, found, chosen, whiskers)
 
 

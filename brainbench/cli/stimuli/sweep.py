@@ -17,7 +17,7 @@ from brainbench.stimuli.engines import DEFAULT_ENGINE
 if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.plan import GenerationPlan
 
-SETTINGS = "brainbench.stimuli.sweeps.plan:Settings"
+SETTINGS = "brainbench.stimuli.sweeps.plan:GenerationSettings"
 OFFERED = ("split", "limit", "sample", "seed", "device", "shard_size", "retry")
 _SHOWN = 8
 
@@ -60,7 +60,7 @@ def sweep(
     """
     from brainbench.stimuli import Fidelity, get_engine
     from brainbench.stimuli.objects.collections import resolve_objects
-    from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+    from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes, counts
 
     if grid not in GRIDS:
@@ -72,7 +72,7 @@ def sweep(
         [*(objects or ()), *(more_objects or ())], unit=unit, collision=collision, surfaces=surfaces
     )
     scenes = SweepScenes(GRIDS[grid], {name: item.load for name, item in found.items()}, whiskers=whiskers)
-    settings = Settings(Fidelity.parse(fidelity), backend=backend, **options)
+    settings = GenerationSettings(Fidelity.parse(fidelity), backend=backend, **options)
     plan = GenerationPlan(grid, GRIDS[grid], found, settings, whiskers)
     summary = counts(scenes)
     shown = {

@@ -30,7 +30,8 @@ QUANTITIES = {
     "M": CHANNELS[3:],
 }
 """Quantities that can be plotted: one channel, the three components together, or (``F``, ``M``) their magnitude."""
-LINE_COLORS = ("#d1495b", "#2a9d6f", "#3466ac")
+LINE_COLORS = ("#d1495b", "#35b07f", "#1f3a93")
+"""Colours of x, y and z, of different lightness too."""
 CONTACT_COLOR = "#f3d9a4"
 _UNITS = {"F": ("mN", 1e3), "M": ("µN·m", 1e6)}
 

@@ -23,10 +23,28 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class ConvexPart:
-    """The convex hull of ``vertices`` [m, 3]: at least four points that do not lie in one plane."""
+class _Polyhedron:
+    """Base of the bodies that their vertices describe."""
 
     vertices: NDArray[np.float64]
+    """[m, 3] (m)."""
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
+        """Return the body rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        return replace(self, vertices=self.vertices @ rotation.T + translation)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the body scaled about the origin."""
+        return replace(self, vertices=self.vertices * factor)
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexPart(_Polyhedron):
+    """The convex hull of ``vertices`` [m, 3]: at least four points that do not lie in one plane."""
 
     def __post_init__(self) -> None:
         points = np.array(self.vertices, dtype=float)
@@ -40,26 +58,13 @@ class ConvexPart:
         points.setflags(write=False)
         object.__setattr__(self, "vertices", points)
 
-    def bounds(self) -> NDArray[np.float64]:
-        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
-        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
-    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ConvexPart:
-        """Return the part rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
-        return ConvexPart(self.vertices @ rotation.T + translation)
-
-    def scaled(self, factor: float) -> ConvexPart:
-        """Return the part scaled about the origin."""
-        return ConvexPart(self.vertices * factor)
-
 
 @dataclass(frozen=True, eq=False)
-class TriangleMesh:
+class TriangleMesh(_Polyhedron):
     """A closed surface of any shape, concavities included: vertices [m, 3] (m) and faces [k, 3], outward by the
     right-hand rule.
     """
 
-    vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
 
     def __post_init__(self) -> None:
@@ -75,10 +80,6 @@ class TriangleMesh:
         object.__setattr__(self, "vertices", points)
         object.__setattr__(self, "faces", faces)
 
-    def bounds(self) -> NDArray[np.float64]:
-        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
-        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
     @cached_property
     def boxes(self) -> NDArray[np.float64]:
         """Axis-aligned boxes [k, 2, 3] of at most 64 patches of neighbouring triangles: together they hold all of it.
@@ -92,14 +93,6 @@ class TriangleMesh:
         while len(patches) < 64 and len(patches[0]) > 1:
             patches = [half for patch in patches for half in _halves(patch, middle[patch]) if len(half)]
         return np.array([[low[patch].min(axis=0), high[patch].max(axis=0)] for patch in patches])
-
-    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> TriangleMesh:
-        """Return the surface rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
-        return TriangleMesh(self.vertices @ rotation.T + translation, self.faces)
-
-    def scaled(self, factor: float) -> TriangleMesh:
-        """Return the surface scaled about the origin."""
-        return TriangleMesh(self.vertices * factor, self.faces)
 
 
 @dataclass(frozen=True)

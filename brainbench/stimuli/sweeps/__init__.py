@@ -14,15 +14,15 @@ from brainbench.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.generation import generate
     from brainbench.stimuli.sweeps.grid import Span, Sweep, SweepGrid
-    from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+    from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
-__all__ = ["GRIDS", "GenerationPlan", "Settings", "Span", "Sweep", "SweepGrid", "SweepScenes", "generate"]
+__all__ = ["GRIDS", "GenerationPlan", "GenerationSettings", "Span", "Sweep", "SweepGrid", "SweepScenes", "generate"]
 
 _MODULES = {
     ".generation": ("generate",),
     ".grid": ("Span", "Sweep", "SweepGrid"),
-    ".plan": ("GenerationPlan", "Settings"),
+    ".plan": ("GenerationPlan", "GenerationSettings"),
     ".sweep_scenes": ("GRIDS", "SweepScenes"),
 }
 __getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

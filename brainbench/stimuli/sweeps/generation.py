@@ -17,7 +17,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, to_plain, write_json
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
-from brainbench.stimuli.sweeps.manifest import MANIFEST, is_whole, make_manifest
+from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
 
 if TYPE_CHECKING:
     from brainbench.core.progress import Progress
@@ -68,10 +68,10 @@ def generate(
     get_engine(plan.settings.backend, device=plan.settings.device)
     folder = Path(out).absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    with _alone(folder):
+    with _locked(folder):
         _check_config(plan, folder)
         _clean(folder)
-        missing = [task for task in plan.shards if not is_whole(folder / task.name, task)]
+        missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
         _check_space(missing, folder)
         report = _Report(missing, progress)
         if len(missing) < len(plan.shards):
@@ -113,7 +113,7 @@ def _duration(seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _locked(folder: Path) -> Iterator[None]:
     """Hold a lock on the folder, which the system releases when this process ends in whatever way."""
     try:
         import fcntl

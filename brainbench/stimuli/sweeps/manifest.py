@@ -23,7 +23,7 @@ MANIFEST = "manifest.json"
 _COUNTS = ("steps", "steps_in_full", "retried", "unstable", "unusable")
 
 
-def is_whole(path: Path, task: ShardTask) -> bool:
+def is_complete(path: Path, task: ShardTask) -> bool:
     """Return whether the file of a shard is there and complete.
 
     Raises:

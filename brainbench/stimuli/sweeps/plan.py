@@ -34,7 +34,7 @@ GPU_SHARD = 2048
 
 
 @dataclass(frozen=True)
-class Settings:
+class GenerationSettings:
     """Options of a data set of sweeps.
 
     Raises:
@@ -99,7 +99,7 @@ class ShardTask:
     """[sweep] number among all sweeps of the grid over all objects."""
     classes: tuple[str, ...]
     """Class labels of the whole data set, sorted."""
-    settings: Settings
+    settings: GenerationSettings
     config: Mapping[str, Any]
     config_hash: str
 
@@ -125,7 +125,7 @@ class GenerationPlan:
     """Name of the grid, for people."""
     grid: SweepGrid
     objects: Mapping[str, NamedObject]
-    settings: Settings
+    settings: GenerationSettings
     whiskers: str = "all"
     """A selection; see :meth:`WhiskerArray.select`."""
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.devices import usable_processors
 from brainbench.core.errors import DataError, UsageError, missing_dependency
-from brainbench.stimuli.sweeps.shards import Prepared, make_shard, prepare_shard, simulate_shard, write_shard
+from brainbench.stimuli.sweeps.shards import PreparedShard, make_shard, prepare_shard, simulate_shard, write_shard
 
 if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.plan import ShardTask
@@ -150,8 +150,8 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
 
 def _built_ahead(
     tasks: Sequence[ShardTask], builders: ProcessPoolExecutor, ahead: int
-) -> Iterator[tuple[ShardTask, Prepared]]:
-    coming: deque[tuple[ShardTask, Future[Prepared]]] = deque()
+) -> Iterator[tuple[ShardTask, PreparedShard]]:
+    coming: deque[tuple[ShardTask, Future[PreparedShard]]] = deque()
     for task in tasks:
         coming.append((task, builders.submit(prepare_shard, task)))
         if len(coming) > ahead:

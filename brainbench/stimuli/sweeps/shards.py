@@ -47,7 +47,7 @@ class ShardContent:
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class PreparedShard:
     """Objects and tables of a shard before it is simulated; made by another process while the GPU works."""
 
     solids: tuple[Solid | None, ...]
@@ -63,7 +63,7 @@ def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
     return write_shard(simulate_shard(task, prepare_shard(task), workers), folder)
 
 
-def prepare_shard(task: ShardTask) -> Prepared:
+def prepare_shard(task: ShardTask) -> PreparedShard:
     """Build the objects of a shard and list its sweeps."""
     solids: list[Solid | None] = []
     reasons = []
@@ -75,10 +75,10 @@ def prepare_shard(task: ShardTask) -> Prepared:
             solids.append(None)
             reasons.append(str(error) or type(error).__name__)
     hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
-    return Prepared(tuple(solids), tuple(reasons), {**_tables(task, hashes), **_conditions(task)})
+    return PreparedShard(tuple(solids), tuple(reasons), {**_tables(task, hashes), **_conditions(task)})
 
 
-def simulate_shard(task: ShardTask, prepared: Prepared, workers: int | None = None) -> ShardContent:
+def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None = None) -> ShardContent:
     """Simulate the sweeps of a shard past its objects."""
     count, frames = task.grid.count, task.grid.frames
     whiskers = len(task.config["whiskers"]["names"])

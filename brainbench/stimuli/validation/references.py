@@ -184,10 +184,10 @@ class _Branch:
                 low = before
 
                 def miss(angle: float, low: tuple = low) -> float:
-                    return self._height(angle, self._settle(angle, low[1])) - target
+                    return self._height(angle, self._solve(angle, low[1])) - target
 
                 root = cast("float", brentq(miss, low[0], slope, xtol=1e-13))
-                return self._contact(root, self._settle(root, guess))
+                return self._contact(root, self._solve(root, guess))
             before = (slope, guess)
         raise UsageError(
             f"A peg at ({self.at:g}, {offset:g}) m has no equilibrium with this whisker: it slips off at an offset "
@@ -210,8 +210,8 @@ class _Branch:
         return self.side * max(points[top][2], -float(found.fun))
 
     def _height_or_nothing(self, slope: float, guess: NDArray) -> float:
-        settled = self._settle(slope, guess)
-        return self._height(slope, settled) if self._valid(settled) else 0.0
+        solution = self._solve(slope, guess)
+        return self._height(slope, solution) if self._valid(solution) else 0.0
 
     def _walk(self):  # noqa: ANN202
         """Yield (slope, (force, arc), peg offset) from the first touch on, while equilibria exist."""
@@ -220,22 +220,22 @@ class _Branch:
         guess = np.array([0.0, self._rest_arc()])
         # Near the fold the rod turns back over the peg: slopes beyond 90° are equilibria too.
         while slope < math.pi + rest:
-            settled = self._settle(slope, guess)
-            height = self._height(slope, settled)
-            if not self._valid(settled):
+            solution = self._solve(slope, guess)
+            height = self._height(slope, solution)
+            if not self._valid(solution):
                 return
-            yield slope, settled, height
-            guess = settled if previous is None else 2 * settled - previous
-            previous, slope = settled, slope + self._STRIDE
+            yield slope, solution, height
+            guess = solution if previous is None else 2 * solution - previous
+            previous, slope = solution, slope + self._STRIDE
 
-    def _valid(self, settled: NDArray) -> bool:
-        return bool(np.isfinite(settled).all()) and settled[1] <= self.whisker.arc_length
+    def _valid(self, solution: NDArray) -> bool:
+        return bool(np.isfinite(solution).all()) and solution[1] <= self.whisker.arc_length
 
     def _rest_arc(self) -> float:
         u = 2 * self.curvature * self.at
         return self.at if abs(u) < 1e-9 else (u * math.sqrt(1 + u * u) + math.asinh(u)) / (4 * self.curvature)
 
-    def _settle(self, slope: float, guess: NDArray) -> NDArray[np.float64]:
+    def _solve(self, slope: float, guess: NDArray) -> NDArray[np.float64]:
         """Return (force, arc) at one contact slope by Newton's method; NaN when it finds none."""
         force_scale = float(self.whisker.bending_stiffness(0.0)) / self.at**2
         scale = np.array([force_scale, self.at])
@@ -257,17 +257,17 @@ class _Branch:
         angle, x, _, _ = self._integrate(slope, force, arc)
         return np.array([angle, (x - self.at + self._gap(arc) * math.sin(slope)) / self.at])
 
-    def _height(self, slope: float, settled: NDArray) -> float:
+    def _height(self, slope: float, solution: NDArray) -> float:
         """Return the offset of the peg that belongs to an equilibrium."""
-        if not np.isfinite(settled).all():
+        if not np.isfinite(solution).all():
             return math.nan
-        return self._integrate(slope, *settled)[2] - self._gap(settled[1]) * math.cos(slope)
+        return self._integrate(slope, *solution)[2] - self._gap(solution[1]) * math.cos(slope)
 
     def _gap(self, arc: float) -> float:
         return 0.0 if self.peg_radius is None else self.peg_radius + float(self.whisker.radius(arc))
 
-    def _contact(self, slope: float, settled: NDArray) -> Contact:
-        force, arc = map(float, settled)
+    def _contact(self, slope: float, solution: NDArray) -> Contact:
+        force, arc = map(float, solution)
         _, x, y, moment = self._integrate(slope, force, arc)
         return Contact(
             force=(-force * math.sin(slope), self.side * force * math.cos(slope)),

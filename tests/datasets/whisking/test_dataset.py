@@ -14,7 +14,7 @@ from brainbench.stimuli import Fidelity, SweepGrid, simulate, to_grid
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.sweeps.generation import generate
-from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from tests.factories.sweep_batches import GRID, small_plan
 
@@ -234,7 +234,7 @@ def test_a_class_without_test_objects_leaves_an_empty_split_in_words(tmp_path):
 def test_many_shards_are_read_with_few_open_files(tmp_path, monkeypatch):
     grid = SweepGrid(frames=Frames(count=10))
     plan = GenerationPlan("still", grid, resolve_objects(["brick:40"], collision="hull"),
-                          Settings(Fidelity.preset("fast"), shard_size=1), "C3")  # fmt: skip
+                          GenerationSettings(Fidelity.preset("fast"), shard_size=1), "C3")  # fmt: skip
     generate(plan, tmp_path, workers=1)
     monkeypatch.setattr("brainbench.datasets.whisking.dataset.most_open", lambda: 5)
     data = WhiskingDataset(tmp_path, split="all", batch_size=7)

@@ -9,14 +9,14 @@ from brainbench.cli.stimuli import simulate as simulate_command
 from brainbench.stimuli import load_stimuli, simulation, tradeoff, whisker_shapes
 from brainbench.stimuli.engines import DEFAULT_ENGINE, fidelity, get_engine, list_engines
 from brainbench.stimuli.figures import scenes
-from brainbench.stimuli.sweeps.plan import Settings
+from brainbench.stimuli.sweeps.plan import GenerationSettings
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.validation import bench_tests
 
 ASKED = (
     simulation.simulate, simulation.prepare, load_stimuli, whisker_shapes.record, scenes.render, simulate_sweeps,
     bench_tests.peg, bench_tests.point_load, bench_tests.ringdown, bench_tests.slip_off, fidelity.measured,
-    fidelity.Fidelity.auto, Settings, tradeoff.SimulationSetting, draw.render, draw.plot,
+    fidelity.Fidelity.auto, GenerationSettings, tradeoff.SimulationSetting, draw.render, draw.plot,
     simulate_command.simulate, sweep.sweep,
 )  # fmt: skip
 

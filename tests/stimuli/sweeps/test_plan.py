@@ -6,7 +6,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.sweeps.plan import GenerationPlan, Settings
+from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 from tests.factories.sweep_batches import small_plan
 
@@ -68,12 +68,12 @@ def test_a_sample_is_a_random_fraction_and_a_limit_the_first_sweeps():
 def test_the_published_grids_are_planned_quickly_and_small():
     objects = resolve_objects(["procedural-24:40"])
     plan = GenerationPlan(
-        "thesis-high", GRIDS["thesis-high"], objects, Settings(FAST, backend="mujoco", shard_size=2048)
+        "thesis-high", GRIDS["thesis-high"], objects, GenerationSettings(FAST, backend="mujoco", shard_size=2048)
     )
     assert plan.sweeps == 960 * 208
     assert sum(map(len, plan.shards)) == plan.sweeps
     assert len(plan.shards) == sum(math.ceil(split * 208 * 24 / 2048) for split in (32, 4, 4))
-    low = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, Settings(FAST))
+    low = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, GenerationSettings(FAST))
     assert sum(task.bytes for task in low.shards) == pytest.approx(960 * 16 * 110 * 30 * 24, rel=0.05)
 
 
@@ -93,11 +93,11 @@ def test_what_determines_the_bytes_is_in_the_hash():
 
 
 def test_shards_are_small_where_sweeps_are_slow():
-    sizes = [Settings(FAST, backend=backend, device=device).sweeps_per_shard for backend, device in
+    sizes = [GenerationSettings(FAST, backend=backend, device=device).sweeps_per_shard for backend, device in
              (("bullet", "cpu"), ("mujoco", "cpu"), ("rod", "cpu"), ("rod", "cuda"))]  # fmt: skip
     assert sizes == sorted(sizes)
     assert len(set(sizes)) == 4
-    assert Settings(FAST, shard_size=7).sweeps_per_shard == 7
+    assert GenerationSettings(FAST, shard_size=7).sweeps_per_shard == 7
 
 
 @pytest.mark.parametrize(
@@ -111,4 +111,4 @@ def test_shards_are_small_where_sweeps_are_slow():
 )
 def test_settings_out_of_range_are_named(options, message):
     with pytest.raises(UsageError, match=message):
-        Settings(FAST, **options)
+        GenerationSettings(FAST, **options)

@@ -9,7 +9,7 @@ import pytest
 from brainbench.core.errors import DataError
 from brainbench.core.files import hash_arrays
 from brainbench.stimuli import simulate
-from brainbench.stimuli.sweeps.manifest import is_whole
+from brainbench.stimuli.sweeps.manifest import is_complete
 from brainbench.stimuli.sweeps.shards import (
     ALIGNMENT,
     OK,
@@ -130,9 +130,9 @@ def test_a_shard_that_was_cut_off_is_not_whole(tmp_path, kept):
     task = small_plan().shards[0]
     write_shard(simulate_shard(task, prepare_shard(task)), tmp_path)
     path = tmp_path / task.name
-    assert is_whole(path, task)
+    assert is_complete(path, task)
     path.write_bytes(path.read_bytes()[:kept])
-    assert not is_whole(path, task)
+    assert not is_complete(path, task)
 
 
 def test_a_shard_of_another_data_set_is_not_taken_for_ones_own(tmp_path):
@@ -140,7 +140,7 @@ def test_a_shard_of_another_data_set_is_not_taken_for_ones_own(tmp_path):
     make_shard(task, str(tmp_path))
     other = small_plan(seed=1).shards[0]
     with pytest.raises(DataError, match="belongs to another data set"):
-        is_whole(tmp_path / task.name, other)
+        is_complete(tmp_path / task.name, other)
 
 
 def test_a_write_that_the_system_cuts_short_goes_on():
