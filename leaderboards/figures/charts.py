@@ -217,8 +217,7 @@ def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
 def augmentation(entries: Sequence[Entry]) -> Figure:
     """Draw the neural fit under each augmentation, for models trained with several (figure 3.8 c)."""
     title = "Augmentation ablation (as figure 3.8 c)"
-    fixed = lambda entry: _masking(entry) if entry.masking else ""  # noqa: E731
-    return _ablation("augmentation", title, entries, _augmentation, fixed, "augmentation")
+    return _ablation("augmentation", title, entries, _augmentation, _any_masking, "augmentation")
 
 
 def masking(entries: Sequence[Entry]) -> Figure:
@@ -299,6 +298,10 @@ def _augmentation(entry: Entry) -> str:
 
 def _masking(entry: Entry) -> str:
     return f"{entry.masking:.0%} masked" if entry.trained else ""
+
+
+def _any_masking(entry: Entry) -> str:
+    return _masking(entry) if entry.masking else ""
 
 
 def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[Point, ...]:

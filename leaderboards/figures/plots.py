@@ -13,7 +13,7 @@ from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry
 from leaderboards.figures.marks import colour_at
-from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, tick_text
+from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, shorten, tick_text
 from leaderboards.text import number, span
 
 WIDTH = 760.0
@@ -269,8 +269,7 @@ def cut_words(count: int, shown: int = SHOWN) -> str:
 
 def cut(text: str, length: int) -> str:
     """Shorten a label; of a path the last part stays."""
-    text = text.rpartition("/")[2] or text
-    return text if len(text) <= length else text[: length - 1] + "…"
+    return shorten(text.rpartition("/")[2] or text, length)
 
 
 def cut_name(name: str, length: int) -> str:

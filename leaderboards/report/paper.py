@@ -259,53 +259,35 @@ def _write_figures(paper: Paper, path: Path) -> list[Path]:
 
 
 def _markdown(paper: Paper, path: Path) -> str:
-    lines = [f"# {_escape(paper.title)}", ""]
-    if paper.synthetic:
-        lines += [f"> **{words.SYNTHETIC}**", ""]
+    blocks = [f"# {_escape(paper.title)}"]
+    blocks += [f"> **{words.SYNTHETIC}**"] if paper.synthetic else []
     for place, section in enumerate(paper.sections, start=1):
-        lines += [
-            f"## {_escape(section.title)}",
-            "",
-            "### Methods",
-            "",
-            _escape(section.methods),
-            "",
-            "### Results",
-            "",
-        ]
+        blocks += [f"## {_escape(section.title)}", "### Methods", _escape(section.methods), "### Results"]
         for table in section.tables:
-            lines += [_escape(table.caption), "", *_rows(table), ""]
+            blocks += [_escape(table.caption), _rows(table)]
         for figure in section.figures:
             target = _figure_path(path, place, figure).relative_to(path.parent).as_posix().replace(" ", "%20")
-            lines += [
-                f"![{_escape(figure.title)}]({target})",
-                "",
-                f"*{_escape(figure.title)}.* {_escape(figure.caption)}",
-                "",
-            ]
+            title = _escape(figure.title)
+            blocks += [f"![{title}]({target})", f"*{title}.* {_escape(figure.caption)}"]
         if section.absent:
-            lines += ["Not drawn: " + " ".join(f"{f.title}: {f.lacking}." for f in section.absent), ""]
+            blocks.append("Not drawn: " + " ".join(f"{f.title}: {f.lacking}." for f in section.absent))
     if paper.commands:
-        lines += [
-            "## To make these records again",
-            "",
-            "```",
-            *(text.replace("`", "'") for text in paper.commands),
-            "```",
-            "",
-        ]
-    lines += ["## References", "", *(f"- {_escape(item.text)}" for item in paper.references), ""]
-    return "\n".join([*lines, f"BibTeX entries: `{path.with_suffix('.bib').name}`.", ""])
+        commands = "\n".join(text.replace("`", "'") for text in paper.commands)
+        blocks += ["## To make these records again", f"```\n{commands}\n```"]
+    blocks += ["## References", "\n".join(f"- {_escape(item.text)}" for item in paper.references)]
+    blocks.append(f"BibTeX entries: `{path.with_suffix('.bib').name}`.")
+    return "\n\n".join(blocks) + "\n"
 
 
-def _rows(table: PaperTable) -> list[str]:
+def _rows(table: PaperTable) -> str:
     ends = ["---:" if number else "---" for number in table.numbers]
     lines = [table.columns, ends, *([_escape(cell) for cell in row] for row in table.rows)]
-    return ["| " + " | ".join(line) + " |" for line in lines]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+_ESCAPED = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<": "&lt;", ">": "&gt;"})
 
 
 def _escape(text: str) -> str:
     """Escape what Markdown or HTML inside it would read as markup."""
-    for mark in "\\`*_{}[]<>|#!":
-        text = text.replace(mark, f"\\{mark}" if mark not in "<>" else {"<": "&lt;", ">": "&gt;"}[mark])
-    return " ".join(text.split())
+    return " ".join(text.translate(_ESCAPED).split())
