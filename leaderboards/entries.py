@@ -68,7 +68,7 @@ class Entry(Ranked):
 
     @property
     def unranked_because(self) -> str:
-        """Why it has no rank; empty when it has one."""
+        """Reason why it has no rank; empty when it has one."""
         return "" if self.first is not None else self.rows[0].unranked_because or "not every seed is ranked"
 
     @property

@@ -1,4 +1,4 @@
-"""What the pages say in words: numbers, verdicts and the methods sentence, all from the record."""
+"""Words of the pages: numbers, labels and the methods sentence, all from the record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the figures of a leaderboard are drawn with: charts of rows, scatter plots, matrices, colours."""
+"""Parts of the figures of a leaderboard: charts of rows, scatter plots, matrices, colours."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Figure:
     caption: str = ""
     drawing: Drawing | None = None
     lacking: str = ""
-    """What the records would have to hold; empty when the figure is drawn."""
+    """Entries that the records would have to hold; empty when the figure is drawn."""
 
 
 def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float, Interval | None]:
@@ -161,7 +161,7 @@ def score_scale(values: Sequence[float], intervals: Sequence[Interval | None], s
 
 
 @dataclass(frozen=True)
-class Point:
+class ChartPoint:
     """A mark at a value of a row's axis; nothing is drawn where the value is NaN."""
 
     value: float
@@ -173,7 +173,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Bar:
+class ChartBar:
     """A bar from the axis' start to a value; ``top`` and ``height`` in pixels from the row's middle."""
 
     value: float
@@ -184,25 +184,25 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Row:
+class ChartRow:
     """One row of a chart: a label, bars, an interval and marks, drawn in this order."""
 
     label: str
-    points: Sequence[Point]
+    points: Sequence[ChartPoint]
     interval: Interval | None = None
     kind: str = ""
     """Colour class of the interval."""
     label_kind: str = "end"
     group: str | None = None
     """Heading of the rows that begin here, at the left edge."""
-    bars: Sequence[Bar] = ()
+    bars: Sequence[ChartBar] = ()
     drop: float = 0.0
     """Distance of interval and marks below the row's middle [px]."""
 
 
 def row_chart(
     title: str,
-    rows: Sequence[Row],
+    rows: Sequence[ChartRow],
     scale: Scale,
     label: str,
     *,

@@ -38,7 +38,7 @@ class Drawing:
     width: float
     height: float
     title: str
-    """What the drawing shows, for readers who do not see it."""
+    """The drawing in words, for readers who do not see it."""
     parts: list[str] = field(default_factory=list)
 
     def text(self, x: float, y: float, text: str, kind: str = "") -> None:

@@ -40,7 +40,7 @@ class PaperTable:
 
     @property
     def numbers(self) -> tuple[bool, ...]:
-        """Whether each column holds numbers, which are set flush right."""
+        """True for each column of numbers, which are set flush right."""
         return tuple(name not in _WORDY for name in self.columns)
 
 
