@@ -74,8 +74,7 @@ class Entry(Ranked):
     @property
     def p(self) -> float:
         """The largest permutation p over seeds."""
-        values = [row.record.score.p for row in self.rows if math.isfinite(row.record.score.p)]
-        return max(values) if values else math.nan
+        return max((p for row in self.rows if math.isfinite(p := row.record.score.p)), default=math.nan)
 
     @property
     def r(self) -> float:

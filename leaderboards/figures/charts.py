@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry, twins
 from leaderboards.figures.plots import (
@@ -244,11 +243,8 @@ def layers_of(entry: Entry) -> Drawing | None:
             points.append(ChartPoint(mean, kind if chosen else f"{kind} open", tip, 4))
         interval = layer.interval if entry.seeds == 1 else None
         rows.append(ChartRow(cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
-    ends = [
-        end for row in rows if row.interval and is_finite(row.interval) for end in (row.interval.low, row.interval.high)
-    ]
     values = [layer.value for one in seeds for layer in one]
-    scale = score_scale(values, [Interval(min(ends), max(ends))] if ends else [], 132, 470)
+    scale = score_scale(values, [row.interval for row in rows], 132, 470)
     words = f"Score of {len(layers)} layers of {entry.name}"
     return row_chart(words, rows, scale, "noise-corrected score", step=20, width=490)
 

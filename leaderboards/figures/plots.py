@@ -12,7 +12,7 @@ import numpy as np
 from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry
-from leaderboards.figures.marks import colour_at
+from leaderboards.figures.marks import colour_at, interval_ends
 from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, shorten, tick_text
 from leaderboards.text import number, span
 
@@ -154,7 +154,7 @@ def draw_matrix(
 
 def score_scale(values: Sequence[float], intervals: Sequence[Interval | None], start: float, end: float) -> Scale:
     """Return an axis from 0 to 1 that widens for values, and for interval ends as far as −1 and 1.5."""
-    ends = [end_ for i in intervals if i and is_finite(i) for end_ in (i.low, i.high)]
+    ends = [end_ for interval in intervals for end_ in interval_ends(interval)]
     finite = [value for value in (*values, *ends) if math.isfinite(value)]
     low, high = max(min([0.0, *finite]), -1.0), min(max([1.0, *finite]), 1.5)
     return Scale(low, high + 0.02, start, end)

@@ -129,21 +129,18 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     if len(board.rows) == 1:
         return words.methods(board.rows[0].record)
     seeds = max(entry.seeds for entry in entries)
-    versions = sorted({version for row in board.rows if (version := row.record.score.provenance.version)})
-    settings = score.provenance.settings
+    fidelity = score.provenance.settings.get("fidelity")
+    models, records = words.plural(len(entries), "model"), words.plural(len(board.rows), "record")
+    animals, shown = words.plural(len(score.subjects), "animal"), len(board.conditions)
     text = (
-        f"{words.plural(len(entries), 'model')} ({words.plural(len(board.rows), 'record')}) were compared with "
-        f"{board.recordings} ({words.plural(len(score.subjects), 'animal')}, "
-        f"{words.plural(len(board.conditions), 'stimulus', 'stimuli')})"
+        f"{models} ({records}) were compared with {board.recordings} ({animals}, "
+        f"{words.plural(shown, 'stimulus', 'stimuli')}){f' by {board.metric}' if board.metric else ''}, "
+        f"with noise correction by the estimator '{board.estimator}'."
     )
-    text += f" by {board.metric}" if board.metric else ""
-    text += f", with noise correction by the estimator '{board.estimator}'."
-    text += f" Stimuli: {board.stimuli.rstrip('.')}." if board.stimuli else ""
-    fidelity = settings.get("fidelity")
+    text += words.stated("Stimuli", board.stimuli.rstrip("."))
     text += f" They were simulated at the fidelity '{fidelity}'." if isinstance(fidelity, str) else ""
-    text += f" Time axis: {board.time}." if board.time else ""
-    text += f" Layer: {score.layer_rule}." if score.layer_rule else ""
-    text += f" Interval of a record: {words.level(score.interval)}." if score.interval else ""
+    text += words.stated("Time axis", board.time) + words.stated("Layer", score.layer_rule)
+    text += words.stated("Interval of a record", words.level(score.interval) if score.interval else "")
     if seeds > 1:
         text += (
             f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, "
@@ -151,15 +148,13 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
             "standard deviation over seeds."
         )
     # The mean under permutation is one record's own.
-    significance = re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method)
-    text += f" Significance: {significance}." if significance else ""
-    text += f" Noise ceiling: {score.ceiling.method}." if score.ceiling and score.ceiling.method else ""
+    text += words.stated("Significance", re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method))
+    text += words.stated("Noise ceiling", score.ceiling.method if score.ceiling else "")
     text += f" Ranks are ranges. {board.ties}"
-    text += f" Computed with brainbench {', '.join(versions)}." if versions else ""
-    text += f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
-    text += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""
-    text += " The recordings are synthetic: the result says nothing about brains." if board.synthetic else ""
-    return text
+    hashes = f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
+    hashes += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""
+    versions = sorted({row.record.score.provenance.version for row in board.rows})
+    return text + words.made_by(versions, synthetic=board.synthetic, hashes=hashes)
 
 
 def _section(board: Board) -> Section:
