@@ -1,4 +1,4 @@
-"""What is doubtful about a set of records: stale ones, and those that contradict one another.
+"""Doubtful records of a set: stale ones, and those that contradict one another.
 
 A record is **stale** when something newer exists than what made it: the layout, the package, the default
 estimator, or the definition behind a fidelity's name. Two records **conflict** when they state the same

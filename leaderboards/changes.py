@@ -1,4 +1,4 @@
-"""What differs: between a record and its repetition, and between two builds of a leaderboard."""
+"""Differences between a record and its repetition, and between two builds of a leaderboard."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from leaderboards.ranking import rank
 from leaderboards.store import StoredRecord, read_records
 
 RECORDS_ZIP = Path("data", "records.zip")
-"""Where a built site keeps the records it was made from."""
+"""Place in a built site of the records it was made from."""
 _CAUSES = ("recordings", "stimuli", "brainbench version", "card.weights", "score.layer")
 
 
@@ -39,7 +39,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one model between two builds."""
+    """A change of one model between two builds."""
 
     kind: Literal["added", "removed", "changed", "moved", "restated"]
     """``moved``: the record is the same, its rank is not, because of others. ``restated``: another record with the
@@ -50,7 +50,7 @@ class Change:
     """Value and rank before; empty for an added one."""
     after: str
     causes: tuple[str, ...] = ()
-    """What else differs between the records, such as the package's version or the stimuli."""
+    """Other differences between the records, such as the package's version or the stimuli."""
 
 
 def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float = TOLERANCE) -> list[Difference]:

@@ -68,14 +68,13 @@ class Entry(Ranked):
 
     @property
     def unranked_because(self) -> str:
-        """Why it has no rank; empty when it has one."""
+        """Reason why it has no rank; empty when it has one."""
         return "" if self.first is not None else self.rows[0].unranked_because or "not every seed is ranked"
 
     @property
     def p(self) -> float:
         """The largest permutation p over seeds."""
-        values = [row.record.score.p for row in self.rows if math.isfinite(row.record.score.p)]
-        return max(values) if values else math.nan
+        return max((p for row in self.rows if math.isfinite(p := row.record.score.p)), default=math.nan)
 
     @property
     def r(self) -> float:

@@ -1,4 +1,4 @@
-"""What may be compared with what, and which ranks the intervals leave open.
+"""Boards of comparable scores, and the ranks that their intervals leave open.
 
 Scores are comparable only within a **board**: same recordings, same stimuli, same estimator, same
 metric, same use of the time axis. Within a board only scores of status ``ok`` that carry an
@@ -35,7 +35,7 @@ FALSE_DISCOVERY_RATE = 0.05
 
 
 class Ranked:
-    """What has a range of ranks."""
+    """Base of a model on a board, which has a range of ranks."""
 
     first: int | None
     last: int | None
@@ -89,7 +89,7 @@ class Board:
     conditions: tuple[str, ...]
     """Labels that were compared, in the order of the RDMs."""
     time: str
-    """How the time axis entered the RDMs; empty when not stated."""
+    """Rule by which the time axis entered the RDMs; empty when not stated."""
     estimator: str
     metric: str
     synthetic: bool

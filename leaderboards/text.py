@@ -1,10 +1,10 @@
-"""What the pages say in words: numbers, verdicts and the methods sentence, all from the record."""
+"""Words of the pages: numbers, labels and the methods sentence, all from the record."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -89,31 +89,33 @@ def p_sentence(score: Score) -> str:
     return "; ".join(parts)
 
 
+def stated(label: str, value: str) -> str:
+    """Return a sentence that says a value, empty without one."""
+    return f" {label}: {value}." if value else ""
+
+
 def methods(record: ResultRecord) -> str:
     """Return a paragraph for a paper's methods section, made only of what the record states."""
-    score = record.score
-    text = (
-        f"The model {score.name} was compared with {score.provenance.recordings_name} "
+    score, origin = record.score, record.score.provenance
+    return (
+        f"The model {score.name} was compared with {origin.recordings_name} "
         f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
-        "by representational similarity analysis"
+        f"by representational similarity analysis{f' ({score.metric})' if score.metric else ''}, "
+        f"with noise correction by the estimator '{score.estimator}'."
+        + stated("Time axis", origin.time_rule)
+        + stated("Layer", score.layer_rule)
+        + stated("Interval", level(score.interval) if score.interval else "")
+        + stated("Significance", score.p_method)
+        + stated("Noise ceiling", score.ceiling.method if score.ceiling else "")
+        + made_by([origin.version], synthetic=record.synthetic)
     )
-    text += f" ({score.metric})" if score.metric else ""
-    text += f", with noise correction by the estimator '{score.estimator}'."
-    if score.provenance.time_rule:
-        text += f" Time axis: {score.provenance.time_rule}."
-    if score.layer_rule:
-        text += f" Layer: {score.layer_rule}."
-    if score.interval:
-        text += f" Interval: {level(score.interval)}."
-    if score.p_method:
-        text += f" Significance: {score.p_method}."
-    if score.ceiling and score.ceiling.method:
-        text += f" Noise ceiling: {score.ceiling.method}."
-    version = score.provenance.get("version")
-    text += f" Computed with brainbench {version}." if version else ""
-    if record.synthetic:
-        text += " The recordings are synthetic: the result says nothing about brains."
-    return text
+
+
+def made_by(versions: Sequence[str], *, synthetic: bool, hashes: str = "") -> str:
+    """Return the end of a methods paragraph: versions of this package, hashes, and whether brains were recorded."""
+    named = ", ".join(filter(None, versions))
+    text = f" Computed with brainbench {named}." if named else ""
+    return text + hashes + (" The recordings are synthetic: the result says nothing about brains." if synthetic else "")
 
 
 def card_rows(card: ModelCard) -> list[tuple[str, str]]:

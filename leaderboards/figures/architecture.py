@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from brainbench.core.records import GraphEdge, GraphNode, ModelGraph, Score
-from leaderboards.figures.svg import Drawing
+from brainbench.core.records import GraphNode, ModelGraph, Score
+from leaderboards.figures.svg import Drawing, shorten
 
 _BOX, _HEIGHT, _GAP, _LANE = 236.0, 34.0, 15.0, 13.0
 _CLASSES = {"input": "c0", "encoder": "c1", "attender": "c2", "decoder": "c3"}
@@ -66,26 +66,16 @@ def _folded(graph: ModelGraph) -> list[_Box]:
     """Join runs of alike parts that are connected only to the next one."""
     ins = {node.name: [e for e in graph.edges if e.target == node.name] for node in graph.nodes}
     outs = {node.name: [e for e in graph.edges if e.source == node.name] for node in graph.nodes}
-    boxes: list[_Box] = []
+    runs: list[list[GraphNode]] = []
     for node in graph.nodes:
-        last = boxes[-1] if boxes else None
-        alike = last is not None and (last.node.part, last.node.kind, last.node.memory) == (
-            node.part, node.kind, node.memory
-        )  # fmt: skip
-        if last is not None and alike and _only(ins[node.name], outs[last.names[-1]]):
-            boxes[-1] = _Box(last.node, (*last.names, node.name))
+        last = runs[-1][-1] if runs else node
+        alike = (last.part, last.kind, last.memory) == (node.part, node.kind, node.memory)
+        if alike and len(ins[node.name]) == 1 and ins[node.name] == outs[last.name]:
+            runs[-1].append(node)
         else:
-            boxes.append(_Box(node, (node.name,)))
-    return [part for box in boxes for part in ([box] if len(box.names) > 2 else _apart(box, graph))]
-
-
-def _apart(box: _Box, graph: ModelGraph) -> list[_Box]:
-    by_name = {node.name: node for node in graph.nodes}
-    return [_Box(by_name[name], (name,)) for name in box.names]
-
-
-def _only(ins: Sequence[GraphEdge], outs: Sequence[GraphEdge]) -> bool:
-    return len(ins) == 1 and len(outs) == 1 and ins[0] == outs[0]
+            runs.append([node])
+    folded = [run for nodes in runs for run in ([nodes] if len(nodes) > 2 else [[node] for node in nodes])]
+    return [_Box(run[0], tuple(node.name for node in run)) for run in folded]
 
 
 def _lanes(edges: Sequence[tuple[int, int, bool]]) -> list[int]:
@@ -114,8 +104,8 @@ def _draw_box(drawing: Drawing, box: _Box, x: float, y: float) -> None:
     short = node.name.partition(".")[2] or node.name
     if len(box.names) > 1:
         short = f"{len(box.names)} × {short.rstrip('0123456789')}"
-    drawing.text(x + 13, y + 14, _cut(short, 22), "title")
-    drawing.text(x + 13, y + 27, _cut(f"{node.kind}{' · ' + node.memory if node.memory else ''}", 40), "quiet small")
+    drawing.text(x + 13, y + 14, shorten(short, 22), "title")
+    drawing.text(x + 13, y + 27, shorten(f"{node.kind}{' · ' + node.memory if node.memory else ''}", 40), "quiet small")
     if node.shape:
         drawing.text(x + _BOX - 8, y + 14, "×".join(map(str, node.shape)), "end quiet small")
 
@@ -137,7 +127,3 @@ def _head(drawing: Drawing, x: float, y: float, dx: int, dy: int, kind: str = "c
     """Draw an arrow head whose tip is at (x, y), pointing along (dx, dy)."""
     bx, by = x - 6 * dx, y - 6 * dy
     drawing.path(f"M{x} {y:.1f}L{bx + 3.2 * dy} {by + 3.2 * dx:.1f}L{bx - 3.2 * dy} {by - 3.2 * dx:.1f}z", kind)
-
-
-def _cut(text: str, length: int) -> str:
-    return text if len(text) <= length else text[: length - 1] + "…"

@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry, twins
 from leaderboards.figures.plots import (
     SHOWN,
     WIDTH,
-    Bar,
+    ChartBar,
+    ChartPoint,
+    ChartRow,
     Figure,
-    Point,
-    Row,
     colours,
     cut,
     cut_name,
@@ -65,17 +64,17 @@ def fit_per_model(board: Board, entries: Sequence[Entry]) -> Figure:
     rows = []
     for entry in models:
         kind = colour[_objective(entry)]
-        seeds = [Point(row.record.score.value, f"{kind} faint", size=2) for row in entry.rows]
+        seeds = [ChartPoint(row.record.score.value, f"{kind} faint", size=2) for row in entry.rows]
         twin = _twin_points(entry, untrained, 3.5) if entry.trained else ()
         hollow = " open" if entry.status != "ok" else ""
-        mark = Point(entry.value, kind + hollow, f"{entry.name}: {number(entry.value)} {span(entry.interval)}")
+        mark = ChartPoint(entry.value, kind + hollow, f"{entry.name}: {number(entry.value)} {span(entry.interval)}")
         points = (*(seeds if entry.seeds > 1 else ()), *twin, mark)
         label_kind = "end" if entry.first is not None else "end quiet"
-        rows.append(Row(cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
+        rows.append(ChartRow(cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
     for item in base:
         kind, shape = ("c7", "square") if item.kind == "animals" else ("c0", "diamond")
-        mark = Point(item.score.value, kind, f"{item.name}: {number(item.score.value)}", 4, shape)
-        rows.append(Row(item.name, (mark,), item.score.interval, kind, "end quiet"))
+        mark = ChartPoint(item.score.value, kind, f"{item.name}: {number(item.score.value)}", 4, shape)
+        rows.append(ChartRow(item.name, (mark,), item.score.interval, kind, "end quiet"))
     values = [entry.value for entry in models] + [item.score.value for item in base]
     scale = score_scale(values, [row.interval for row in rows], 250, WIDTH - 20)
     animals = next((b.score for b in base if b.kind == "animals" and is_finite(b.score.interval)), None)
@@ -176,14 +175,14 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     rows = []
     for entry, twin in zip(models, found, strict=True):
         kind, card = colour[_objective(entry)], entry.card
-        bars = [Bar(twin, -6, 4, f"{kind} faint", f"untrained twin {number(twin)}")] if twin is not None else []
-        bars.append(Bar(card.top1 or 0, -2, 8, kind, f"{entry.name}: top-1 {number(card.top1)}"))
+        bars = [ChartBar(twin, -6, 4, f"{kind} faint", f"untrained twin {number(twin)}")] if twin is not None else []
+        bars.append(ChartBar(card.top1 or 0, -2, 8, kind, f"{entry.name}: top-1 {number(card.top1)}"))
         top5 = (
             ()
             if card.top5 is None
-            else (Point(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.2, "diamond"),)
+            else (ChartPoint(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.2, "diamond"),)
         )
-        rows.append(Row(cut_name(entry.name, 36), top5, card.accuracy_interval, "line", bars=bars, drop=2))
+        rows.append(ChartRow(cut_name(entry.name, 36), top5, card.accuracy_interval, "line", bars=bars, drop=2))
     reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in models))
     scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
     drawing = row_chart(f"{title}: {len(models)} models", rows, scale, "accuracy on held-out objects")
@@ -217,8 +216,7 @@ def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
 def augmentation(entries: Sequence[Entry]) -> Figure:
     """Draw the neural fit under each augmentation, for models trained with several (figure 3.8 c)."""
     title = "Augmentation ablation (as figure 3.8 c)"
-    fixed = lambda entry: _masking(entry) if entry.masking else ""  # noqa: E731
-    return _ablation("augmentation", title, entries, _augmentation, fixed, "augmentation")
+    return _ablation("augmentation", title, entries, _augmentation, _any_masking, "augmentation")
 
 
 def masking(entries: Sequence[Entry]) -> Figure:
@@ -238,18 +236,15 @@ def layers_of(entry: Entry) -> Drawing | None:
         chosen = layer.layer == entry.score.layer
         found = [one[index].value for one in seeds if len(one) == len(layers)]
         finite = [value for value in found if math.isfinite(value)]
-        points = [Point(value, f"{kind} faint", size=2.2) for value in finite if entry.seeds > 1]
+        points = [ChartPoint(value, f"{kind} faint", size=2.2) for value in finite if entry.seeds > 1]
         if finite:
             mean = math.fsum(finite) / len(finite)
             tip = f"{layer.layer}: {number(mean)} {span(layer.interval) if entry.seeds == 1 else ''}"
-            points.append(Point(mean, kind if chosen else f"{kind} open", tip, 4))
+            points.append(ChartPoint(mean, kind if chosen else f"{kind} open", tip, 4))
         interval = layer.interval if entry.seeds == 1 else None
-        rows.append(Row(cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
-    ends = [
-        end for row in rows if row.interval and is_finite(row.interval) for end in (row.interval.low, row.interval.high)
-    ]
+        rows.append(ChartRow(cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
     values = [layer.value for one in seeds for layer in one]
-    scale = score_scale(values, [Interval(min(ends), max(ends))] if ends else [], 132, 470)
+    scale = score_scale(values, [row.interval for row in rows], 132, 470)
     words = f"Score of {len(layers)} layers of {entry.name}"
     return row_chart(words, rows, scale, "noise-corrected score", step=20, width=490)
 
@@ -278,9 +273,9 @@ def _ablation(
         group = cut(", ".join(part for part in model[:-1] if part), 50)
         for label, entry in sorted(levels.items()):
             top1 = f", top-1 {number(entry.card.top1)}" if entry.card.top1 is not None else ""
-            mark = Point(entry.value, colour[label], f"{entry.name}, {label}: {number(entry.value)}{top1}")
+            mark = ChartPoint(entry.value, colour[label], f"{entry.name}, {label}: {number(entry.value)}{top1}")
             points = (*_twin_points(entry, untrained, 3.2), mark)
-            rows.append(Row(cut(label, 22), points, entry.interval, colour[label], group=group))
+            rows.append(ChartRow(cut(label, 22), points, entry.interval, colour[label], group=group))
             values.append(entry.value)
             group = ""
     scale = score_scale(values, [row.interval for row in rows], 400, WIDTH - 20)
@@ -301,10 +296,14 @@ def _masking(entry: Entry) -> str:
     return f"{entry.masking:.0%} masked" if entry.trained else ""
 
 
-def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[Point, ...]:
+def _any_masking(entry: Entry) -> str:
+    return _masking(entry) if entry.masking else ""
+
+
+def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[ChartPoint, ...]:
     """Return the mark of a model's untrained twin, if its score is on the board."""
     twin = untrained.get(entry.architecture)
-    return () if twin is None else (Point(twin.value, "c0 open", f"untrained twin {number(twin.value)}", size),)
+    return () if twin is None else (ChartPoint(twin.value, "c0 open", f"untrained twin {number(twin.value)}", size),)
 
 
 def _twin_accuracy(entry: Entry, untrained: Mapping[str, Entry]) -> float | None:

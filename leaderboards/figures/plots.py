@@ -1,4 +1,4 @@
-"""What the figures of a leaderboard are drawn with: charts of rows, scatter plots, matrices, colours."""
+"""Parts of the figures of a leaderboard: charts of rows, scatter plots, matrices, colours."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry
-from leaderboards.figures.marks import colour_at
-from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, tick_text
+from leaderboards.figures.marks import colour_at, interval_ends
+from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, shorten, tick_text
 from leaderboards.text import number, span
 
 WIDTH = 760.0
@@ -32,7 +32,7 @@ class Figure:
     caption: str = ""
     drawing: Drawing | None = None
     lacking: str = ""
-    """What the records would have to hold; empty when the figure is drawn."""
+    """Entries that the records would have to hold; empty when the figure is drawn."""
 
 
 def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float, Interval | None]:
@@ -154,14 +154,14 @@ def draw_matrix(
 
 def score_scale(values: Sequence[float], intervals: Sequence[Interval | None], start: float, end: float) -> Scale:
     """Return an axis from 0 to 1 that widens for values, and for interval ends as far as −1 and 1.5."""
-    ends = [end_ for i in intervals if i and is_finite(i) for end_ in (i.low, i.high)]
+    ends = [end_ for interval in intervals for end_ in interval_ends(interval)]
     finite = [value for value in (*values, *ends) if math.isfinite(value)]
     low, high = max(min([0.0, *finite]), -1.0), min(max([1.0, *finite]), 1.5)
     return Scale(low, high + 0.02, start, end)
 
 
 @dataclass(frozen=True)
-class Point:
+class ChartPoint:
     """A mark at a value of a row's axis; nothing is drawn where the value is NaN."""
 
     value: float
@@ -173,7 +173,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Bar:
+class ChartBar:
     """A bar from the axis' start to a value; ``top`` and ``height`` in pixels from the row's middle."""
 
     value: float
@@ -184,25 +184,25 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Row:
+class ChartRow:
     """One row of a chart: a label, bars, an interval and marks, drawn in this order."""
 
     label: str
-    points: Sequence[Point]
+    points: Sequence[ChartPoint]
     interval: Interval | None = None
     kind: str = ""
     """Colour class of the interval."""
     label_kind: str = "end"
     group: str | None = None
     """Heading of the rows that begin here, at the left edge."""
-    bars: Sequence[Bar] = ()
+    bars: Sequence[ChartBar] = ()
     drop: float = 0.0
     """Distance of interval and marks below the row's middle [px]."""
 
 
 def row_chart(
     title: str,
-    rows: Sequence[Row],
+    rows: Sequence[ChartRow],
     scale: Scale,
     label: str,
     *,
@@ -269,8 +269,7 @@ def cut_words(count: int, shown: int = SHOWN) -> str:
 
 def cut(text: str, length: int) -> str:
     """Shorten a label; of a path the last part stays."""
-    text = text.rpartition("/")[2] or text
-    return text if len(text) <= length else text[: length - 1] + "…"
+    return shorten(text.rpartition("/")[2] or text, length)
 
 
 def cut_name(name: str, length: int) -> str:

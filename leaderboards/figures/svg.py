@@ -38,7 +38,7 @@ class Drawing:
     width: float
     height: float
     title: str
-    """What the drawing shows, for readers who do not see it."""
+    """The drawing in words, for readers who do not see it."""
     parts: list[str] = field(default_factory=list)
 
     def text(self, x: float, y: float, text: str, kind: str = "") -> None:
@@ -64,9 +64,8 @@ class Drawing:
         """Draw a rectangle, in a colour of its own or by its classes; ``tip`` is shown on hovering."""
         colour = f' fill="{fill}"' if fill else ""
         round_ = f' rx="{_n(rx)}"' if rx else ""
-        inner = f"><title>{escape(tip)}</title></rect>" if tip else "/>"
         size = f'width="{_n(max(width, 0))}" height="{_n(max(height, 0))}"'
-        self.parts.append(f'<rect x="{_n(x)}" y="{_n(y)}" {size}{colour}{round_}{_class(kind)}{inner}')
+        self.parts.append(f'<rect x="{_n(x)}" y="{_n(y)}" {size}{colour}{round_}{_class(kind)}{_end("rect", tip)}')
 
     def path(self, d: str, kind: str = "line") -> None:
         """Draw a path given by its commands."""
@@ -83,8 +82,7 @@ class Drawing:
             "down": f"M{_n(x)} {_n(y + 1.2 * s)}l{1.2 * s} {-2.1 * s}h{-2.4 * s}z",
             "cross": f"M{_n(x - s)} {_n(y - s)}l{2 * s} {2 * s}m0 {-2 * s}l{-2 * s} {2 * s}",
         }
-        inner = f"><title>{escape(tip)}</title></path>" if tip else "/>"
-        self.parts.append(f'<path d="{shapes[shape]}"{_class(kind)}{inner}')
+        self.parts.append(f'<path d="{shapes[shape]}"{_class(kind)}{_end("path", tip)}')
 
     def render(self, *, style: str = "") -> str:
         """Return the SVG element."""
@@ -156,6 +154,11 @@ def scale_of(
     return Scale(low if low == floor else low - room, high + room, start, end)
 
 
+def shorten(text: str, length: int) -> str:
+    """Cut a text behind a number of characters."""
+    return text if len(text) <= length else text[: length - 1] + "…"
+
+
 def tick_text(value: float) -> str:
     """Write a tick's value shortly: ``0.25``, ``−1``, ``2 M``."""
     for size, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
@@ -170,3 +173,8 @@ def _n(value: float) -> str:
 
 def _class(kind: str) -> str:
     return f' class="{kind}"' if kind else ""
+
+
+def _end(element: str, tip: str) -> str:
+    """Close an element, with the text that is shown on hovering."""
+    return f"><title>{escape(tip)}</title></{element}>" if tip else "/>"

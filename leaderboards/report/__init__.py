@@ -1,1 +1,4 @@
-"""Reports: of one score, and of a board for a paper's supplement."""
+"""Reports of records for a paper.
+
+:mod:`paper` writes methods, tables and figures with the works that :mod:`citations` finds; :mod:`pdf` prints them.
+"""

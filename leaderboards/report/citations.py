@@ -1,4 +1,4 @@
-"""What a report must cite: the entries (BibTeX) that its records lead to."""
+"""Citations of a report: the BibTeX entries of ``references.bib`` that its records lead to."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class PaperTable:
 
     @property
     def numbers(self) -> tuple[bool, ...]:
-        """Whether each column holds numbers, which are set flush right."""
+        """True for each column of numbers, which are set flush right."""
         return tuple(name not in _WORDY for name in self.columns)
 
 
@@ -129,21 +129,18 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     if len(board.rows) == 1:
         return words.methods(board.rows[0].record)
     seeds = max(entry.seeds for entry in entries)
-    versions = sorted({version for row in board.rows if (version := row.record.score.provenance.version)})
-    settings = score.provenance.settings
+    fidelity = score.provenance.settings.get("fidelity")
+    models, records = words.plural(len(entries), "model"), words.plural(len(board.rows), "record")
+    animals, shown = words.plural(len(score.subjects), "animal"), len(board.conditions)
     text = (
-        f"{words.plural(len(entries), 'model')} ({words.plural(len(board.rows), 'record')}) were compared with "
-        f"{board.recordings} ({words.plural(len(score.subjects), 'animal')}, "
-        f"{words.plural(len(board.conditions), 'stimulus', 'stimuli')})"
+        f"{models} ({records}) were compared with {board.recordings} ({animals}, "
+        f"{words.plural(shown, 'stimulus', 'stimuli')}){f' by {board.metric}' if board.metric else ''}, "
+        f"with noise correction by the estimator '{board.estimator}'."
     )
-    text += f" by {board.metric}" if board.metric else ""
-    text += f", with noise correction by the estimator '{board.estimator}'."
-    text += f" Stimuli: {board.stimuli.rstrip('.')}." if board.stimuli else ""
-    fidelity = settings.get("fidelity")
+    text += words.stated("Stimuli", board.stimuli.rstrip("."))
     text += f" They were simulated at the fidelity '{fidelity}'." if isinstance(fidelity, str) else ""
-    text += f" Time axis: {board.time}." if board.time else ""
-    text += f" Layer: {score.layer_rule}." if score.layer_rule else ""
-    text += f" Interval of a record: {words.level(score.interval)}." if score.interval else ""
+    text += words.stated("Time axis", board.time) + words.stated("Layer", score.layer_rule)
+    text += words.stated("Interval of a record", words.level(score.interval) if score.interval else "")
     if seeds > 1:
         text += (
             f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, "
@@ -151,15 +148,13 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
             "standard deviation over seeds."
         )
     # The mean under permutation is one record's own.
-    significance = re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method)
-    text += f" Significance: {significance}." if significance else ""
-    text += f" Noise ceiling: {score.ceiling.method}." if score.ceiling and score.ceiling.method else ""
+    text += words.stated("Significance", re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method))
+    text += words.stated("Noise ceiling", score.ceiling.method if score.ceiling else "")
     text += f" Ranks are ranges. {board.ties}"
-    text += f" Computed with brainbench {', '.join(versions)}." if versions else ""
-    text += f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
-    text += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""
-    text += " The recordings are synthetic: the result says nothing about brains." if board.synthetic else ""
-    return text
+    hashes = f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
+    hashes += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""
+    versions = sorted({row.record.score.provenance.version for row in board.rows})
+    return text + words.made_by(versions, synthetic=board.synthetic, hashes=hashes)
 
 
 def _section(board: Board) -> Section:
@@ -259,53 +254,35 @@ def _write_figures(paper: Paper, path: Path) -> list[Path]:
 
 
 def _markdown(paper: Paper, path: Path) -> str:
-    lines = [f"# {_escape(paper.title)}", ""]
-    if paper.synthetic:
-        lines += [f"> **{words.SYNTHETIC}**", ""]
+    blocks = [f"# {_escape(paper.title)}"]
+    blocks += [f"> **{words.SYNTHETIC}**"] if paper.synthetic else []
     for place, section in enumerate(paper.sections, start=1):
-        lines += [
-            f"## {_escape(section.title)}",
-            "",
-            "### Methods",
-            "",
-            _escape(section.methods),
-            "",
-            "### Results",
-            "",
-        ]
+        blocks += [f"## {_escape(section.title)}", "### Methods", _escape(section.methods), "### Results"]
         for table in section.tables:
-            lines += [_escape(table.caption), "", *_rows(table), ""]
+            blocks += [_escape(table.caption), _rows(table)]
         for figure in section.figures:
             target = _figure_path(path, place, figure).relative_to(path.parent).as_posix().replace(" ", "%20")
-            lines += [
-                f"![{_escape(figure.title)}]({target})",
-                "",
-                f"*{_escape(figure.title)}.* {_escape(figure.caption)}",
-                "",
-            ]
+            title = _escape(figure.title)
+            blocks += [f"![{title}]({target})", f"*{title}.* {_escape(figure.caption)}"]
         if section.absent:
-            lines += ["Not drawn: " + " ".join(f"{f.title}: {f.lacking}." for f in section.absent), ""]
+            blocks.append("Not drawn: " + " ".join(f"{f.title}: {f.lacking}." for f in section.absent))
     if paper.commands:
-        lines += [
-            "## To make these records again",
-            "",
-            "```",
-            *(text.replace("`", "'") for text in paper.commands),
-            "```",
-            "",
-        ]
-    lines += ["## References", "", *(f"- {_escape(item.text)}" for item in paper.references), ""]
-    return "\n".join([*lines, f"BibTeX entries: `{path.with_suffix('.bib').name}`.", ""])
+        commands = "\n".join(text.replace("`", "'") for text in paper.commands)
+        blocks += ["## To make these records again", f"```\n{commands}\n```"]
+    blocks += ["## References", "\n".join(f"- {_escape(item.text)}" for item in paper.references)]
+    blocks.append(f"BibTeX entries: `{path.with_suffix('.bib').name}`.")
+    return "\n\n".join(blocks) + "\n"
 
 
-def _rows(table: PaperTable) -> list[str]:
+def _rows(table: PaperTable) -> str:
     ends = ["---:" if number else "---" for number in table.numbers]
     lines = [table.columns, ends, *([_escape(cell) for cell in row] for row in table.rows)]
-    return ["| " + " | ".join(line) + " |" for line in lines]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+_ESCAPED = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<": "&lt;", ">": "&gt;"})
 
 
 def _escape(text: str) -> str:
     """Escape what Markdown or HTML inside it would read as markup."""
-    for mark in "\\`*_{}[]<>|#!":
-        text = text.replace(mark, f"\\{mark}" if mark not in "<>" else {"<": "&lt;", ">": "&gt;"}[mark])
-    return " ".join(text.split())
+    return " ".join(text.translate(_ESCAPED).split())

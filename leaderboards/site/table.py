@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from brainbench.core.statistics import is_finite
+from brainbench.core.records import Interval
 from leaderboards.entries import Entry
-from leaderboards.figures.marks import score_axis
+from leaderboards.figures.marks import interval_ends, score_axis
 from leaderboards.ranking import Baseline, Board, RankedRecord
 
 COLUMNS: tuple[dict[str, Any], ...] = (
@@ -38,34 +38,37 @@ COLUMNS: tuple[dict[str, Any], ...] = (
 
 
 def board_label(board: Board) -> str:
-    """Return what tells a board from others of the same recordings."""
-    parts = [board.metric or "metric not stated", board.estimator]
-    parts += [f"time {board.time}"] if board.time else []
-    parts += [f"stimuli {board.stimuli_hash[:6]}"] if board.stimuli_hash else []
-    return f"{board.recordings}: {', '.join(parts)}"
+    """Return the recordings of a board and what tells it from others of the same recordings."""
+    return f"{board.recordings}: {_rules(board)}"
 
 
 def compact(listed: Sequence[tuple[Board, Sequence[Entry]]]) -> list[dict[str, Any]]:
     """Return every board as columns: what the script of the first page shows."""
     found = []
-    for index, (board, entries) in enumerate(listed):
-        scores = [entry.score for entry in entries] + [baseline.score for baseline in board.baselines]
-        axis = score_axis(scores)
+    for index, (board, entries) in enumerate(listed, start=1):
+        axis = score_axis(item.score for item in (*entries, *board.baselines))
         animals = next((b.score for b in board.baselines if b.kind == "animals" and b.score.status == "ok"), None)
-        interval = animals.interval if animals and is_finite(animals.interval) else None
-        rows = _rows(board, entries)
+        rows = [*map(_model_row, entries), *map(_baseline_row, board.baselines)]
+        keys = dict.fromkeys(key for row in rows for key in row)
         found.append(
             {
-                "key": str(index + 1),
+                "key": str(index),
                 "recordings": board.recordings + (f" ({board.recordings_hash[:6]})" if board.recordings_hash else ""),
-                "label": board_label(board).partition(": ")[2],
+                "label": _rules(board),
                 "about": _about(board),
                 "axis": {"low": axis.low, "high": axis.high, "ticks": axis.ticks},
-                "band": [interval.low, interval.high] if interval else None,
-                "data": {key: [row.get(key) for row in rows] for key in (rows[0] if rows else {})},
+                "band": list(interval_ends(animals.interval)) or None if animals else None,
+                "data": {key: [row.get(key) for row in rows] for key in keys},
             }
         )
     return found
+
+
+def _rules(board: Board) -> str:
+    parts = [board.metric or "metric not stated", board.estimator]
+    parts += [f"time {board.time}"] if board.time else []
+    parts += [f"stimuli {board.stimuli_hash[:6]}"] if board.stimuli_hash else []
+    return ", ".join(parts)
 
 
 def _about(board: Board) -> list[str]:
@@ -81,18 +84,10 @@ def _about(board: Board) -> list[str]:
     return parts
 
 
-def _rows(board: Board, entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    models = [_model_row(entry) for entry in entries]
-    others = [_baseline_row(baseline) for baseline in board.baselines]
-    keys = dict.fromkeys(key for row in (*models, *others) for key in row)
-    return [{key: row.get(key) for key in keys} for row in (*models, *others)]
-
-
 def _model_row(entry: Entry) -> dict[str, Any]:
     card, score = entry.card, entry.score
-    runs = None
-    if entry.seeds > 1:
-        runs = [_run(row) for row in entry.rows]
+    low, high = _ends(entry.interval)
+    unranked = [f"not ranked: {entry.unranked_because}"] if entry.unranked_because else []
     return {
         "kind": "model",
         "model": entry.name,
@@ -102,14 +97,14 @@ def _model_row(entry: Entry) -> dict[str, Any]:
         "last": entry.last,
         "placed": entry.first is not None,
         "score": _short(entry.value),
-        "low": _short(entry.interval.low) if entry.interval else None,
-        "high": _short(entry.interval.high) if entry.interval else None,
+        "low": low,
+        "high": high,
         "spread": _short(entry.spread),
         "p": _short(entry.p, 6),
         "raw": _short(entry.r),
         "layer": score.layer,
         "status": entry.status,
-        "notes": list(entry.notes) + ([f"not ranked: {why}"] if (why := entry.unranked_because) else []) or None,
+        "notes": [*entry.notes, *unranked] or None,
         "parameters": card.parameters,
         "cost": card.multiply_adds,
         "top1": _short(card.top1),
@@ -122,30 +117,19 @@ def _model_row(entry: Entry) -> dict[str, Any]:
         "seeds": entry.seeds,
         "animals": len(score.subjects) or None,
         "version": score.provenance.version or None,
-        "runs": runs,
+        "runs": [_run(row) for row in entry.rows] if entry.seeds > 1 else None,
     }
 
 
 def _run(row: RankedRecord) -> list[Any]:
-    score = row.record.score
-    interval = score.interval if is_finite(score.interval) else None
-    return [
-        row.record.card.seed if row.record.card else None,
-        _short(score.value),
-        _short(interval.low) if interval else None,
-        _short(interval.high) if interval else None,
-        _short(score.p, 6),
-        row.first,
-        row.last,
-        score.status,
-        _short(score.r),
-        score.layer,
-    ]
+    score, card = row.record.score, row.record.card
+    placed = (_short(score.value), *_ends(score.interval), _short(score.p, 6), row.first, row.last)
+    return [card.seed if card else None, *placed, score.status, _short(score.r), score.layer]
 
 
 def _baseline_row(baseline: Baseline) -> dict[str, Any]:
     score = baseline.score
-    interval = score.interval if is_finite(score.interval) else None
+    low, high = _ends(score.interval)
     return {
         "kind": baseline.kind,
         "model": baseline.name,
@@ -154,13 +138,18 @@ def _baseline_row(baseline: Baseline) -> dict[str, Any]:
         "first": None,
         "last": None,
         "score": _short(score.value),
-        "low": _short(interval.low) if interval else None,
-        "high": _short(interval.high) if interval else None,
+        "low": low,
+        "high": high,
         "p": _short(score.p, 6),
         "raw": _short(score.r),
         "status": score.status,
         "notes": list(baseline.notes) or None,
     }
+
+
+def _ends(interval: Interval | None) -> tuple[float | None, float | None]:
+    low, high = interval_ends(interval) or (None, None)
+    return _short(low), _short(high)
 
 
 def _short(value: float | None, digits: int = 4) -> float | None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from brainbench.core import records
 from leaderboards import audit
 from leaderboards.audit import conflicting, remarks
 from leaderboards.store import StoredRecord
@@ -70,3 +71,11 @@ def test_last_digits_and_other_seeds_are_no_conflict(make_record, tmp_path):
 
 def test_the_examples_hold():
     assert doctest.testmod(audit).failed == 0
+
+
+def test_a_record_is_hashed_once_however_many_rivals_ask_for_its_identity(make_record, monkeypatch):
+    hashed = []
+    monkeypatch.setattr(records, "record_identity", lambda data: hashed.append(data) or str(len(hashed)))
+    one, other = make_record(value=0.5), make_record(value=0.7)
+    assert conflicting(one, [other] * 20) == [other] * 20
+    assert len(hashed) == 2

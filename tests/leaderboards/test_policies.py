@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from brainbench.cli import app
 from leaderboards import rank, read_records
 from leaderboards.entries import entries_of
-from tests.leaderboards.test_schema import VALIDATOR
+from tests.factories.records import VALIDATOR
 
 POLICIES = Path(__file__).parents[2] / "leaderboards" / "policies"
 

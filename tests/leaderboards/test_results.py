@@ -12,7 +12,7 @@ import pytest
 from leaderboards import rank, read_records
 from leaderboards.audit import remarks
 from leaderboards.entries import entries_of
-from tests.leaderboards.test_schema import VALIDATOR
+from tests.factories.records import VALIDATOR
 
 RESULTS = Path(__file__).parents[2] / "leaderboards" / "results"
 

@@ -14,8 +14,7 @@ from jsonschema import Draft202012Validator
 from brainbench.core.errors import DataError
 from brainbench.core.records import ResultRecord
 from leaderboards.schema import SCHEMA_PATH, record_schema
-
-VALIDATOR = Draft202012Validator(record_schema())
+from tests.factories.records import VALIDATOR
 
 
 def _fault(data: Any) -> str | None:

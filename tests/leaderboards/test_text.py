@@ -8,7 +8,7 @@ import numpy as np
 
 from brainbench.core.records import Interval, SubjectScore
 from leaderboards import build_leaderboard
-from leaderboards import text as _words
+from leaderboards import text as words
 from leaderboards.ranking import comparisons
 from tests.factories.html_page import Page
 
@@ -22,7 +22,7 @@ def test_the_lines_that_load_a_model_run_for_every_kind(make_record):
     import torch
 
     twin = _with(make_record(), "s4-small", objective="untrained", seed=3, family="s4")
-    lines = _words.loading(twin)
+    lines = words.loading(twin)
     assert len(lines.splitlines()) == 3
     made: dict[str, torch.nn.Module] = {}
     exec(lines, made)
@@ -31,10 +31,10 @@ def test_the_lines_that_load_a_model_run_for_every_kind(make_record):
     for one, other in zip(made["model"].parameters(), load_model("s4-small", seed=3).parameters(), strict=True):
         assert torch.equal(one, other)
     trained = _with(make_record(), "s4-small.simclr", objective="simclr", family="s4", seed=1)
-    assert "load_model('s4-small.simclr')" in _words.loading(trained)
+    assert "load_model('s4-small.simclr')" in words.loading(trained)
     own = _with(make_record(), "a.py:Mine", family="user module", seed=0)
-    assert "load_user_model('a.py:Mine', seed=0)" in _words.loading(own)
-    assert "names no model to load" in _words.loading(_with(make_record(), family="features computed elsewhere"))
+    assert "load_user_model('a.py:Mine', seed=0)" in words.loading(own)
+    assert "names no model to load" in words.loading(_with(make_record(), family="features computed elsewhere"))
 
 
 def test_a_trained_models_page_shows_accuracy_and_training(make_record, tmp_path):
@@ -49,13 +49,13 @@ def test_a_trained_models_page_shows_accuracy_and_training(make_record, tmp_path
         assert shown in text
     assert "untrained twin net" in text
     assert "clip" not in text
-    rows = _words.training_rows(replace(record.card, training={**record.card.training, "objective": "simclr"}))
+    rows = words.training_rows(replace(record.card, training={**record.card.training, "objective": "simclr"}))
     assert [label for label, _ in rows].count("objective") == 1
 
 
 def test_numbers_have_true_minus_signs_and_no_negative_zero():
-    assert _words.number(-0.1234) == "−0.123"
-    assert _words.number(-0.0001) == "0.000"
+    assert words.number(-0.1234) == "−0.123"
+    assert words.number(-0.0001) == "0.000"
 
 
 def test_layers_show_their_corrected_p_where_the_record_states_it(make_record, tmp_path):
@@ -76,7 +76,7 @@ def test_statistics_of_the_provenance_are_rounded_and_what_a_table_shows_is_not_
         "layer_tests": [{"layer": "conv3", "p": 0.01}],
         "bootstrap": {"draws": 1000, "interval": {"low": -0.46965415, "high": 0.8}, "spread": [1 / 3]},
     }
-    rows = dict(_words.provenance_rows({"statistics": statistics, "settings": {"bin": 0.0123456}}))
+    rows = dict(words.provenance_rows({"statistics": statistics, "settings": {"bin": 0.0123456}}))
     assert rows["statistics: monte carlo error"] == "value: 0.000272, p: 0"
     assert rows["statistics: bootstrap"] == "draws: 1000, interval: low: -0.47, high: 0.8, spread: 0.333"
     assert rows["settings: bin"] == "0.0123456"

@@ -14,7 +14,7 @@ import pytest
 from brainbench.core.records import ResultRecord
 from leaderboards import build_leaderboard, write_report
 from tests.factories.html_page import HOSTILE, Page, poisoned
-from tests.leaderboards.conftest import make_record
+from tests.factories.records import make_record
 
 
 def report(record: ResultRecord, folder: Path) -> Page:
