@@ -12,26 +12,22 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from leaderboards.ranking import Board, RankedRecord, rank
+    from leaderboards.ranking import rank
     from leaderboards.site.build import build_leaderboard
     from leaderboards.site.score_page import write_report
-    from leaderboards.store import StoredRecord, read_record, read_records, write_record
+    from leaderboards.store import read_records, write_record
 
 __all__ = [
-    "Board",
-    "RankedRecord",
-    "StoredRecord",
     "build_leaderboard",
     "rank",
-    "read_record",
     "read_records",
     "write_record",
     "write_report",
 ]
 
 _EXPORTS = {
-    **dict.fromkeys(("Board", "RankedRecord", "rank"), ".ranking"),
-    **dict.fromkeys(("StoredRecord", "read_record", "read_records", "write_record"), ".store"),
+    **dict.fromkeys(("rank",), ".ranking"),
+    **dict.fromkeys(("read_records", "write_record"), ".store"),
     "build_leaderboard": ".site.build",
     "write_report": ".site.score_page",
 }

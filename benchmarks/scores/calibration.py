@@ -19,7 +19,9 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.report import table, write_section
-from brainbench.metrics import Trials, compare, rdm, score_animals, subject_rdm
+from brainbench.core.trials import Trials
+from brainbench.metrics import compare, rdm
+from brainbench.metrics.animal_to_animal import score_animals
 from brainbench.metrics.inference.bootstrap import animal_counts, ceilings, drawn_scores, noise_factors
 from brainbench.metrics.inference.equivalence import equivalence_test
 from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
@@ -29,7 +31,7 @@ from brainbench.metrics.inference.power import ExperimentDesign, simulate_experi
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.rdms.comparison import compare_all, features
 from brainbench.metrics.rdms.pairs import permuted_pairs
-from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 PAIRS = permuted_pairs(np.concatenate(list(label_orders(6, 0))))

@@ -16,9 +16,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets import open_recordings, trials_by_subject
+from brainbench.core.trials import Trials
+from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import ensure_demo, read_truth
-from brainbench.metrics import Trials, rdm, score_animals, subject_rdm
+from brainbench.datasets.trials.session_trials import trials_by_subject
+from brainbench.metrics import rdm
+from brainbench.metrics.animal_to_animal import score_animals
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.stimuli import load_stimuli
 
 UNITS = np.array([1e-4] * 3 + [1e-6] * 3)

@@ -22,17 +22,12 @@ from functools import partial
 import numpy as np
 
 from benchmarks.report import table, write_section
-from brainbench.metrics import (
-    Trials,
-    compare_models,
-    noise_precision,
-    permutation_test,
-    rdm,
-    score_animals,
-    score_rdms,
-    subject_rdm,
-)
+from brainbench.core.trials import Trials
+from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
+from brainbench.metrics.animal_to_animal import score_animals
 from brainbench.metrics.inference.bootstrap import bootstrap_ceiling, bootstrap_comparisons
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
+from brainbench.metrics.score import score_rdms
 
 STIMULI = [f"s{k}" for k in range(6)]
 

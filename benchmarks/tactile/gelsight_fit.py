@@ -20,7 +20,8 @@ from scipy.optimize import least_squares
 
 from benchmarks.report import table, write_section
 from robotics_bridge.physics import Geometry, HandState, TouchScene
-from robotics_bridge.sensors import ElastomerTaxel, Layer, Probes, SensorSuite
+from robotics_bridge.sensors import ElastomerTaxel, Probes, SensorSuite
+from robotics_bridge.sensors.elastomer.taxel import Layer
 
 MILLIMETRES_PER_PIXEL = 0.0532
 SCALE = MILLIMETRES_PER_PIXEL * 1e-3

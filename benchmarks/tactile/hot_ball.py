@@ -19,6 +19,7 @@ from benchmarks.report import table, write_section
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.tasks.hot_ball import CELLS, published
+from robotics_bridge.tasks.task import Success
 from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 
 PUBLISHED = {(150.0, 0.5, 500.0), (150.0, 0.5, 5000.0)}
@@ -81,7 +82,7 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
         actuators=None,
         groups={},
         rewards={},
-        success=tasks.Success(metric="goals"),
+        success=Success(metric="goals"),
         episode=1e4,
     )
     env = tasks.make(task, num_envs=envs, seed=seed)

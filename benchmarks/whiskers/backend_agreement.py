@@ -15,19 +15,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from brainbench.stimuli import (
-    Fidelity,
-    Frames,
-    PlacedObject,
-    Scene,
-    Still,
-    Translation,
-    WhiskerArray,
-    Whisking,
-    get_engine,
-    get_recipe,
-)
+from brainbench.stimuli import Fidelity, Frames, PlacedObject, Scene, WhiskerArray, Whisking, get_recipe
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.protocol import Trace
+from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.primitives import box, cylinder, sphere
 
 DURATION = 0.2

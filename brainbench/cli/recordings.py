@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from brainbench.metrics import SubjectRDM
+    from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 SelectOption = Annotated[str | None, option(SCORE, "select")]
 WindowOption = Annotated[str | None, option(SCORE, "window")]
@@ -51,7 +51,7 @@ def rdm(
     """Compute every animal's RDM (correlation distance) and its split-half reliability."""
     from dataclasses import replace
 
-    from brainbench.datasets import pooled
+    from brainbench.datasets.trials.session_trials import pooled
     from brainbench.scoring.neural_responses import open_neural_responses
 
     with progress_bar() as progress:
@@ -168,7 +168,7 @@ def recipe(
     as_json: JsonOption = False,
 ) -> None:
     """Print every rule by which a recording layout selects trials and units and cuts windows."""
-    from brainbench.datasets import get_layout, list_layouts
+    from brainbench.datasets.layouts.registry import get_layout, list_layouts
 
     if name is None:
         known = {item: get_layout(item).title for item in list_layouts()}

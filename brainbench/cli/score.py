@@ -89,7 +89,7 @@ def _command() -> str:
 
 
 def _text(record: ResultRecord) -> str:
-    from brainbench.metrics import turing_test
+    from brainbench.metrics.inference.equivalence import turing_test
 
     score, animals = record.score, record.animal_to_animal
     known = score.subjects or (animals.subjects if animals else ())

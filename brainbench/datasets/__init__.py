@@ -14,32 +14,18 @@ from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import inspect
 from brainbench.datasets.layouts.layout import RecordingLayout
-from brainbench.datasets.layouts.registry import get_layout, list_layouts, register_layout
+from brainbench.datasets.layouts.registry import register_layout
 from brainbench.datasets.recordings import open_recordings
-from brainbench.datasets.sessions import make_session
-from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.selection import Rule, Selection
-from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
-from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 
 __all__ = [
-    "Conditions",
     "RecordingLayout",
-    "Rule",
-    "Selection",
     "WhiskingDataset",
-    "Window",
     "check",
     "export",
     "fetch",
-    "get_layout",
     "inspect",
-    "list_layouts",
-    "make_session",
     "open_recordings",
-    "pooled",
     "register_layout",
-    "trials_by_subject",
     "write_recordings",
 ]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from brainbench.metrics import Metric
+    from brainbench.metrics.measures.registry import Metric
 
 DEMO_STIMULI = "rodgers"
 """Recipe that the demo animals feel."""
@@ -49,7 +49,7 @@ class NeuralResponses:
         self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
     ) -> tuple[Any, ...]:
         """Prepare every animal by a metric (RSA by default) over the labels ``kept``, in that order."""
-        from brainbench.datasets import trials_by_subject
+        from brainbench.datasets.trials.session_trials import trials_by_subject
         from brainbench.metrics import get_metric
 
         metric = metric or get_metric("rsa")

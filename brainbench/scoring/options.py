@@ -17,8 +17,9 @@ from brainbench.core.errors import unknown_name
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.datasets import Selection, Window
-    from brainbench.metrics import Metric
+    from brainbench.datasets.trials.selection import Selection
+    from brainbench.datasets.trials.windows import Window
+    from brainbench.metrics.measures.registry import Metric
     from brainbench.stimuli import Fidelity, Stimuli
 
 TIME_RULES = ("mean", "concatenate")

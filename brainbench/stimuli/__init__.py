@@ -12,18 +12,15 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.engines import get_engine
     from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.motion.recorded import Recorded, load_trajectory
-    from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation, Whisking
+    from brainbench.stimuli.motion.trajectories import Whisking
     from brainbench.stimuli.objects.placed_object import PlacedObject
-    from brainbench.stimuli.objects.shapenet import load_shapenet
     from brainbench.stimuli.objects.solid import Solid
-    from brainbench.stimuli.readout import to_frame, to_grid
+    from brainbench.stimuli.readout import to_grid
     from brainbench.stimuli.scenes.frames import Frames
-    from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, list_recipes
-    from brainbench.stimuli.scenes.scene import Animal, Head, Scene
-    from brainbench.stimuli.scenes.scene_files import Recipe, load_scene
+    from brainbench.stimuli.scenes.recipes import get_recipe, list_recipes
+    from brainbench.stimuli.scenes.scene import Head, Scene
+    from brainbench.stimuli.scenes.scene_files import load_scene
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.sources import Stimuli, load_stimuli
     from brainbench.stimuli.stimulus_set import read_stimulus_set, write_stimulus_set
@@ -33,53 +30,38 @@ if TYPE_CHECKING:
     from brainbench.stimuli.whiskers.whisker import Whisker
 
 __all__ = [
-    "Animal",
     "Fidelity",
     "Frames",
     "Head",
-    "Path",
     "PlacedObject",
-    "Recipe",
-    "Recorded",
     "Scene",
     "Solid",
-    "Spin",
-    "Still",
     "Stimuli",
     "SweepGrid",
-    "Translation",
     "Whisker",
     "WhiskerArray",
     "Whisking",
-    "describe_recipe",
-    "get_engine",
     "get_recipe",
     "list_recipes",
     "load_scene",
-    "load_shapenet",
     "load_stimuli",
-    "load_trajectory",
     "read_stimulus_set",
     "references",
     "simulate",
-    "to_frame",
     "to_grid",
     "write_stimulus_set",
 ]
 
 _MODULES = {
-    ".engines": ("get_engine",),
     ".engines.fidelity": ("Fidelity",),
-    ".motion.recorded": ("Recorded", "load_trajectory"),
-    ".motion.trajectories": ("Path", "Spin", "Still", "Translation", "Whisking"),
+    ".motion.trajectories": ("Whisking",),
     ".objects.placed_object": ("PlacedObject",),
-    ".objects.shapenet": ("load_shapenet",),
     ".objects.solid": ("Solid",),
-    ".readout": ("to_frame", "to_grid"),
+    ".readout": ("to_grid",),
     ".scenes.frames": ("Frames",),
-    ".scenes.recipes": ("describe_recipe", "get_recipe", "list_recipes"),
-    ".scenes.scene": ("Animal", "Head", "Scene"),
-    ".scenes.scene_files": ("Recipe", "load_scene"),
+    ".scenes.recipes": ("get_recipe", "list_recipes"),
+    ".scenes.scene": ("Head", "Scene"),
+    ".scenes.scene_files": ("load_scene",),
     ".simulation": ("simulate",),
     ".sources": ("Stimuli", "load_stimuli"),
     ".stimulus_set": ("read_stimulus_set", "write_stimulus_set"),

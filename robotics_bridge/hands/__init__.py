@@ -9,21 +9,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from brainbench.core.errors import unknown_name
 from brainbench.core.lazy import lazy_exports
 from robotics_bridge.hands.hand import Hand, from_file
-from robotics_bridge.hands.layouts import PLACEMENTS, RESOLUTIONS, active_count, read_probes, write_probes
 from robotics_bridge.hands.spec import read_spec
 
-if TYPE_CHECKING:
-    from robotics_bridge.hands import observations, scenes, surface
-
-__all__ = [
-    "PLACEMENTS", "RESOLUTIONS", "Hand", "active_count", "list_hands", "load", "observations", "read_probes", "scenes",
-    "surface", "write_probes",
-]  # fmt: skip
+__all__ = ["Hand", "list_hands", "load"]
 
 _OWN = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"))}
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.hands.layouts import Layout
-    from robotics_bridge.sensors import Sensor
+    from robotics_bridge.sensors.sensor import Sensor
 
 PATCH_FORCE_SCALE = 1e4
 """From summed depth (m) to the reading of the real finger tip (4.29)."""

@@ -12,8 +12,9 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from robotics_bridge.sensors import SensorSuite, TemperatureGrid, ThermalBody, ThermalMaterial
+from robotics_bridge.sensors import SensorSuite, TemperatureGrid
 from robotics_bridge.sensors.temperature.grid import link_temperature
+from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial
 
 if TYPE_CHECKING:
     import torch

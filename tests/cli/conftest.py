@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from brainbench.cli import main
-from brainbench.datasets import make_session, write_recordings
+from brainbench.datasets import write_recordings
+from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
 
 LABELS = ("a", "b", "c", "d")

@@ -8,18 +8,12 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from brainbench.datasets import (
-    check,
-    inspect,
-    make_session,
-    open_recordings,
-    pooled,
-    trials_by_subject,
-    write_recordings,
-)
-from brainbench.datasets.sessions import SessionTable
+from brainbench.core.trials import Trials
+from brainbench.datasets import check, inspect, open_recordings, write_recordings
+from brainbench.datasets.sessions import SessionTable, make_session
 from brainbench.datasets.synthetic import Design, ResponseGeometry, as_recordings, simulate
-from brainbench.metrics import Trials, subject_rdm
+from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.recordings import make_simple_session
 
 

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import inspect, make_session, open_recordings, trials_by_subject
+from brainbench.datasets import inspect, open_recordings
 from brainbench.datasets.nwb import read_nwb
+from brainbench.datasets.sessions import make_session
+from brainbench.datasets.trials.session_trials import trials_by_subject
 from tests.factories.recording_files import HUMAN, write_nwb
 
 INTRACELLULAR = {

@@ -7,22 +7,21 @@ import xarray as xr
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.datasets import (
-    Conditions,
     RecordingLayout,
-    Selection,
-    Window,
     check,
     export,
     fetch,
-    get_layout,
     inspect,
-    list_layouts,
     open_recordings,
     register_layout,
     write_recordings,
 )
 from brainbench.datasets.layouts.hires import recorded_runs
+from brainbench.datasets.layouts.registry import get_layout, list_layouts
 from brainbench.datasets.sessions import Series
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.selection import Selection
+from brainbench.datasets.trials.windows import Window
 from tests.factories.dandi_files import make_pole_task, write_area2, write_hires, write_yu
 from tests.factories.recordings import make_simple_session
 

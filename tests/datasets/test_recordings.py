@@ -7,16 +7,9 @@ from hypothesis import strategies as st
 
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.datasets import (
-    Selection,
-    check,
-    export,
-    inspect,
-    make_session,
-    open_recordings,
-    write_recordings,
-)
-from brainbench.datasets.sessions import Session
+from brainbench.datasets import check, export, inspect, open_recordings, write_recordings
+from brainbench.datasets.sessions import Session, make_session
+from brainbench.datasets.trials.selection import Selection
 from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session
 

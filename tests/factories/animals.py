@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.metrics import SubjectRDM, Trials, rdm
+from brainbench.core.trials import Trials
+from brainbench.metrics import rdm
 from brainbench.metrics.reliability.noise_correction import spearman_brown
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 STIMULI = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 

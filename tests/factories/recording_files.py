@@ -5,8 +5,9 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
-from brainbench.datasets import make_session, write_recordings
+from brainbench.datasets import write_recordings
 from brainbench.datasets.nwb_writer import NwbWriter
+from brainbench.datasets.sessions import make_session
 
 HUMAN = "pynapple_sub-4_ses-4_ecephys+image.nwb"
 """A file of human recordings among the private reference data."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.datasets import make_session
-from brainbench.datasets.sessions import Session
+from brainbench.datasets.sessions import Session, make_session
 
 LABELS = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 

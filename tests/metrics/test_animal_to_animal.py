@@ -9,15 +9,11 @@ import pytest
 from scipy import stats
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import (
-    compare,
-    noise_corrected,
-    pairwise_consistency,
-    score_animals,
-    subject_rdm,
-)
+from brainbench.metrics import compare, noise_corrected
+from brainbench.metrics.animal_to_animal import pairwise_consistency, score_animals
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.noise_correction import spearman_brown
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import noise_corrected, score_rdms
+from brainbench.metrics import noise_corrected
 from brainbench.metrics.explain import (
     CORRECTED,
     PUBLISHED,
@@ -19,6 +19,7 @@ from brainbench.metrics.explain import (
     explain_score,
     explain_splits,
 )
+from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brainbench.metrics import score_rdms
 from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
+from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 

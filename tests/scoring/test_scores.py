@@ -11,7 +11,8 @@ from torch import nn
 
 import brainbench
 from brainbench.core.errors import UsageError
-from brainbench.datasets import make_session, open_recordings, write_recordings
+from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
 from brainbench.scoring.scores import score_record
 

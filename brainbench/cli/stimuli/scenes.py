@@ -15,7 +15,8 @@ from brainbench.core.errors import UsageError, unknown_name
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.stimuli import Recipe, Scene
+    from brainbench.stimuli import Scene
+    from brainbench.stimuli.scenes.scene_files import Recipe
 
 WhiskersOption = Annotated[str, option(SCORE, "whiskers")]
 FidelityOption = Annotated[
@@ -77,7 +78,8 @@ def choose_scene(recipe: Recipe, stimulus: str | None) -> Scene:
 
 def list_(as_json: JsonOption = False) -> None:
     """List the stimulus recipes."""
-    from brainbench.stimuli import describe_recipe, list_recipes
+    from brainbench.stimuli import list_recipes
+    from brainbench.stimuli.scenes.recipes import describe_recipe
 
     recipes = {name: describe_recipe(name).strip() for name in list_recipes()}
     emit(recipes, table("", ["recipe", ""], [list(item) for item in recipes.items()]), as_json=as_json)

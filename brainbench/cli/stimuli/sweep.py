@@ -58,7 +58,8 @@ def sweep(
 
     A run that was interrupted or killed goes on where it stopped when the same command is given again.
     """
-    from brainbench.stimuli import Fidelity, get_engine
+    from brainbench.stimuli import Fidelity
+    from brainbench.stimuli.engines import get_engine
     from brainbench.stimuli.objects.collections import resolve_objects
     from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes, counts

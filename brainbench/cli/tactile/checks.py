@@ -78,7 +78,8 @@ def _white(device: str) -> Result:
 
 
 def _cooling(device: str) -> Result:
-    from robotics_bridge.sensors import TemperatureGrid, ThermalMaterial
+    from robotics_bridge.sensors import TemperatureGrid
+    from robotics_bridge.sensors.temperature.materials import ThermalMaterial
 
     material = ThermalMaterial(1.0, 1000.0, 1000.0, 0.0)
     grid = TemperatureGrid(
@@ -91,7 +92,8 @@ def _cooling(device: str) -> Result:
 
 
 def _tone(device: str) -> Result:
-    from robotics_bridge.sensors import ContactAudio, Modes
+    from robotics_bridge.sensors import ContactAudio
+    from robotics_bridge.sensors.audio.materials import Modes
 
     suite = _ball(device, {"a": ContactAudio(link="pad", modes=Modes((1000.0,), (0.0,), (1.0,)), samples=320)})
     heard = suite.read("a")[0, 0].cpu().double().numpy()
@@ -101,8 +103,8 @@ def _tone(device: str) -> Result:
 
 def _beam(device: str) -> Result:
     del device
-    from robotics_bridge.sensors import ElasticSolid, find_modes
     from robotics_bridge.sensors.audio.materials import ElasticMaterial
+    from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
 
     steel = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
     found = find_modes(ElasticSolid("box", (0.1, 0.005, 0.005)), steel, count=2, cells=16, cache=False).frequency[0]
@@ -112,11 +114,12 @@ def _beam(device: str) -> Result:
 def _counts(device: str) -> Result:
     del device
     from robotics_bridge import hands
+    from robotics_bridge.hands import layouts
 
     total = sum(
-        hands.active_count(hands.load(name).layout(level))
+        layouts.active_count(hands.load(name).layout(level))
         for name in ("xhand1", "sharpa")
-        for level in hands.RESOLUTIONS
+        for level in layouts.RESOLUTIONS
     )
     return float(total), float(90 + 199 + 667 + 98 + 206 + 781), 0.0
 

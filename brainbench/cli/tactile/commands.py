@@ -55,24 +55,25 @@ def layouts(
 ) -> None:
     """Count the probes of a hand by resolution and placement, as table 4.11 of the thesis does."""
     from robotics_bridge import hands
+    from robotics_bridge.hands import layouts
 
     chosen = hands.load(hand)
-    resolutions: tuple[str, ...] = hands.RESOLUTIONS
+    resolutions: tuple[str, ...] = layouts.RESOLUTIONS
     if probes is not None:
         chosen, resolutions = chosen.with_probes(probes), ("custom",)
     counts, rows, detail = {}, [], []
     for resolution in resolutions:
-        layout = {place: chosen.layout(resolution, place) for place in hands.PLACEMENTS}
-        counts[resolution] = {place: hands.active_count(layout[place]) for place in hands.PLACEMENTS}
-        rows.append([resolution, *(str(counts[resolution][place]) for place in hands.PLACEMENTS)])
+        layout = {place: chosen.layout(resolution, place) for place in layouts.PLACEMENTS}
+        counts[resolution] = {place: layouts.active_count(layout[place]) for place in layouts.PLACEMENTS}
+        rows.append([resolution, *(str(counts[resolution][place]) for place in layouts.PLACEMENTS)])
         for link, item in layout["hand"].items():
             shape = " × ".join(map(str, item.shape))
             radius = sorted({f"{1e3 * value:g}" for value in item.radius[item.active]})
             detail.append([resolution, link, shape, str(int(item.active.sum())), ", ".join(radius)])
         if out is not None:
-            hands.write_probes(out / f"{chosen.name}_{resolution}.json", layout["hand"])
+            layouts.write_probes(out / f"{chosen.name}_{resolution}.json", layout["hand"])
     text = table(f"{chosen.name}: {len(chosen.joints)} joints, {len(chosen.fingers)} fingers, palm {chosen.palm}",
-                 ["resolution", *hands.PLACEMENTS], rows, right=(1, 2, 3, 4))  # fmt: skip
+                 ["resolution", *layouts.PLACEMENTS], rows, right=(1, 2, 3, 4))  # fmt: skip
     if links:
         text += "\n\n" + table("", ["resolution", "link", "grid", "active", "radius (mm)"], detail, right=(3,))
     data = {

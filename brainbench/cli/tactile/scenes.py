@@ -57,6 +57,8 @@ class Grip:
     def sensors(self, name: str, resolution: str, placement: str, *, noisy: bool = False) -> dict[str, Any]:
         """Return a sensor of one class on every link of a layout, by link."""
         from robotics_bridge import sensors
+        from robotics_bridge.sensors.audio.materials import Modes
+        from robotics_bridge.sensors.temperature.materials import ThermalBody
 
         if name not in CLASSES:
             raise unknown_name("sensor class", name, CLASSES)
@@ -64,10 +66,10 @@ class Grip:
         layout = self.hand.layout(resolution, placement)
         common = {"noise": sensors.Noise.preset(CLASSES[name])} if noisy else {}
         if name == "TemperatureGrid":
-            body = {"object": sensors.ThermalBody("steel", 45.0)}
+            body = {"object": ThermalBody("steel", 45.0)}
             return {link: kind(link=link, cells=(3, 3, 3), bodies=body, **common) for link in layout}
         if name == "ContactAudio":
-            modes = sensors.Modes(tuple(np.geomspace(300, 9000, 16).tolist()), (30.0,) * 16, (1.0,) * 16)
+            modes = Modes(tuple(np.geomspace(300, 9000, 16).tolist()), (30.0,) * 16, (1.0,) * 16)
             return {"object": kind(link="object", modes=modes, **common)}
         extra: dict[str, Any] = {"track": ("object",)}
         if name in ("ElastomerTaxel", "ProximityTaxel"):
@@ -164,7 +166,8 @@ def markers(path: Path, *, noisy: bool) -> dict[str, float]:
 
 def temperature(path: Path, hand: str) -> dict[str, float]:
     """Draw the warming of the finger tips by a ball of 45 °C, for three materials."""
-    from robotics_bridge.sensors import SensorSuite, TemperatureGrid, ThermalBody
+    from robotics_bridge.sensors import SensorSuite, TemperatureGrid
+    from robotics_bridge.sensors.temperature.materials import ThermalBody
 
     grip = Grip(hand)
     tips = grip.hand.tips
@@ -196,7 +199,8 @@ def sound(path: Path) -> dict[str, float]:
     """Draw spectrograms of a ball that bounces on plates of wood, metal and glass."""
     from brainbench.core.devices import mujoco_module as mujoco
     from robotics_bridge.physics import MujocoEngine
-    from robotics_bridge.sensors import ContactAudio, ElasticSolid, SensorSuite, find_modes
+    from robotics_bridge.sensors import ContactAudio, SensorSuite
+    from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
 
     model = mujoco().MjModel.from_xml_string("""
     <mujoco><option timestep="0.005"/><worldbody>

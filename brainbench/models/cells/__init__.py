@@ -14,18 +14,14 @@ Schmidhuber 1997, Gers et al. 2000. Order and names of the gates follow PyTorchT
 
 from collections.abc import Callable, Mapping
 
-from brainbench.models.cells.cell import FORGET_BIAS, Cell, ChannelNorm, Projected
-from brainbench.models.cells.gated import GatedCell
+from brainbench.models.cells.cell import Cell
 from brainbench.models.cells.gru import GRU
 from brainbench.models.cells.intersection import IntersectionRNN
 from brainbench.models.cells.lstm import LSTM
 from brainbench.models.cells.time_decay import TimeDecay
 from brainbench.models.cells.ugrnn import UGRNN
 
-__all__ = [
-    "CELLS", "FORGET_BIAS", "GRU", "LSTM", "UGRNN", "Cell", "ChannelNorm", "GatedCell", "IntersectionRNN", "Projected",
-    "TimeDecay",
-]  # fmt: skip
+__all__ = ["GRU", "LSTM", "UGRNN", "IntersectionRNN", "TimeDecay"]
 
 CELLS: Mapping[str, Callable[..., Cell]] = {
     "time-decay": TimeDecay,

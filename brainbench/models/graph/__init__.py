@@ -7,32 +7,18 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Pool
-    from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
+    from brainbench.models.graph.spec import GraphSpec
+    from brainbench.models.graph.temporal_graph import TemporalGraph
 
 __all__ = [
-    "Convolution",
-    "Dense",
-    "Edge",
     "GraphSpec",
-    "GraphState",
-    "Memory",
-    "Node",
-    "Pool",
     "TemporalGraph",
 ]
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "Convolution": ".spec",
-        "Dense": ".spec",
-        "Edge": ".spec",
         "GraphSpec": ".spec",
-        "GraphState": ".temporal_graph",
-        "Memory": ".spec",
-        "Node": ".spec",
-        "Pool": ".spec",
         "TemporalGraph": ".temporal_graph",
     },
 )

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from brainbench.models.cells import GatedCell, IntersectionRNN
+from brainbench.models.cells import IntersectionRNN
+from brainbench.models.cells.gated import GatedCell
 from brainbench.models.graph.spec import GraphSpec, Unroll
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.convolution import DeferredWeightGrad

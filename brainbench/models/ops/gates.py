@@ -13,7 +13,8 @@ from torch.autograd.function import once_differentiable
 from brainbench.models.ops.convolution import HALF, DeferredWeightGrad
 
 if TYPE_CHECKING:
-    from brainbench.models.cells import ChannelNorm, IntersectionRNN
+    from brainbench.models.cells import IntersectionRNN
+    from brainbench.models.cells.cell import ChannelNorm
 
 
 class DeferredNormGrad:

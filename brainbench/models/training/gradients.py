@@ -15,7 +15,8 @@ from torch import nn
 from brainbench.core.cuda_graphs import record_step
 from brainbench.models.attenders.gpt import GPTBlock
 from brainbench.models.attenders.mamba import MambaBlock
-from brainbench.models.cells import Cell, GatedCell
+from brainbench.models.cells.cell import Cell
+from brainbench.models.cells.gated import GatedCell
 from brainbench.models.encoders.resnet import BasicBlock
 from brainbench.models.encoders.s4 import S4Block
 

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.validation import references
-    from brainbench.stimuli.validation.bench_tests import BenchTest, peg, point_load, ringdown, slip_off
+    from brainbench.stimuli.validation.bench_tests import peg, point_load, ringdown, slip_off
 
-__all__ = ["BenchTest", "peg", "point_load", "references", "ringdown", "slip_off"]
+__all__ = ["peg", "point_load", "ringdown", "slip_off"]
 
 _MODULES = {
-    ".bench_tests": ("BenchTest", "peg", "point_load", "ringdown", "slip_off"),
+    ".bench_tests": ("peg", "point_load", "ringdown", "slip_off"),
     ".references.": ("references",),
 }
 __getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

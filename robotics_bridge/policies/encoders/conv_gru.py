@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
-from brainbench.models.cells import FORGET_BIAS
+from brainbench.models.cells.cell import FORGET_BIAS
 
 if TYPE_CHECKING:
     from brainbench.models.cells import GRU

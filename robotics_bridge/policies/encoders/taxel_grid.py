@@ -27,6 +27,7 @@ from torch import nn
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
+from robotics_bridge.hands import layouts
 from robotics_bridge.hands.observations import observation_type, observe
 from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 
@@ -80,7 +81,7 @@ class TaxelGrid(nn.Module):
         self.observe = observe
         self.channels: int = kind.channels
         """C."""
-        own = resolution not in hands.RESOLUTIONS
+        own = resolution not in layouts.RESOLUTIONS
         self.axes: FingerAxes = finger_axes_of(body, body.layout(resolution if own else "med", "hand"))
         parts = [_scatter(self.axes, link, probes, observe) for link, probes in self.layout.items()]
         if not parts:

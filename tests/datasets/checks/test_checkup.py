@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataFileNotFoundError, UsageError
-from brainbench.datasets import check, make_session, write_recordings
+from brainbench.datasets import check, write_recordings
 from brainbench.datasets.checks.spikes import coincidences
 from brainbench.datasets.exports import subset
 from brainbench.datasets.reading import each_session, open_file
-from brainbench.datasets.sessions import SPIKES, Session, SessionTable, ragged
+from brainbench.datasets.sessions import SPIKES, Session, SessionTable, make_session, ragged
 from brainbench.datasets.synthetic import Design, ResponseGeometry, make_sessions, write_files
 from tests.factories.recording_files import HUMAN, detection, write_nwb, write_rodgers
 from tests.factories.recordings import make_simple_session

@@ -6,15 +6,9 @@ import pytest
 import xarray as xr
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import (
-    export,
-    get_layout,
-    inspect,
-    list_layouts,
-    make_session,
-    open_recordings,
-    write_recordings,
-)
+from brainbench.datasets import export, inspect, open_recordings, write_recordings
+from brainbench.datasets.layouts.registry import get_layout, list_layouts
+from brainbench.datasets.sessions import make_session
 from tests.factories.recording_files import ROWS, detection, write_rodgers
 from tests.factories.recordings import LABELS
 

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import open_recordings, trials_by_subject
+from brainbench.core.trials import Trials
+from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import (
     FAULTS,
     Design,
@@ -21,7 +22,9 @@ from brainbench.datasets.synthetic import (
     stimulus_means,
     write_files,
 )
-from brainbench.metrics import Trials, noise_ceiling, rdm, subject_rdm
+from brainbench.datasets.trials.session_trials import trials_by_subject
+from brainbench.metrics import noise_ceiling, rdm
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 
 SMALL = Design(animals=3, sessions=2, units=12, trials=5)
 

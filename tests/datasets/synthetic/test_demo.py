@@ -9,8 +9,9 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import file_hash
-from brainbench.datasets import inspect, open_recordings, trials_by_subject
+from brainbench.datasets import inspect, open_recordings
 from brainbench.datasets.synthetic import demo, read_truth
+from brainbench.datasets.trials.session_trials import trials_by_subject
 from tests.factories.recordings import LABELS, make_stimuli
 
 

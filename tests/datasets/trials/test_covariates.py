@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brainbench.datasets import export, make_session, open_recordings, trials_by_subject, write_recordings
+from brainbench.datasets import export, open_recordings, write_recordings
+from brainbench.datasets.sessions import make_session
+from brainbench.datasets.trials.session_trials import trials_by_subject
 
 
 def _make_file(path, choices):

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import Rule, Selection
 from brainbench.datasets.sessions import SessionTable
-from brainbench.datasets.trials.selection import Tally
+from brainbench.datasets.trials.selection import Rule, Selection, Tally
 
 
 def make_table(**columns):

@@ -3,7 +3,8 @@ import pytest
 import xarray as xr
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import open_recordings, pooled, trials_by_subject, write_recordings
+from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
 from tests.factories.recordings import make_simple_session
 
 

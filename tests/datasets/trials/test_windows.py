@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import Window, make_session
+from brainbench.datasets.sessions import make_session
+from brainbench.datasets.trials.windows import Window
 
 
 def make_contacts(**tables):

@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import bootstrap_score, compare, noise_ceiling, score_rdms, subject_rdm
-from brainbench.metrics.inference.bootstrap import animal_counts, bootstrap_ceiling, bootstrap_comparisons, ceilings
+from brainbench.metrics import compare, noise_ceiling
+from brainbench.metrics.inference.bootstrap import (
+    animal_counts,
+    bootstrap_ceiling,
+    bootstrap_comparisons,
+    bootstrap_score,
+    ceilings,
+)
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
+from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 

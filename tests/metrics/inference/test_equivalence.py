@@ -9,8 +9,11 @@ import pytest
 from scipy import stats
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import rdm, score_animals, score_rdms, subject_rdm, turing_test
-from brainbench.metrics.inference.equivalence import equivalence_test
+from brainbench.metrics import rdm
+from brainbench.metrics.animal_to_animal import score_animals
+from brainbench.metrics.inference.equivalence import equivalence_test, turing_test
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
+from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_block, make_latent
 
 

@@ -9,9 +9,10 @@ import pytest
 from scipy import stats
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import compare, compare_models, layer_tests, permutation_test, score_rdms
-from brainbench.metrics.inference.multiple import adjust, sign_flip_p, step_down
+from brainbench.metrics import compare, compare_models, permutation_test
+from brainbench.metrics.inference.multiple import adjust, layer_tests, sign_flip_p, step_down
 from brainbench.metrics.inference.permutation import permuted_values
+from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 

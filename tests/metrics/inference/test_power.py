@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import score_rdms
 from brainbench.metrics.inference.power import ExperimentDesign, needed, power, simulate_experiments
+from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_subject
 
 

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from brainbench.metrics import Trials, get_metric
+from brainbench.core.trials import Trials
+from brainbench.metrics import get_metric
 from brainbench.metrics.measures.classifier import decode
 from brainbench.metrics.measures.decoding import label_properties
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brainbench.metrics import Trials, get_metric, rdm
+from brainbench.core.trials import Trials
+from brainbench.metrics import get_metric, rdm
 from brainbench.metrics.measures.nuisance import partial_correlations, variance_partition
 
 STIMULI = list("abcdefg")

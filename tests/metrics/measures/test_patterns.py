@@ -9,15 +9,8 @@ import pytest
 from scipy.linalg import orthogonal_procrustes
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.metrics import (
-    PatternMetric,
-    Trials,
-    compare,
-    get_metric,
-    list_metrics,
-    rdm,
-    register_metric,
-)
+from brainbench.core.trials import Trials
+from brainbench.metrics import PatternMetric, compare, get_metric, list_metrics, rdm, register_metric
 from brainbench.metrics.measures.animal_patterns import animal_patterns
 from brainbench.metrics.measures.procrustes import Procrustes, procrustes_distance
 from brainbench.metrics.measures.ridge import PENALTIES, RidgeEncoding

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import compare, rdm, rdm_movie
+from brainbench.metrics import compare, rdm
+from brainbench.metrics.rdms.dissimilarity import rdm_movie
 
 
 @pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "poisson"])

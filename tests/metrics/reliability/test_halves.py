@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.metrics import Trials, compare, rdm, subject_rdm
+from brainbench.core.trials import Trials
+from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.halves import WeightedRDMs, members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.reliability.trial_hashes import content_hashes, draws, key_hashes
 from tests.factories.animals import STIMULI, make_block, make_latent
 

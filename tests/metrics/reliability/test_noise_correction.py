@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import compare, noise_corrected, rdm, subject_rdm
+from brainbench.metrics import compare, noise_corrected, rdm
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, corrected_splits, spearman_brown
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import make_block, make_latent
 
 

@@ -9,10 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brainbench.metrics import Trials, rdm, subject_rdm
+from brainbench.core.trials import Trials
+from brainbench.metrics import rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.resampling import resample, trial_counts
 from brainbench.metrics.reliability.sessions import SortedTrials
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.reliability.trial_hashes import key_hashes
 from tests.factories.animals import make_block, make_latent
 

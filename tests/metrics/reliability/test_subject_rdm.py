@@ -7,9 +7,11 @@ import warnings
 import numpy as np
 import pytest
 
-from brainbench.metrics import Trials, noise_precision, rdm, subject_rdm
+from brainbench.core.trials import Trials
+from brainbench.metrics import noise_precision, rdm
 from brainbench.metrics.reliability.halves import WeightedRDMs, half_rdms, split_members
 from brainbench.metrics.reliability.sessions import SortedTrials
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.reliability.trial_hashes import key_hashes
 from tests.factories.animals import make_block, make_latent
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import Trials, subject_rdm
+from brainbench.core.trials import Trials
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.reliability.units import reliable_units, unit_reliability
 
 

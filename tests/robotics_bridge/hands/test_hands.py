@@ -12,7 +12,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.rotations import from_rpy
 from robotics_bridge import hands
 from robotics_bridge.hands.hand import palmar_directions
-from robotics_bridge.hands.layouts import active_count, fillers, read_probes, write_probes
+from robotics_bridge.hands.layouts import RESOLUTIONS, active_count, fillers, read_probes, write_probes
 from robotics_bridge.hands.spec import CapsuleGeometry, HandSpec, Joint, Link, build
 
 URDF = {
@@ -145,7 +145,7 @@ def test_servo_gains_are_those_of_the_actuators_file(name, reference):
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", hands.list_hands())
-@pytest.mark.parametrize("resolution", hands.RESOLUTIONS)
+@pytest.mark.parametrize("resolution", RESOLUTIONS)
 def test_published_probe_files_are_read_with_their_counts_and_links(name, resolution, reference):
     path = next((reference / "tactile" / name / resolution).glob("probes_*.json"))
     hand = hands.load(name).with_probes(path)

@@ -12,6 +12,7 @@ from brainbench.core.rotations import about, multiply
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import PolicyEvaluation, agent, evaluate
+from robotics_bridge.tasks.task import Placement
 
 
 def _env() -> Env:
@@ -45,7 +46,7 @@ def test_what_success_does_not_tell_is_graded() -> None:
     assert summary["seconds"] == pytest.approx(0.1)
     assert {"turn_rate", "goals_half_width", "dropped"} <= set(summary)
     # Beside the hand the block falls: nothing touches it, so nothing turns it.
-    falls = replace(tasks.load("in_palm_rotate"), placement=tasks.Placement(height=1.0, x=(0.5, 0.5), y=(0.5, 0.5)))
+    falls = replace(tasks.load("in_palm_rotate"), placement=Placement(height=1.0, x=(0.5, 0.5), y=(0.5, 0.5)))
     env = tasks.make(falls, num_envs=2, threads=1)
     fallen = evaluate(env, agent("zero", env), episodes=2, seed=0)
     assert fallen.dropped == (True, True)

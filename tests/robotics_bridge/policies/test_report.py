@@ -9,7 +9,8 @@ from scipy import stats
 from brainbench.core.errors import DataError
 from brainbench.core.files import read_json, write_json
 from brainbench.core.statistics import newcombe_interval
-from leaderboards import rank, read_record, write_record
+from leaderboards import rank, write_record
+from leaderboards.store import read_record
 from robotics_bridge.policies.report import (
     COLUMNS,
     LeftOut,

@@ -18,6 +18,7 @@ from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import box, screwdriver, slots, with_sizes
 from robotics_bridge.tasks.scenes import build, palm_up
+from robotics_bridge.tasks.task import ObjectRandomisation
 
 MY_TASK = """
 from dataclasses import replace
@@ -63,7 +64,7 @@ def test_unknown_names_are_met_with_the_nearest() -> None:
     with pytest.raises(UsageError, match="positive length"):
         replace(tasks.load("screwdriver"), episode=0.0)
     with pytest.raises(UsageError, match="range"):
-        replace(tasks.load("screwdriver"), object_changes=tasks.ObjectRandomisation(friction=(2.0, 1.0)))
+        replace(tasks.load("screwdriver"), object_changes=ObjectRandomisation(friction=(2.0, 1.0)))
 
 
 def test_stepping_goals_lie_one_step_further_about_the_axis() -> None:
@@ -134,7 +135,7 @@ def test_a_finger_that_the_hand_lacks_is_named() -> None:
 
 
 def test_sampled_grasps_hold_without_any_action() -> None:
-    task = replace(tasks.load("screwdriver"), push=None, object_changes=tasks.ObjectRandomisation())
+    task = replace(tasks.load("screwdriver"), push=None, object_changes=ObjectRandomisation())
     env = tasks.make(task, num_envs=8, threads=1)
     start = env.object_pose[:, 0, :3].clone()
     # In published terms: three finger tips nearer than 2 cm, and the tool does not move by a centimetre.

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
+from robotics_bridge.hands import layouts
 from robotics_bridge.hands.observations import observation_type, observe
 from robotics_bridge.policies.encoders.finger_axes import finger_rows
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
@@ -44,8 +45,8 @@ def _total(grid: TaxelGrid, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return force.sum((1, 2)), about.sum((1, 2))
 
 
-@pytest.mark.parametrize("resolution", hands.RESOLUTIONS)
-@pytest.mark.parametrize("placement", hands.PLACEMENTS)
+@pytest.mark.parametrize("resolution", layouts.RESOLUTIONS)
+@pytest.mark.parametrize("placement", layouts.PLACEMENTS)
 @pytest.mark.parametrize("name", HANDS)
 def test_force_and_torque_of_the_whole_hand_are_conserved(name, placement, resolution) -> None:
     grid = TaxelGrid(name, placement=placement, resolution=resolution)
@@ -108,7 +109,7 @@ def test_medium_resolution_fills_every_site_and_sites_run_from_tip_to_wrist(name
 @pytest.mark.parametrize("name", HANDS)
 def test_a_spot_of_skin_keeps_its_cell_at_every_placement_and_resolution(name) -> None:
     whole = _GRIDS[name]
-    for resolution in hands.RESOLUTIONS:
+    for resolution in layouts.RESOLUTIONS:
         for placement in ("tips", "fingers"):
             part = TaxelGrid(name, placement=placement, resolution=resolution)
             np.testing.assert_array_equal(part.axes.edges, whole.axes.edges)

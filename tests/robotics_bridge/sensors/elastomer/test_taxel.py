@@ -9,7 +9,8 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics import Geometry
-from robotics_bridge.sensors import ElastomerTaxel, Layer, Noise, Probes, SensorSuite
+from robotics_bridge.sensors import ElastomerTaxel, Noise, Probes, SensorSuite
+from robotics_bridge.sensors.elastomer.taxel import Layer
 from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 
 BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.006,))

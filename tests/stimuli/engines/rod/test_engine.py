@@ -372,7 +372,7 @@ def test_sweeps_through_the_fast_path_may_leave_inertia_out():
 
 @pytest.mark.parametrize("name", ["mujoco", "bullet"])
 def test_other_engines_refuse_to_leave_inertia_out(name):
-    from brainbench.stimuli import get_engine
+    from brainbench.stimuli.engines import get_engine
 
     if name == "bullet":
         pytest.importorskip("pybullet")
