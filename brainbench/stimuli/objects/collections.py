@@ -145,7 +145,7 @@ def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObje
     for path in paths:
         label = path.parent.name if several else path.stem
         source = f"mesh {file_hash(path)} in {unit}, {collision}"
-        load = functools.partial(_load, path.absolute(), unit, collision)
+        load = functools.partial(mesh_solid, path.absolute(), unit=unit, collision=collision)
         yield NamedObject(f"{label}/{path.stem}" if several else path.stem, label, source, load)
 
 
@@ -154,10 +154,6 @@ def _match(pattern: Path) -> list[Path]:
     if pattern.is_file():
         return [pattern]
     return sorted(Path(pattern.anchor or ".").glob(str(pattern.relative_to(pattern.anchor))))
-
-
-def _load(path: Path, unit: str, collision: str) -> Solid:
-    return mesh_solid(path, unit=unit, collision=collision)
 
 
 def _shapenet(text: str, collision: str) -> Iterator[NamedObject]:
