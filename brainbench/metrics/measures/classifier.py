@@ -165,7 +165,7 @@ def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) ->
 
 
 def _partition(codes: Ints) -> tuple[int, ...]:
-    """Number the classes by first appearance."""
+    """Give the classes numbers in order of first appearance."""
     seen: dict[int, int] = {}
     return tuple(seen.setdefault(code, len(seen)) for code in codes.tolist())
 

@@ -42,7 +42,7 @@ class Reach:
         return sum(len(obstacle.surface.faces) for obstacle in self.obstacles if obstacle.surface is not None)
 
     def links(self, chain: Chain) -> int:
-        """Number of links of the chain that come near enough to touch; links closer to the base never do."""
+        """Return how many links of the chain come near enough to touch; links closer to the base never do."""
         return int(np.count_nonzero(chain.nodes[1:] + chain.radii >= self.nearest)) if self else 0
 
 

@@ -14,7 +14,7 @@ def ellipsoid(draw: ShapeSampler, detail: int) -> Body:
 
 
 def superquadric(draw: ShapeSampler, detail: int) -> Body:
-    """Rounded box, cylinder or double cone (Barr 1981) with both exponents drawn."""
+    """Draw a rounded box, cylinder or double cone (Barr 1981) with both exponents drawn."""
     vertical, around_z = draw("exponent_vertical", 0.25, 1.9), draw("exponent_around", 0.25, 1.9)
     y, z = draw("y_over_x", 0.7, 1.0), draw("z_over_x", 0.6, 1.4)
 

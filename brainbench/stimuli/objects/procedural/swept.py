@@ -77,7 +77,7 @@ def horseshoe(draw: ShapeSampler, detail: int) -> Body:
 
 
 def hook(draw: ShapeSampler, detail: int) -> Body:
-    """Walking cane: a straight bar that curls round at one end."""
+    """Draw a walking cane: a straight bar that curls round at one end."""
     length, bar, curl = draw("shaft", 1.6, 2.8), draw("bar", 0.12, 0.2), draw("curl", 0.8, 1.25)
     sides, steps = _mesh_of(detail)
     angle = np.linspace(0, curl * np.pi, steps // 2)
