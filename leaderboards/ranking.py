@@ -180,12 +180,11 @@ def comparisons(record: ResultRecord) -> list[str]:
                 f"{verdict} {name} ({number(other.value)}): difference {number(mean)} {span(interval)}, paired over "
                 f"{animals} animals."
             )
-        elif score.interval.low > other.interval.high:
-            sentences.append(f"Above {name} ({number(other.value)}): the intervals do not overlap.")
-        elif score.interval.high < other.interval.low:
-            sentences.append(f"Below {name} ({number(other.value)}): the intervals do not overlap.")
         else:
-            sentences.append(f"Not told apart from {name} ({number(other.value)}): the intervals overlap.")
+            above, below = score.interval.low > other.interval.high, score.interval.high < other.interval.low
+            verdict = "Above" if above else "Below" if below else "Not told apart from"
+            how = "do not overlap" if above or below else "overlap"
+            sentences.append(f"{verdict} {name} ({number(other.value)}): the intervals {how}.")
     if any("overlap" in sentence for sentence in sentences):
         sentences.append(f"With fewer than {PAIRED_ANIMALS} animals in common no paired test is trusted.")
     return sentences

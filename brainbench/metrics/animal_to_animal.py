@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.records import Interval, Provenance, Score, Status, SubjectScore
+from brainbench.core.provenance import Provenance
+from brainbench.core.records import Interval, Score, Status, SubjectScore
 from brainbench.metrics.animals import (
     Animals,
     ceiling_of,

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
-from brainbench.core.records import LayerScore, Provenance, Score, Status, SubjectScore
+from brainbench.core.provenance import Provenance
+from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.metrics.animals import (
     Animals,
     ceiling_of,

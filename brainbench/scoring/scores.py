@@ -16,7 +16,8 @@ from brainbench.core.errors import UsageError
 from brainbench.core.files import provenance, to_plain
 from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
-from brainbench.core.records import ESTIMATOR_VERSION, Provenance, ResultRecord, Score
+from brainbench.core.provenance import Provenance
+from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
 
 

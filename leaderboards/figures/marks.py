@@ -60,8 +60,8 @@ class Axis:
 
     def mark(self, value: float, interval: Interval | None = None, points: Sequence[float] = ()) -> Mark:
         """Place a value with its interval and the single observations behind it; NaN is not drawn."""
-        span = (interval.low, interval.high) if interval and is_finite(interval) else None
-        seen = [item for item in (value, *(span or ()), *points) if math.isfinite(item)]
+        span = interval_ends(interval)
+        seen = [item for item in (value, *span, *points) if math.isfinite(item)]
         return Mark(
             x=self.at(value) if self.low <= value <= self.high else None,
             low=self.at(span[0]) if span else None,

@@ -10,7 +10,6 @@ from itertools import combinations
 import numpy as np
 
 from brainbench.core.records import Interval
-from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry
 from leaderboards.figures.marks import colour_at, interval_ends
 from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, shorten, tick_text
@@ -19,6 +18,8 @@ from leaderboards.text import number, span
 WIDTH = 760.0
 SHOWN = 60
 """Most models in one figure; the table holds all."""
+_LEAST_VARIANCE = 1e-100
+"""Products of two smaller ones would be zero in floating point."""
 _SHAPES = {"supervised": "square", "simclr": "cross", "simsiam": "up", "ae": "down", "untrained": "dot"}
 
 
@@ -38,11 +39,11 @@ class Figure:
 def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float, Interval | None]:
     """Return slope, intercept, Pearson's r and its 95 % interval by Fisher's z (None below four points).
 
-    r is NaN when either variable is constant.
+    r is NaN when either variable is constant, or so nearly that its variance cannot be divided by.
     """
     from scipy.stats import linregress, pearsonr
 
-    if min(x) == max(x) or min(y) == max(y):
+    if min(x) == max(x) or min(y) == max(y) or min(np.var(x), np.var(y)) < _LEAST_VARIANCE:
         return math.nan, math.nan, math.nan, None
     slope, start, r = np.array(linregress(x, y))[:3].tolist()
     interval = None
@@ -217,8 +218,8 @@ def row_chart(
         drawing.line(scale.at(tick), top, scale.at(tick), bottom, "one" if tick == 1 else "grid")
         drawing.text(scale.at(tick), top - 6, tick_text(tick), "mid quiet")
     drawing.text(scale.end, 11, label, "end quiet small")
-    if band is not None and is_finite(band):
-        left, right = scale.at(band.low), scale.at(band.high)
+    if ends := interval_ends(band):
+        left, right = map(scale.at, ends)
         drawing.rect(left, top, right - left, bottom - top, "band")
     for index, row in enumerate(rows):
         y = 44 + step * index
@@ -229,8 +230,9 @@ def row_chart(
             length = scale.at(bar.value) - scale.start
             drawing.rect(scale.start, y + bar.top, length, bar.height, bar.kind, tip=bar.tip)
         y += row.drop
-        if row.interval is not None and is_finite(row.interval):
-            drawing.line(scale.at(row.interval.low), y, scale.at(row.interval.high), y, f"span {row.kind}")
+        if ends := interval_ends(row.interval):
+            left, right = map(scale.at, ends)
+            drawing.line(left, y, right, y, f"span {row.kind}")
         for point in row.points:
             if math.isfinite(point.value):
                 drawing.mark(scale.at(point.value), y, point.shape, point.kind, point.tip, point.size)

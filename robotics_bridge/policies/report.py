@@ -19,7 +19,8 @@ import numpy as np
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import content_hash, provenance, read_json
-from brainbench.core.records import Interval, ModelCard, Provenance, ResultRecord, Score, SubjectScore
+from brainbench.core.provenance import Provenance
+from brainbench.core.records import Interval, ModelCard, ResultRecord, Score, SubjectScore
 from brainbench.core.statistics import newcombe_interval, t_interval, wilson_interval
 from robotics_bridge.policies.evaluate import mean_of_episodes
 from robotics_bridge.policies.training.distill_config import DistillConfig

@@ -11,12 +11,12 @@ import leaderboards
 from brainbench.core.contracts import CHANNELS, check_recordings, check_stimulus_set
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
+from brainbench.core.provenance import Provenance
 from brainbench.core.records import (
     Ceiling,
     Interval,
     LayerScore,
     ModelCard,
-    Provenance,
     ResultRecord,
     Score,
     SubjectScore,

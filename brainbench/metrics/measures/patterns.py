@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
-from brainbench.core.records import Interval, LayerScore, Provenance, Score, Status
+from brainbench.core.provenance import Provenance
+from brainbench.core.records import Interval, LayerScore, Score, Status
 from brainbench.core.trials import Trials
 from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.intervals import interval_reasons, t_interval

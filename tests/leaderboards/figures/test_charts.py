@@ -96,6 +96,10 @@ def test_regression_agrees_with_scipy(points):
         )
 
 
+def test_a_variable_whose_variance_vanishes_has_no_regression():
+    assert math.isnan(regression([0.0, 0.0, 0.0, 1.5e-299], [0.0, 0.0, 0.0, 1.0])[2])
+
+
 def test_layers_stand_at_their_scores(make_record):
     (board,) = rank([make_record("net")])
     (entry,) = entries_of(board)

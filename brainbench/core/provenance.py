@@ -1,0 +1,114 @@
+"""Origin of a score: versions, machine, data with hashes, settings and the command that makes it again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+@dataclass(frozen=True, eq=False)
+class Provenance(Mapping[str, Any]):
+    """Origin of a score. Read as a mapping it has the entries that are stated, as the JSON has."""
+
+    version: str = ""
+    """Version of this package that made the score."""
+    time: str = ""
+    """When, in ISO format."""
+    machine: str = ""
+    """Operating system and processor."""
+    python: str = ""
+    packages: Mapping[str, str] = field(default_factory=dict)
+    """Versions of the packages that numbers may depend on."""
+    seconds: float = 0.0
+    """Time that the computation took [s]."""
+    command: str = ""
+    """Command line that makes the score again."""
+    recordings: Mapping[str, Any] = field(default_factory=dict)
+    """``source``, ``content_hash``, ``window``, ``selection``, ``removed`` and ``synthetic`` of the recordings."""
+    stimuli: Mapping[str, Any] = field(default_factory=dict)
+    """``description``, ``content_hash``, ``config_hash`` and ``backend``; empty for features computed elsewhere."""
+    pairs: Mapping[str, str] = field(default_factory=dict)
+    """Recording label → stimulus label."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the run, from which the same score can be computed again."""
+    statistics: Mapping[str, Any] = field(default_factory=dict)
+    """Additions of single metrics and tests: layer tests, bootstrap, accuracies, shares of variance."""
+    more: Mapping[str, Any] = field(default_factory=dict)
+    """All else that was stated, and entries of another kind than above: a record is data that anyone may write."""
+
+    @classmethod
+    def of(cls, stated: Mapping[str, Any]) -> Provenance:
+        """Return the provenance that a mapping states; as a mapping it is equal to that."""
+        kinds: dict[str, Any] = dict.fromkeys(("version", "time", "machine", "python", "command"), str)
+        kinds |= dict.fromkeys(("packages", "recordings", "stimuli", "pairs", "settings", "statistics"), Mapping)
+        kinds["seconds"] = (int, float)
+        typed: dict[str, Any] = {
+            name: value for name, value in stated.items() if value and isinstance(value, kinds.get(name, ()))
+        }
+        return cls(**typed, more={name: value for name, value in stated.items() if name not in typed})
+
+    @property
+    def recordings_name(self) -> str:
+        """Short name of the recordings: the last part of each path, or ``unnamed recordings``."""
+        source = self.recordings.get("source")
+        sources = source if isinstance(source, (list, tuple)) else [source] if source else []
+        names = [str(item).replace("\\", "/").rstrip("/").rpartition("/")[2] for item in sources]
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        return ", ".join(names[:3]) + more or "unnamed recordings"
+
+    @property
+    def recordings_hash(self) -> str | None:
+        """Content hash of the recordings, if stated."""
+        return _text(self.recordings.get("content_hash")) or None
+
+    @property
+    def stimuli_name(self) -> str:
+        """Description of the stimuli; empty if not stated."""
+        return _text(self.stimuli.get("description"))
+
+    @property
+    def stimuli_hash(self) -> str | None:
+        """Hash that names the stimuli, if stated.
+
+        That of their configuration is equal on every machine; the numbers differ in their last digits.
+        """
+        return _text(self.stimuli.get("config_hash")) or _text(self.stimuli.get("content_hash")) or None
+
+    @property
+    def time_rule(self) -> str:
+        """How the time axis entered the RDMs, ``mean`` or ``concatenate``; empty if not stated."""
+        return _text(self.settings.get("time"))
+
+    @property
+    def layer_p(self) -> dict[str, float]:
+        """Each layer's p, corrected for the number of layers where that is stated."""
+        tests = self.statistics.get("layer_tests")
+        found = {}
+        for item in tests if isinstance(tests, (list, tuple)) else ():
+            if isinstance(item, Mapping) and isinstance(item.get("layer"), str):
+                p = item.get("p_corrected", item.get("p"))
+                if isinstance(p, (int, float)) and not isinstance(p, bool):
+                    found[item["layer"]] = float(p)
+        return found
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a stated entry."""
+        return self._stated()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the stated entries."""
+        return iter(self._stated())
+
+    def __len__(self) -> int:
+        """Return the number of stated entries."""
+        return len(self._stated())
+
+    def _stated(self) -> dict[str, Any]:
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {**values.pop("more"), **{name: value for name, value in values.items() if value}}
+
+
+def _text(value: Any) -> str:
+    """Return a text as it is; what is none counts as not stated, since anyone may write a record."""
+    return value if isinstance(value, str) else ""
