@@ -14,7 +14,7 @@ from brainbench import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash, to_plain
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.sweeps.split import SPLITS, SplitBy, split_objects, split_sweeps
 from brainbench.stimuli.whiskers.array import WhiskerArray
@@ -162,6 +162,7 @@ class GenerationPlan:
             **to_plain(self.settings),
             "shard_size": self.settings.sweeps_per_shard,
             "version": __version__,
+            "physics": PHYSICS_VERSION,
             "engine": f"{package} {metadata.version(package)}" if package else self.settings.backend,
         }
 
