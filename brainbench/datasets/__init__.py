@@ -16,11 +16,18 @@ from brainbench.datasets.inspection import inspect
 from brainbench.datasets.layouts.layout import RecordingLayout
 from brainbench.datasets.layouts.registry import register_layout
 from brainbench.datasets.recordings import open_recordings
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.selection import Rule, Selection
+from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 
 __all__ = [
+    "Conditions",
     "RecordingLayout",
+    "Rule",
+    "Selection",
     "WhiskingDataset",
+    "Window",
     "check",
     "export",
     "fetch",

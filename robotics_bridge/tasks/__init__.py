@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from brainbench.core.lazy import lazy_exports
 from robotics_bridge.tasks.registry import forget, list_tasks, load, register
-from robotics_bridge.tasks.task import Task
+from robotics_bridge.tasks.task import Reward, Task
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import make
 
-__all__ = ["Task", "forget", "list_tasks", "load", "make", "register"]
+__all__ = ["Reward", "Task", "forget", "list_tasks", "load", "make", "register"]
 
 __getattr__, __dir__ = lazy_exports(__name__, {"make": "robotics_bridge.envs.env"})

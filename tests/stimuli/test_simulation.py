@@ -195,7 +195,8 @@ def test_another_version_of_the_physics_never_takes_these_results_for_its_own(en
 def test_an_edited_drawing_module_leaves_simulations_in_their_place_in_the_cache(tmp_path):
     """Keys of two copies of the package, of which one draws otherwise."""
     code = (
-        "from brainbench.stimuli import Fidelity, get_engine, get_recipe\n"
+        "from brainbench.stimuli import Fidelity, get_recipe\n"
+        "from brainbench.stimuli.engines import get_engine\n"
         "from brainbench.stimuli.simulation import cache_path\n"
         "print(cache_path(get_recipe('rodgers').scenes[:1], Fidelity(), get_engine('mujoco')).name)"
     )
