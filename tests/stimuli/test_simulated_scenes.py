@@ -1,6 +1,5 @@
 """Scenes run through the real engine, where the answer is known beforehand."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,40 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.motion.trajectories import Path, Still, Translation, Whisking, smooth_step
+from brainbench.stimuli.motion.trajectories import Path, Still, Whisking, smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule
 from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import capsule, sphere
+from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-# A straight C2 whose base frame lies on the array frame: it points along +x.
-STRAIGHT = WhiskerArray.mouse(whiskers="C2").replace(
-    position=(0.0, 0.0, 0.0), angles=(math.pi / 2, 0.0, -math.pi / 2), curvature=0.0
-)
-AT = 6e-3
-DEFLECTION = 0.1e-3
-
-
-def _pushed(head=None):
-    """A smooth upright bar that moves from +y against the whisker by DEFLECTION and stops there."""
-    radius = 0.5e-3
-    head = head or Head()
-    rod = float(STRAIGHT["C2"].whisker.radius(AT))
-    speed, onset = 2e-3, 0.02
-    travel = speed * (0.08 - onset / 2)
-    start = np.array([AT, radius + rod + travel - DEFLECTION, 0.0])
-    bar = PlacedObject(
-        capsule(radius, 8e-3),
-        position=tuple(head.matrix @ start + head.position),
-        rotation=head.rotation,
-        motion=Translation(tuple(head.matrix @ [0.0, -speed, 0.0]), onset),
-        friction=0.0,
-    )
-    return Scene("pushed", STRAIGHT, (bar,), Still(), head, Frames(0.08, 0.001, 1))
+from tests.factories.pushed_bar import AT, DEFLECTION, STRAIGHT, pushed_bar
 
 
 def _wrench(scene):
@@ -53,7 +28,7 @@ def _wrench(scene):
 
 def test_a_bar_that_pushes_the_whisker_towards_minus_y_makes_it_push_its_base_towards_minus_y():
     # The whisker hands the contact force on to its base: force −y at x = +a has the moment −z.
-    force_x, force_y, force_z, *moment = _wrench(_pushed())
+    force_x, force_y, force_z, *moment = _wrench(pushed_bar())
     whisker = STRAIGHT["C2"].whisker
     stiffness = 3 * float(whisker.bending_stiffness(0.0)) / AT**3 * float(whisker.radius(AT)) / whisker.base_radius
     assert force_y == pytest.approx(-stiffness * DEFLECTION, rel=0.05)
@@ -88,8 +63,8 @@ def _path(times, axis, angles):
 
 def test_turning_the_whole_scene_turns_the_wrench():
     head = Head((0.01, -0.02, 0.03), (0.3, -0.5, 1.2))
-    turned, matrix = _wrench(_pushed(head)), euler_matrix(head.rotation)
-    plain = _wrench(_pushed())
+    turned, matrix = _wrench(pushed_bar(head)), euler_matrix(head.rotation)
+    plain = _wrench(pushed_bar())
     np.testing.assert_allclose(turned[:3], matrix @ plain[:3], atol=2e-3 * np.linalg.norm(plain[:3]))
     np.testing.assert_allclose(turned[3:], matrix @ plain[3:], atol=2e-3 * np.linalg.norm(plain[3:]))
 

@@ -17,7 +17,7 @@ from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whisker_shapes import record
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
-from tests.stimuli.test_simulated_scenes import _pushed
+from tests.factories.pushed_bar import pushed_bar
 
 FAST = Fidelity.preset("fast")
 ARRAY = WhiskerArray.mouse(whiskers="C1,D4")
@@ -39,7 +39,7 @@ def test_a_whisker_at_rest_has_its_published_shape():
 
 
 def test_the_moment_at_the_base_is_the_moment_the_follicle_feels():
-    scene = dataclasses.replace(_pushed(), frames=Frames(0.3, 0.001, 1))
+    scene = dataclasses.replace(pushed_bar(), frames=Frames(0.3, 0.001, 1))
     fidelity = Fidelity.preset("accurate")
     (moments,) = record(scene, [0.3], fidelity=fidelity, cache=False).moments
     wrench = simulate(scene, fidelity=fidelity, cache=False)["wrench"].values[0, 0, 0]
@@ -53,13 +53,13 @@ def test_the_moment_at_the_base_is_the_moment_the_follicle_feels():
 
 def test_turning_the_scene_turns_the_shapes():
     head = Head((0.01, -0.02, 0.03), (0.3, -0.5, 1.2))
-    plain, turned = (_record(_pushed(pose), [0.05, 0.08]) for pose in (Head(), head))
+    plain, turned = (_record(pushed_bar(pose), [0.05, 0.08]) for pose in (Head(), head))
     moved = plain.joints[0] @ euler_matrix(head.rotation).T + head.position
     np.testing.assert_allclose(turned.joints[0], moved, atol=2e-6)
 
 
 def test_links_keep_their_lengths_while_the_whisker_bends():
-    shown = _record(_pushed(), [0.0, 0.04, 0.08])
+    shown = _record(pushed_bar(), [0.0, 0.04, 0.08])
     lengths = np.linalg.norm(np.diff(shown.joints[0], axis=1), axis=-1)
     np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape), rtol=1e-6)
     assert np.ptp(shown.joints[0][:, -1], axis=0).max() > 1e-4

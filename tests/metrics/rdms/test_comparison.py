@@ -12,17 +12,7 @@ from brainbench.core.errors import UsageError
 from brainbench.metrics import compare
 from brainbench.metrics.rdms.comparison import COMPARISONS, compare_all
 from brainbench.metrics.rdms.pairs import permuted_pairs
-
-THEIRS = {
-    "pearson": "corr",
-    "spearman": "spearman",
-    "rho-a": "rho-a",
-    "tau-a": "tau-a",
-    "tau-b": "tau-b",
-    "cosine": "cosine",
-    "whitened-cosine": "cosine_cov",
-    "whitened-pearson": "corr_cov",
-}
+from tests.factories.rsatoolbox_names import THEIRS
 
 
 def _make_rdms(count, stimuli=6, seed=0, ties=False):

@@ -8,7 +8,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.metrics import noise_ceiling
 from brainbench.metrics.rdms.comparison import COMPARISONS
-from tests.metrics.rdms.test_comparison import THEIRS
+from tests.factories.rsatoolbox_names import THEIRS
 
 
 def _make_animals(count=7, seed=0):
