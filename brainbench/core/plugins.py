@@ -18,12 +18,6 @@ from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundE
 _LOG = logging.getLogger(__name__)
 
 
-def is_target(text: str) -> bool:
-    """Return whether a text names an object of a file or a module: ``FILE.py:NAME`` or ``module:NAME``."""
-    path, colon, name = text.rpartition(":")
-    return bool(colon and path and name) and name.isidentifier()
-
-
 def load_object(target: str, kind: str, *, offers: Callable[[Any], bool] = callable) -> Any:
     """Return the object NAME of ``path/to/FILE.py:NAME`` or ``package.module:NAME``; the file or module is run.
 

@@ -14,10 +14,10 @@ from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, base_r
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
+from tests.factories.swing import Swing
 from tests.factories.whiskers import C2
 
 CRITICAL = replace(C2, damping_ratio=1.0)
-FLAT = (math.pi / 2, 0.0, -math.pi / 2)
 
 
 @dataclass(frozen=True)
@@ -57,21 +57,6 @@ def _param(engine):
 @pytest.fixture(params=[_param(engine) for engine in ENGINES])
 def engine(request):
     return request.param
-
-
-@dataclass(frozen=True)
-class Swing:
-    """Angles and displacement that swing out smoothly and stay: amplitude × 6u⁵ − 15u⁴ + 10u³."""
-
-    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rest: tuple[float, float, float] = FLAT
-    duration: float = 0.04
-
-    def pose(self, times):
-        u = np.clip(times / self.duration, 0, 1)[:, None]
-        ramp = u**3 * (10 - 15 * u + 6 * u**2)
-        return ramp * np.array(self.shift), ramp * np.array(self.angles) + np.array(self.rest)
 
 
 def _run(engine, *jobs, fidelity=None, **options):

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -23,28 +23,13 @@ from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.swing import Swing
 from tests.factories.whiskers import C2
 
 needs_bullet = pytest.mark.skipif(find_spec("pybullet") is None, reason="PyBullet is made for Python below 3.12")
 
 CRITICAL = replace(C2, damping_ratio=1.0)
 COARSE = Fidelity(links=8, time_step=2e-4)
-FLAT = (math.pi / 2, 0.0, -math.pi / 2)
-
-
-@dataclass(frozen=True)
-class Swing:
-    """Angles and displacement that swing out smoothly and stay: amplitude × 6u⁵ − 15u⁴ + 10u³."""
-
-    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rest: tuple[float, float, float] = FLAT
-    duration: float = 0.04
-
-    def pose(self, times):
-        u = np.clip(times / self.duration, 0, 1)[:, None]
-        ramp = u**3 * (10 - 15 * u + 6 * u**2)
-        return ramp * np.array(self.shift), ramp * np.array(self.angles) + np.array(self.rest)
 
 
 def _run(*jobs, fidelity=COARSE, backend="bullet", **options):
