@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import leaderboards
 from brainbench.core.contracts import CHANNELS, check_recordings, check_stimulus_set
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
@@ -86,7 +85,7 @@ def test_a_bad_record_is_refused_in_words(text: str, message: str):
 
 
 def test_shipped_records_are_read_and_written_byte_for_byte():
-    paths = sorted((Path(leaderboards.__file__).parent / "results").rglob("*.json"))
+    paths = sorted((Path(__file__).parents[2] / "leaderboards/results").rglob("*.json"))  # not in an installed wheel
     assert len(paths) > 100
     for path in paths:
         text = path.read_text(encoding="utf-8")
