@@ -51,6 +51,10 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def _is_default(value: Any, default: Any) -> bool:
+    return value is default or value == default  # NaN equals nothing
+
+
 def to_plain(value: Any) -> Any:
     """Turn dataclasses, mappings, arrays and paths into JSON types; a float without value is null.
 
@@ -63,7 +67,7 @@ def to_plain(value: Any) -> Any:
         return {
             field.name: to_plain(getattr(value, field.name))
             for field in fields(value)
-            if not (field.metadata.get("later") and getattr(value, field.name) == field.default)
+            if not (field.metadata.get("later") and _is_default(getattr(value, field.name), field.default))
         }
     if isinstance(value, (list, tuple)):
         return [to_plain(item) for item in value]

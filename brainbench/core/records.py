@@ -166,6 +166,12 @@ class Score(_NullIsNaN):
     """[P], of ``layer``."""
     brain_rdm: tuple[Number, ...] = ()
     """[P], mean over the animals that were scored."""
+    chance: Number = field(default=math.nan, metadata={"later": True})
+    """Mean of ``value`` under permuted stimuli, the choice of layer repeated in each permutation."""
+    attainable: Number = field(default=math.nan, metadata={"later": True})
+    """``value`` of a model that explains all that is reliable: 1 where the metric corrects for noise."""
+    without_stimulus: tuple[Number, ...] = field(default=(), metadata={"later": True})
+    """[K] ``value`` without each stimulus in turn, for the variance over stimuli (jackknife)."""
     provenance: _StatedProvenance = field(default_factory=Provenance)
     """Versions, machine, data with hashes, settings and the command that makes it again; a mapping becomes typed."""
 
@@ -174,6 +180,28 @@ class Score(_NullIsNaN):
         super().__post_init__()
         if not isinstance(self.provenance, Provenance):
             object.__setattr__(self, "provenance", Provenance.of(self.provenance))
+
+    def on_scale(self, value: float) -> float:
+        """Return a value of this score's metric on the scale that all metrics share.
+
+        0 is chance and 1 all that is reliable: (value − chance)/(attainable − chance). NaN where chance is unknown or
+        not below what is attainable.
+        """
+        span = self.attainable - self.chance
+        return (value - self.chance) / span if span > 0 else math.nan
+
+    @property
+    def scaled(self) -> float:
+        """``value`` between chance (0) and all that is reliable (1); what boards show and rank by."""
+        return self.on_scale(self.value)
+
+    @property
+    def scaled_interval(self) -> Interval | None:
+        """``interval`` on the scale of :attr:`scaled`; None where either is unknown."""
+        if self.interval is None or math.isnan(self.on_scale(0.0)):
+            return None
+        low, high = self.on_scale(self.interval.low), self.on_scale(self.interval.high)
+        return Interval(low, high, self.interval.level, self.interval.method)
 
     def to_json(self) -> str:
         """Serialise deterministically; NaN becomes null."""

@@ -6,7 +6,7 @@ import math
 from typing import TypeGuard
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import Interval
@@ -36,6 +36,46 @@ def t_interval(values: ArrayLike, level: float = LEVEL, *, over: str = "values")
     half = float(stdtrit(len(array) - 1, (1 + level) / 2) * array.std(ddof=1) / math.sqrt(len(array)))
     mean = float(array.mean())
     return Interval(mean - half, mean + half, level, f"t over {len(array)} {over}")
+
+
+FEWEST_ANIMALS = 4
+"""Fewest animals over which a difference of models is tested."""
+FEWEST_STIMULI = 10
+"""Fewest stimuli over which a difference of models is tested."""
+
+
+def two_factor_error(
+    animals: ArrayLike, without_stimulus: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the standard error of a mean over animals and stimuli, both sampled, and its degrees of freedom.
+
+    The variances over animals (of the mean) and over stimuli (jackknife: (K − 1)/K Σ(θ₍ₖ₎ − θ̄)²) are added, which is
+    a little too much since both hold their interaction; the degrees of freedom are Welch and Satterthwaite's.
+
+    Args:
+        animals: [..., A] values of single animals; NaN where an animal has none.
+        without_stimulus: [..., K] the mean over animals without each stimulus in turn; NaN where undefined.
+
+    Returns:
+        Standard errors [...] and degrees of freedom [...]; NaN with fewer than two animals or stimuli.
+    """
+    one, other = np.asarray(animals, dtype=np.float64), np.asarray(without_stimulus, dtype=np.float64)
+    count, stimuli = np.isfinite(one).sum(axis=-1), np.isfinite(other).sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        over_animals = _spread(one) / (count * (count - 1))
+        over_stimuli = _spread(other) * (stimuli - 1) / stimuli
+        total = over_animals + over_stimuli
+        freedom = total**2 / (over_animals**2 / (count - 1) + over_stimuli**2 / (stimuli - 1))
+    known = (count > 1) & (stimuli > 1)
+    return np.where(known, np.sqrt(total), np.nan), np.where(known, freedom, np.nan)
+
+
+def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum [...] of squared deviations from the mean of the finite values [..., N]."""
+    finite = np.isfinite(values)
+    filled = np.where(finite, values, 0.0)
+    mean = filled.sum(axis=-1, keepdims=True) / np.maximum(finite.sum(axis=-1, keepdims=True), 1)
+    return (np.where(finite, values - mean, 0.0) ** 2).sum(axis=-1)
 
 
 def wilson_interval(successes: float, count: int, level: float = LEVEL, *, over: str = "trials") -> Interval:

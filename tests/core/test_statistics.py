@@ -1,7 +1,8 @@
+import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from brainbench.core.statistics import wilson_interval
+from brainbench.core.statistics import t_interval, two_factor_error, wilson_interval
 
 
 def test_wilson_equals_a_published_value():
@@ -11,3 +12,26 @@ def test_wilson_equals_a_published_value():
     assert wilson_interval(0, 10).low == pytest.approx(0.0, abs=1e-12)
     with pytest.raises(DataError, match="at least one observation"):
         wilson_interval(0, 0)
+
+
+def test_two_factors_are_those_of_a_crossed_design():
+    # A mean over animals × stimuli of a + s: its variance is var(a)/A + var(s)/K exactly.
+    generator = np.random.default_rng(0)
+    animals, stimuli = generator.normal(0.0, 2.0, (4000, 6)), generator.normal(0.0, 3.0, (4000, 12))
+    mean = stimuli.mean(axis=1, keepdims=True)
+    without = (stimuli.sum(axis=1, keepdims=True) - stimuli) / 11
+    error, freedom = two_factor_error(animals + mean, without + animals.mean(axis=1, keepdims=True))
+    expected = 4.0 / 6 + 9.0 / 12
+    assert np.mean(error**2) == pytest.approx(expected, rel=0.03)
+    assert np.var(animals.mean(axis=1) + stimuli.mean(axis=1)) == pytest.approx(expected, rel=0.06)
+    assert 5 < freedom.mean() < 17
+
+
+def test_one_factor_without_spread_leaves_the_other():
+    values = np.array([0.2, 0.5, 0.9, np.nan])
+    error, freedom = two_factor_error(values, np.full(8, 0.3))
+    interval = t_interval(values[:3])
+    assert interval is not None
+    assert 4.302653 * error == pytest.approx((interval.high - interval.low) / 2, rel=1e-6)
+    assert freedom == pytest.approx(2.0)
+    assert np.isnan(two_factor_error([0.2], np.full(8, 0.3))[0])
