@@ -11,16 +11,14 @@ import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.deploy.udp import COMMAND, STATE, STOP, decode, encode
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""

@@ -14,15 +14,12 @@ import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 MAGIC = b"BBH1"
 STATE, COMMAND = 1, 2

@@ -7,18 +7,15 @@ joint's motion); below the deadband it counts as none. Letters: B environment, J
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import warp
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.simulation import Simulation
-    from robotics_bridge.tasks.scenes import TaskModel
-    from robotics_bridge.tasks.task import ActuatorRandomisation
+from robotics_bridge.envs.simulation import Simulation
+from robotics_bridge.tasks.scenes import TaskModel
+from robotics_bridge.tasks.task import ActuatorRandomisation
 
 _IMPERFECTIONS = ("strength", "bias", "deadband", "backlash", "kick")
 
@@ -35,8 +32,6 @@ class Actuators:
         substeps: int,
         seed: int,
     ) -> None:
-        import torch
-
         self._simulation, self._changes, self._substeps = simulation, changes, substeps
         device, first = simulation.device, simulation.model
         ids = [first.joint(name).id for name in model.joints]
@@ -86,8 +81,6 @@ class Actuators:
             mask: which.
             draw: ``draw(n, low, high)`` returns uniform random numbers [B, n].
         """
-        import torch
-
         column, joints = mask.unsqueeze(1), self.target.shape[1]
         position, c = self._simulation.qpos[:, self.qpos_columns], self._changes
         values = {"stiffness": self.nominal["stiffness"], "damping": self.nominal["damping"]}

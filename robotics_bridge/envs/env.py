@@ -5,8 +5,11 @@ Letters: B environment, A action, J joint, L tactile link.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError
@@ -16,17 +19,10 @@ from robotics_bridge.envs.observations import observe
 from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.state import EnvState
-from robotics_bridge.envs.step import STATISTICS, ActionMap, apply_action, compute_step, run_physics
+from robotics_bridge.envs.step import STATISTICS, ActionMap, StepResult, apply_action, compute_step, run_physics
+from robotics_bridge.envs.tactile import TactileLayout
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
-
-if TYPE_CHECKING:
-    import os
-
-    import torch
-
-    from robotics_bridge.envs.step import StepResult
-    from robotics_bridge.envs.tactile import TactileLayout
 
 _ADVICE = (
     "Terms and the state of a task may not copy from the processor or wait for it (brainbench.core.rotations.constant "
@@ -196,8 +192,6 @@ class Env:
 
     def reset(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Start new episodes in some environments ([B] bool; all by default) and return the observations."""
-        import torch
-
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         elif mask.shape != (self.num_envs,) or mask.dtype != torch.bool:

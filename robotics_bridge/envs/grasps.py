@@ -9,20 +9,19 @@ settings are the defaults).
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, cache_dir, content_hash
+from robotics_bridge.hands import Hand
+from robotics_bridge.tasks.scenes import TaskModel
+from robotics_bridge.tasks.task import Task
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.hands import Hand
-    from robotics_bridge.tasks.scenes import TaskModel
-    from robotics_bridge.tasks.task import Task
+mujoco = mujoco_module()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +120,7 @@ class _Trial:
     """Tries candidates in one simulation."""
 
     def __init__(self, task: Task, model: TaskModel, shape: int, settings: GraspSampling) -> None:
-        mujoco = mujoco_module()
-        self._mujoco, self._task, self._settings, self._model = mujoco, task, settings, model
+        self._task, self._settings, self._model = task, settings, model
         self._m: Any = model.models[shape]
         self._d = mujoco.MjData(self._m)
         self._joints = np.array([self._m.joint(name).qposadr[0] for name in model.joints])
@@ -172,7 +170,7 @@ class _Trial:
         return chosen if self._penetration() <= self._settings.max_penetration else None
 
     def _put(self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float) -> None:
-        d, mujoco = self._d, self._mujoco
+        d = self._d
         mujoco.mj_resetData(self._m, d)
         d.qpos[self._joints] = joints
         quat = np.zeros(4)
@@ -186,7 +184,7 @@ class _Trial:
         # The same law as the environment's actuators, without their imperfections.
         torque = model.stiffness * (target - d.qpos[self._joints]) - model.damping * d.qvel[self._speeds]
         d.ctrl[self._drive] = np.clip(torque, -model.effort, model.effort)
-        self._mujoco.mj_step(self._m, d)
+        mujoco.mj_step(self._m, d)
 
     def _above(self, body: int) -> NDArray[np.int64]:
         """Return the numbers of the flexing joints that move a body; those that spread a finger are left alone."""

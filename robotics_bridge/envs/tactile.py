@@ -7,29 +7,28 @@ L link.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module, warp
 from brainbench.core.rotations import to_matrices
+from robotics_bridge.envs.options import EnvOptions
+from robotics_bridge.envs.simulation import Simulation
+from robotics_bridge.hands import Hand
 from robotics_bridge.hands.observations import (
     PATCH_FORCE_SCALE,
     TAXELS_IN_CONTACT,
     observation_type,
     sensors_for,
 )
+from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors import SensorSuite
+from robotics_bridge.tasks.scenes import TaskModel
 
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import NDArray
-
-    from robotics_bridge.envs.options import EnvOptions
-    from robotics_bridge.envs.simulation import Simulation
-    from robotics_bridge.hands import Hand
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.tasks.scenes import TaskModel
+mujoco = mujoco_module()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +78,6 @@ class TactileObservation:
     def __init__(
         self, model: TaskModel, hand: Hand, simulation: Simulation, options: EnvOptions, *, substeps: int
     ) -> None:
-        import torch
-
         observe, num_envs, device = options.observe, options.num_envs, simulation.warp_device
         kind = observation_type(observe)
         taxels = hand.layout(options.resolution, options.placement)
@@ -163,7 +160,6 @@ class TactileObservation:
 
 def rest_poses(model: TaskModel, base: str, links: tuple[str, ...]) -> NDArray[np.float64]:
     """Return the poses [L, 7] (x y z, qw qx qy qz) of links in the frame of a base link, joints at rest."""
-    mujoco = mujoco_module()
     first = model.models[0]
     data = mujoco.MjData(first)
     for name, angle in zip(model.joints, model.rest, strict=True):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
@@ -31,7 +32,6 @@ from robotics_bridge.policies.encoders.taxel_grid import SITES, TaxelGrid
 from robotics_bridge.sensors import SensorSuite
 
 if TYPE_CHECKING:
-    import torch
     import xarray as xr
     from numpy.typing import NDArray
 
@@ -104,8 +104,6 @@ class HandRecording:
         Raises:
             UsageError: the frames do not divide into time steps of five sub-steps.
         """
-        import torch
-
         count, frames = self.wrench.shape[:2]
         if frames % SUB_STEPS:
             raise UsageError(f"{frames} frames do not divide into time steps of {SUB_STEPS} sub-steps.")

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from brainbench.core.errors import UsageError, unknown_name
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.hands.layouts import Layout
-    from robotics_bridge.sensors.sensor import Sensor
+from robotics_bridge.hands.layouts import Layout
+from robotics_bridge.sensors.sensor import Sensor
 
 PATCH_FORCE_SCALE = 1e4
 """From summed depth (m) to the reading of the real finger tip (4.29)."""
@@ -116,8 +114,6 @@ def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> 
     Raises:
         UsageError: the type is unknown, or a link's reading is missing or has another shape.
     """
-    import torch
-
     kind = observation_type(name)
     if kind.sensor is None:
         batch = next((reading.shape[0] for reading in readings.values()), 0)
@@ -142,8 +138,6 @@ def _by_taxel(reading: torch.Tensor, count: int, link: str) -> torch.Tensor:
 
 def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
     """Return the observation [B, F] of one link."""
-    import torch
-
     active = torch.as_tensor(probes.active.copy(), device=values.device)
     values = values[:, active].float()
     if name == "agg_bool":

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.hands.hand import Hand, palmar_directions
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+mujoco = mujoco_module()
+
 
 OBJECT = "object"
 """Name of the free body and of its geometry."""
@@ -46,7 +47,6 @@ def holding_spec(
     Raises:
         UsageError: the palm's side is unknown, or radius or mass are not positive.
     """
-    mujoco = mujoco_module()
     if not (radius > 0 and mass > 0):
         raise UsageError(f"A ball has a positive radius (m) and mass (kg); received {radius!r} and {mass!r}.")
     up, surface, step = palm_surface(hand)
@@ -70,7 +70,6 @@ def holding_spec(
 
 def _raised(model: Any) -> Any:
     """Lift the ball of a model until it touches nothing: hulls of meshes reach above the palm they stand for."""
-    mujoco = mujoco_module()
     ball, body = model.geom(OBJECT).id, model.body(OBJECT).id
     for _ in range(60):
         data = mujoco.MjData(model)
@@ -95,7 +94,6 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
 
 def _add_servos(spec: Any) -> None:
     """Give every hinge of a hand without drives, as URDF files are, a weak position servo."""
-    mujoco = mujoco_module()
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             joint.armature = max(joint.armature, _ARMATURE)
@@ -114,7 +112,6 @@ def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     Raises:
         UsageError: the joints do not tell which side the palm is.
     """
-    mujoco = mujoco_module()
     facing = palmar_directions(hand.model, hand.palm, hand.fingers)
     if hand.palm not in facing:
         raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")

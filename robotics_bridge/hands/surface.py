@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.probes.placement import Probes
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+mujoco = mujoco_module()
 
 
 def link_points(model: Any, body: int) -> NDArray[np.float64]:
     """Return points [n, 3] that span a body's solids, in its frame (m): vertices of meshes, corners of the rest."""
-    mujoco = mujoco_module()
     points = []
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for geom in geoms_of(model, body):
@@ -57,8 +56,6 @@ def cast_grid(
     Raises:
         UsageError: the model has no such link, or the link has no surface there.
     """
-    mujoco = mujoco_module()
-
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link)
     if body < 0:
         raise UsageError(f"The model has no link {link!r}.")
@@ -102,8 +99,6 @@ def _plane(up: NDArray, corners: NDArray, along: ArrayLike | None) -> tuple[NDAr
 
 def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) -> tuple[float, NDArray] | None:
     """Return distance and surface normal where a ray first meets one of the geometries (body's frame)."""
-    mujoco = mujoco_module()
-
     data = mujoco.MjData(model)
     best: tuple[float, NDArray] | None = None
     for geom in geoms:

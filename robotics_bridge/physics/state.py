@@ -6,20 +6,17 @@ whose quaternions are (x, y, z, w): views of them copy nothing.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    import torch
-    from numpy.typing import ArrayLike
 
 DIVERGED = 1
 """Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
@@ -203,8 +200,6 @@ class HandState:
 
 
 def _copy(view: torch.Tensor, values: Any) -> None:
-    import torch
-
     if not isinstance(values, torch.Tensor):
         values = torch.from_numpy(np.array(values))
     view.copy_(values)

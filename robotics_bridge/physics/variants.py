@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.physics.scene import Geometry
 
-if TYPE_CHECKING:
-    from robotics_bridge.physics.scene import Geometry
+mujoco = mujoco_module()
 
 
 def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, density: float = 1000.0) -> list[Any]:
@@ -28,8 +28,6 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
     Raises:
         UsageError: the spec has no such geometry, or a kind cannot be an object.
     """
-    mujoco = mujoco_module()
-
     kinds = {"sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
     models = []
     for shape in shapes:

@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
 from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
 from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.probes.placement import Probes
-    from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
+from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
 
 wp = warp()
 

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import missing_dependency
 from brainbench.core.files import atomic_path
 from brainbench.core.rotations import to_matrices
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.figures.camera import Lens
-    from brainbench.stimuli.figures.raster import Triangles
+from brainbench.stimuli.figures.camera import Lens
+from brainbench.stimuli.figures.raster import Triangles
 
 SIZE = (1100, 900)
 SKIN, OBJECT = (0.80, 0.82, 0.86), (0.95, 0.75, 0.45)

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import statistics
 import time
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from brainbench.cli.tactile import figures
 from brainbench.core.errors import unknown_name
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 CLASSES = {
     "ContactProbe": "published-bool",

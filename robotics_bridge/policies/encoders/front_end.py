@@ -7,8 +7,9 @@ in one array [B, H]: zeros are the state before the first step and rows are inde
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -21,9 +22,6 @@ from brainbench.models.streaming import StreamingStep
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.encoders.timing import CONTROL_SUB_STEP, TIMES, Resampler, Time
-
-if TYPE_CHECKING:
-    import os
 
 Learning = Literal["frozen", "finetuned"]
 LEARNING = ("frozen", "finetuned")

@@ -17,29 +17,23 @@ Letters: B batch, S sub-step, N item (an active taxel, or a link of the ``agg_``
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.hands import layouts
+from robotics_bridge.hands import Hand, layouts
+from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.hands.observations import observation_type, observe
-from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from robotics_bridge.hands import Hand
-    from robotics_bridge.hands.layouts import Layout
-    from robotics_bridge.policies.encoders.finger_axes import FingerAxes
-    from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
+from robotics_bridge.sensors.probes.placement import Probes
 
 SITES = GRID_SHAPE[0] * GRID_SHAPE[1]
 """Cells of the grid."""

@@ -6,21 +6,18 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import atomic_path
-
-if TYPE_CHECKING:
-    import torch
 
 _LEAF = "__tensor__"
 
 
 def flatten(tree: Any, prefix: str = "") -> tuple[dict[str, torch.Tensor], Any]:
     """Split a tree of dictionaries, lists, tensors and numbers into named tensors and a JSON-able rest."""
-    import torch
-
     tensors: dict[str, torch.Tensor] = {}
     if isinstance(tree, torch.Tensor):
         return {prefix: tree}, {_LEAF: prefix}

@@ -8,19 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import cache_dir, content_hash, read_json, to_plain, write_json
+from brainbench.geometry import Mesh
 from robotics_bridge.sensors.audio import tetrahedra
 from robotics_bridge.sensors.audio.materials import ElasticMaterial, Modes, elastic_material
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.geometry import Mesh
 
 _VERSION = 1
 SHAPES = ("box", "sphere", "ellipsoid", "cylinder", "mesh")

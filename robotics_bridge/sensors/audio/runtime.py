@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels.sound import (
     ContactSoundArrays,
     DriveSoundArrays,
@@ -19,14 +20,10 @@ from robotics_bridge.sensors.audio.kernels.sound import (
     ring_modes,
     sound_drives,
 )
+from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.noise.model import stream_seed
 from robotics_bridge.sensors.runtime import ReadoutRuntime
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
-    from robotics_bridge.sensors.context import SuiteContext
-
 
 wp = warp()
 

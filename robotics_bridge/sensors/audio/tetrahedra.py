@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, missing_dependency
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.geometry import Mesh
+from brainbench.geometry import Mesh
 
 SMALLEST = 0.05
 """A tetrahedron may shrink to this share of its volume when its corners are moved to a surface."""

@@ -12,24 +12,19 @@ as white noise of variance q²/12, which is right while the white noise is not m
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from robotics_bridge.sensors.calibration.delays import align, extent, find_delays, find_lags
-from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, fit_dynamics
+from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, Fit, fit_dynamics
 from robotics_bridge.sensors.calibration.log import Log, find_dead, find_quantum, segments
 from robotics_bridge.sensors.noise.model import Noise
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from robotics_bridge.sensors.calibration.likelihood import Fit
 
 NOT_FITTED = ("radius", "crosstalk")
 """Knobs that a log of one signal cannot tell: they need known places."""

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext
 from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
 from robotics_bridge.sensors.elastomer.kernels.dilation import (
     ElastomerArrays,
@@ -18,15 +21,10 @@ from robotics_bridge.sensors.elastomer.kernels.dilation import (
     spread_kernel,
 )
 from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, sum_shear
-from robotics_bridge.sensors.elastomer.taxel import Layer
+from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel, Layer
 from robotics_bridge.sensors.queries.surface_points import sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext
-    from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel
 
 wp = warp()
 
@@ -179,8 +177,6 @@ class ElastomerRuntime(ProbeRuntime):
 
     def _transform(self) -> None:
         """Convolve h with the three dilation kernels in Fourier space, zero outside the grid."""
-        import torch
-
         height, out = wp.to_torch(self.pads.height), wp.to_torch(self.pads.spread)
         if not self._spectra:
             self._spectra = [_spectrum(sensor, height.device) for sensor in self._sensors]
@@ -225,8 +221,6 @@ def _axes(sensor: ElastomerTaxel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any]:
     """Return the padded size of a grid and the spectra [3, …] of its kernels: along, across and normal."""
-    import torch
-
     rows, columns = sensor.probes.shape
     pitch = sensor.probes.pitch or (1.0, 1.0)
     # Kernels of 4.19 over all offsets between two markers, with the layer's factor 1 − κ λ_d r² on the tangential ones.

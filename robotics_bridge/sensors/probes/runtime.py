@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.probes.kernels.probe import depth_kernel, distance_kernel
-from robotics_bridge.sensors.probes.sensors import ContactProbe
+from robotics_bridge.sensors.probes.sensors import ContactDepthProbe, ContactProbe, SurfaceDistanceProbe
 from robotics_bridge.sensors.runtime import ProbeRuntime
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.probes.sensors import ContactDepthProbe, SurfaceDistanceProbe
 
 
 class DistanceRuntime(ProbeRuntime):

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from brainbench.core.files import atomic_path, cache_dir
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.geometry import Mesh
+from brainbench.geometry import Mesh
 
 _log = logging.getLogger(__name__)
 _FORMAT = 3

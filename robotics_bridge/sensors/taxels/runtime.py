@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.probes.kernels.probe import KinematicParams, kinematic_kernel
 from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
 from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
 from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityArrays, ProximityParams, proximity_kernel
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
-    from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
+from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
+from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
 
 wp = warp()
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.runtime import ReadoutRuntime
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.kernels.heat import (
     CAPACITY,
     HeatArrays,
@@ -21,14 +25,6 @@ from robotics_bridge.sensors.temperature.kernels.heat import (
     sense_temperature,
 )
 from robotics_bridge.sensors.temperature.materials import ThermalBody, material
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.temperature.grid import TemperatureGrid
-
 
 wp = warp()
 
