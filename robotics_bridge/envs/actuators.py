@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from brainbench.core.devices import warp
+from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
 from robotics_bridge.envs.simulation import Simulation
 from robotics_bridge.tasks.scenes import TaskModel
 from robotics_bridge.tasks.task import ActuatorRandomisation
@@ -59,8 +60,6 @@ class Actuators:
         self.seed(seed)
         self._noise = self.nominal["effort"] * (changes.torque_noise if changes else 0.0)
         wp = warp()
-        from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
-
         self._actuate, self._count = actuate, count_launch
         self._arrays = ActuatorArrays()
         for name, value in self.values.items():

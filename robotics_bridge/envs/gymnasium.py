@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from brainbench.core.errors import UsageError, missing_dependency
+from robotics_bridge import tasks
 from robotics_bridge.envs.env import Env
 
 try:
@@ -158,8 +159,6 @@ def make(task: str, *, groups: tuple[str, ...] = (), **options: Any) -> GymEnv:
 
 def make_vec(task: str, num_envs: int = 1, *, groups: tuple[str, ...] = (), **options: Any) -> GymVectorEnv:
     """Return the environments of a task for gymnasium; options are those of :func:`robotics_bridge.tasks.make`."""
-    from robotics_bridge import tasks
-
     return GymVectorEnv(tasks.make(task, num_envs=num_envs, keep_final=True, **options), groups)
 
 

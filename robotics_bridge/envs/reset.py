@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from brainbench.core.rotations import about, constant, multiply
+from robotics_bridge.envs.grasps import grasps_for
 from robotics_bridge.envs.state import EnvState
 
 
@@ -24,8 +25,6 @@ class EpisodeReset:
         self._bottom = floats([shape.bottom for shape in state.model.shapes])[state.shape_of]
         self._grasps = None
         if state.task.starts == "grasps":
-            from robotics_bridge.envs.grasps import grasps_for
-
             self._grasps = {k: floats(v) for k, v in grasps_for(state.task, state.hand, state.model).items()}
             # Grasps belong to a shape: each environment takes one of its own.
             self._grasp_rows = self._grasps["rows"][state.shape_of].long()

@@ -14,6 +14,7 @@ import torch
 
 from brainbench.core.devices import mujoco_module, pick_device, warp
 from brainbench.core.errors import UsageError
+from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
 
 mujoco = mujoco_module()
 
@@ -39,8 +40,6 @@ class Simulation:
     def __init__(
         self, models: Sequence[Any], num_envs: int, *, device: str, engine: str | None, threads: int | None = None
     ) -> None:
-        from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
-
         if engine == "mujoco" and device != "cpu":
             raise UsageError("C MuJoCo runs on the processor: use device='cpu', or engine='warp'.")
         self.model = models[0]

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge import sensors
 from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.sensors.sensor import Sensor
 
@@ -81,8 +82,6 @@ def sensors_for(
     Raises:
         UsageError: there is no such type, or a knob has a wrong value.
     """
-    from robotics_bridge import sensors
-
     kind = observation_type(name)
     if kind.sensor is None:
         return {}

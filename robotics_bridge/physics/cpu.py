@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -247,8 +248,6 @@ class _Gatherer:
 
 
 def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:
-    import copy
-
     varied = copy.copy(model)
     for name, value in values.items():
         getattr(varied, name)[...] = value

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
+from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.model_fields import check_fields, differing_fields
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
@@ -181,16 +182,12 @@ class MujocoWarpEngine:
         self._fill()
 
     def _fill_links(self) -> None:
-        from robotics_bridge.physics.kernels.state import fill_links
-
         wp, d, state = warp(), self._d, self.state
         # MuJoCo's quaternions are (w, x, y, z); the kernel stores them as Warp's (x, y, z, w).
         poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
         wp.launch(fill_links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
 
     def _fill(self) -> None:
-        from robotics_bridge.physics.kernels.state import fill_contacts
-
         wp, d, state = warp(), self._d, self.state
         self._fill_links()
         pyramidal = int(self.model.opt.cone == 0)

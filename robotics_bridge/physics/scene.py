@@ -257,8 +257,6 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
 
 
 def _mesh(model: Any, index: int) -> Mesh:
-    from brainbench.geometry import Mesh
-
     first, count = int(model.mesh_vertadr[index]), int(model.mesh_vertnum[index])
     face, faces = int(model.mesh_faceadr[index]), int(model.mesh_facenum[index])
     return Mesh(

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
+from robotics_bridge.physics.kernels.state import StateArrays, check_state
 
 DIVERGED = 1
 """Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
@@ -95,8 +96,6 @@ class HandState:
     @cached_property
     def arrays(self) -> Any:
         """The Warp structure of the buffers that kernels take."""
-        from robotics_bridge.physics.kernels.state import StateArrays
-
         struct = StateArrays()
         for name in StateArrays.vars:
             setattr(struct, name, getattr(self, name))
@@ -182,8 +181,6 @@ class HandState:
 
     def check(self) -> None:
         """Refresh :attr:`status`: which environments diverged, and whether contacts were lost."""
-        from robotics_bridge.physics.kernels.state import check_state
-
         warp().launch(check_state, dim=self.num_envs, inputs=[self.arrays], device=self.device)
 
     def aliasing(self, buffers: Mapping[str, Any]) -> HandState:

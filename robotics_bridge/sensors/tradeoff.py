@@ -22,11 +22,14 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from trimesh.triangles import closest_point
 
+from brainbench.core.errors import missing_dependency
 from brainbench.core.files import write_json
 from brainbench.core.progress import Progress
-from brainbench.geometry import Mesh
+from brainbench.geometry import Mesh, winding_number
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.surface_points import surface_points
@@ -73,10 +76,6 @@ def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[
 
     The inside is where the winding number exceeds one half.
     """
-    from trimesh.triangles import closest_point
-
-    from brainbench.geometry import winding_number
-
     corners = mesh.vertices[mesh.faces]
     # All triangles by brute force in double precision: an own reference that shares no code with the kernels.
     sign = np.where(winding_number(mesh, points) > 0.5, -1.0, 1.0)
@@ -126,10 +125,6 @@ def _grid() -> Probes:
 
 @cache
 def _torus() -> Geometry:
-    import trimesh
-
-    from brainbench.geometry import Mesh
-
     made = trimesh.creation.torus(0.012, 0.005, major_sections=72, minor_sections=32)
     return Geometry(name="o", link="object", kind="mesh", mesh=Mesh(made.vertices, made.faces))
 
@@ -220,8 +215,6 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    from brainbench.core.errors import missing_dependency
-
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

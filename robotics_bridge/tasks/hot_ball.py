@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from brainbench.core.devices import mujoco_module
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import ball
 from robotics_bridge.tasks.registry import register
@@ -41,8 +42,6 @@ _SITES = tuple((0.13 * (i - 1), 0.13 * (j - 1), -0.13 * (i - 1) * math.sin(TILT)
 
 def bin_walls(spec: Any) -> None:
     """Add the tilted bin, its floor's middle at the origin."""
-    from brainbench.core.devices import mujoco_module
-
     mujoco = mujoco_module()
     body = spec.worldbody.add_body(name="bin", quat=(math.cos(TILT / 2), 0.0, math.sin(TILT / 2), 0.0))
     edge, half = SIDE / 2, WALL / 2

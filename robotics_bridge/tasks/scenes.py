@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from robotics_bridge.hands.hand import Hand
+from robotics_bridge.hands.scenes import palm_surface
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 from robotics_bridge.tasks.task import Pose, Task
 
@@ -224,8 +225,6 @@ def palm_up(hand: Hand) -> Pose:
     Raises:
         UsageError: the joints do not tell which side the palm is.
     """
-    from robotics_bridge.hands.scenes import palm_surface
-
     up, surface, step = palm_surface(hand)
     forward = step / np.linalg.norm(step)
     # Columns: where the palm's own directions (forward, up × forward, up) go in the world.

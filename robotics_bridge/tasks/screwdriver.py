@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from brainbench.core.devices import mujoco_module
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import SCREWDRIVERS
 from robotics_bridge.tasks.registry import register
@@ -48,8 +49,6 @@ POSES = {
 
 def table(spec: Any) -> None:
     """Add the plane on which the tip stands."""
-    from brainbench.core.devices import mujoco_module
-
     plane = mujoco_module().mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name="table", type=plane, size=(0.0, 0.0, 1.0))
 

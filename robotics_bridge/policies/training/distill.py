@@ -21,6 +21,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
@@ -357,8 +360,6 @@ def build_student(
     Raises:
         UsageError: the shapes do not fit the tactile encoder.
     """
-    from tensordict import TensorDict
-
     example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
     tactile = config.tactile
     return TactilePolicy(
@@ -396,8 +397,6 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
 
 def save_student(path: Path, student: TactilePolicy) -> None:
     """Write a student's weights and normalisers."""
-    from safetensors.torch import save_file
-
     state = {name: value.detach().cpu().contiguous().clone() for name, value in student.state_dict().items()}
     with atomic_path(path) as temporary:
         save_file(state, temporary)
@@ -414,9 +413,6 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         UsageError: there is no such folder or name.
         DataError: the folder holds no student, or its weights are damaged.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
     folder = student_path(folder)
     described = read_json(folder / CONFIG)
     if not isinstance(described, dict) or described.get("brainbench_student") != 1:

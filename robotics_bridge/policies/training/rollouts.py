@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file, save_file
+
+from brainbench.core.files import atomic_path
 
 
 @dataclass
@@ -41,10 +44,6 @@ class Rollout:
 
     def save(self, path: Path) -> None:
         """Write the rollout to a safetensors file."""
-        from safetensors.torch import save_file
-
-        from brainbench.core.files import atomic_path
-
         parts: dict[str, Any] = {f"groups.{name}": value for name, value in self.groups.items()}
         parts |= {name: getattr(self, name) for name in ("teacher", "student", "ended", "memory")}
         if self.features is not None:
@@ -55,8 +54,6 @@ class Rollout:
     @classmethod
     def load(cls, path: Path, device: torch.device) -> Rollout:
         """Read what :meth:`save` wrote."""
-        from safetensors.torch import load_file
-
         parts = {name: value.to(device) for name, value in load_file(path).items()}
         groups = {name.removeprefix("groups."): parts.pop(name) for name in list(parts) if name.startswith("groups.")}
         return cls(groups, parts.pop("features", None), **parts)

@@ -13,13 +13,16 @@ import torch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, write_json
 from brainbench.core.progress import Progress
+from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.evaluate import evaluate
 from robotics_bridge.policies.report import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_teachers
 from robotics_bridge.policies.training.distill import CONFIG, DistillResult, StudentPolicy, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.teacher import load_teacher
 
 _log = logging.getLogger(__name__)
 
@@ -66,9 +69,6 @@ def train_student(
         UsageError: no teacher is named, or something does not fit.
         DataError: a file is missing or damaged.
     """
-    from robotics_bridge import tasks
-    from robotics_bridge.policies.training.teacher import load_teacher
-
     if not config.teacher:
         raise UsageError(
             "A student needs a teacher: the folder of a run of brainbench policy train, or a shipped one "
@@ -138,8 +138,6 @@ def evaluate_student(
     An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
     ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
     """
-    from robotics_bridge.policies.evaluate import evaluate
-
     student, _ = load_student(folder, device=str(env.device))
     policy, found = StudentPolicy(student), []
     for number, seed in enumerate(seeds):

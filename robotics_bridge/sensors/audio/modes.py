@@ -12,6 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.linalg import eigsh
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import cache_dir, content_hash, read_json, to_plain, write_json
@@ -114,8 +115,6 @@ def solve(
     Raises:
         UsageError: the mesh is too coarse for so many modes.
     """
-    from scipy.sparse.linalg import eigsh
-
     fem = tetrahedra.skfem()
     helpers, elasticity = import_module("skfem.helpers"), import_module("skfem.models.elasticity")
     # K φ = ω² M φ (4.33) with a consistent mass and quadratic elements.

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import beta
 
 from brainbench.core.errors import DataError
 from robotics_bridge.sensors.calibration.delays import align, extent, find_delays, find_lags
@@ -126,8 +127,6 @@ def _delay(
 
 def _dead(stuck: NDArray, values: NDArray, knobs: dict[str, Any], estimates: dict[str, Estimate]) -> None:
     """Enter the share of dead probes with its exact binomial interval (Clopper & Pearson), and their values."""
-    from scipy.stats import beta
-
     count, dead = len(stuck), int(stuck.sum())
     low = float(beta.ppf(0.025, dead, count - dead + 1)) if dead else 0.0
     high = float(beta.ppf(0.975, dead + 1, count - dead)) if dead < count else 1.0

@@ -14,6 +14,7 @@ import os
 from dataclasses import dataclass, fields
 from typing import Any
 
+from brainbench.core.devices import warp
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import read_json, to_plain, write_json
 
@@ -119,7 +120,6 @@ class Noise:
 
     def params(self, seed: int) -> Any:
         """Return the Warp structure ``NoiseParams`` for a 64-bit ``seed`` (see :func:`stream_seed`)."""
-        from brainbench.core.devices import warp
         from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
 
         wp = warp()

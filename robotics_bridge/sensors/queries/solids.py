@@ -45,8 +45,6 @@ def tessellate(geometry: Geometry) -> Mesh:
     """Return the surface of a geometry as triangles; curved ones lie within 0.1 % of their radius."""
     import trimesh
 
-    from brainbench.geometry import Mesh
-
     if geometry.mesh is not None:
         return geometry.mesh
     size = geometry.size
