@@ -162,7 +162,7 @@ class EnvState:
         """[B, 3] edges of the box around the object (m)."""
         scene = self.simulation.engine.scene
         self._palm = scene.link_index(self.hand.palm)
-        links = () if self.touch is None else self.touch.layout.links
+        links = () if self.touch is None else self.touch.links
         self._tactile_links = integers([scene.link_index(link) for link in links])
 
     def draw(self, count: int, low: float, high: float) -> torch.Tensor:

@@ -389,7 +389,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "joints": list(env.joint_names),
             "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},
             "frozen": dict(env.frozen),
-            "links": list(env.tactile.links) if env.tactile is not None else [],
+            "links": list(env.touch.links) if env.touch is not None else [],
         },
         "provenance": provenance(),
     }
