@@ -148,13 +148,3 @@ def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
     if name == "force":
         values = values[..., :3]
     return values.flatten(1)
-
-
-def real_contact(pressure: torch.Tensor, threshold: float) -> torch.Tensor:
-    """Return ``agg_bool`` [B, L] of a real hand's summed finger-tip forces [B, L, 3] (4.31)."""
-    return (pressure.norm(dim=-1) > threshold).float()
-
-
-def repeat_slots(reading: torch.Tensor, slots: int) -> torch.Tensor:
-    """Fill the history slots [B, L·slots·C] of a policy with a real hand's one value per link [B, L, C]."""
-    return reading[:, :, None].expand(-1, -1, slots, -1).flatten(1)

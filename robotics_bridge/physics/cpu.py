@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics.model_fields import check_fields
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
+from robotics_bridge.physics.variants import check_fields
 
 mujoco = mujoco_module()
 

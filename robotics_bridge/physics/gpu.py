@@ -13,9 +13,9 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
-from robotics_bridge.physics.model_fields import check_fields, differing_fields
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
+from robotics_bridge.physics.variants import check_fields, differing_fields
 
 _DERIVED = ("dof_length",)
 """Fields that the compiler derives for the thresholds of sleeping bodies; the first variant's serve all."""

@@ -35,8 +35,7 @@ from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.surface_points import surface_points
 from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.suite import SensorSuite
-from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
-from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
+from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
 RESOLUTIONS = (16, 32, 64, 128)
 POINTS = (250, 500, 1000, 2000, 4000, 16_000)

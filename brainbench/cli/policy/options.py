@@ -49,7 +49,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
-    known = (*evaluate.AGENTS, *shipped.list_teachers(), *shipped.list_students())
+    known = (*evaluate.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
     if name not in known and not Path(name).exists():
         raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
     if _student(name):

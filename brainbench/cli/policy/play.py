@@ -30,7 +30,7 @@ from brainbench.cli.policy.options import (
 def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
-    from robotics_bridge.policies.shipped import list_students, list_teachers
+    from robotics_bridge.policies.shipped import list_policies
 
     found = []
     for name in tasks.list_tasks():
@@ -45,7 +45,7 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "success_from": task.success.threshold,
                 "student": student,
                 "teacher": list(task.groups["actor"]),
-                "shipped": [*list_teachers(name), *list_students(name)],
+                "shipped": [*list_policies("teacher", name), *list_policies("student", name)],
             }
         )
     columns = {

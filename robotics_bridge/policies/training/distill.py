@@ -31,7 +31,7 @@ from brainbench.core.files import atomic_path, provenance, read_json, to_plain, 
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
-from robotics_bridge.policies.shipped import student_path
+from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -406,14 +406,14 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     """Return a distilled student in evaluation mode, and its run's configuration.
 
     Args:
-        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_students`.
+        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_policies`.
         device: Of its weights.
 
     Raises:
         UsageError: there is no such folder or name.
         DataError: the folder holds no student, or its weights are damaged.
     """
-    folder = student_path(folder)
+    folder = policy_path("student", folder)
     described = read_json(folder / CONFIG)
     if not isinstance(described, dict) or described.get("brainbench_student") != 1:
         raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")

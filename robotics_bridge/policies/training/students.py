@@ -19,7 +19,7 @@ from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import evaluate
 from robotics_bridge.policies.report import EVALUATION, GRADED
-from robotics_bridge.policies.shipped import list_teachers
+from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import CONFIG, DistillResult, StudentPolicy, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.teacher import load_teacher
@@ -72,7 +72,7 @@ def train_student(
     if not config.teacher:
         raise UsageError(
             "A student needs a teacher: the folder of a run of brainbench policy train, or a shipped one "
-            f"({', '.join(list_teachers())})."
+            f"({', '.join(list_policies('teacher'))})."
         )
     out = Path(out)
     env = tasks.make(

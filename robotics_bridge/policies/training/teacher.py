@@ -22,7 +22,7 @@ import torch
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
-from robotics_bridge.policies.shipped import teacher_path
+from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.tasks.settings import TeacherSettings
 
@@ -379,7 +379,7 @@ def model_file(path: Path) -> Path:
         UsageError: there is no such file, folder or name.
         DataError: the folder holds no model.
     """
-    found = teacher_path(path)
+    found = policy_path("teacher", path)
     return newest(found) if found.is_dir() else found
 
 
@@ -388,7 +388,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
 
     Args:
         run: folder of a run, one of its ``model_<iteration>.safetensors``, or a name of
-            :func:`~robotics_bridge.policies.shipped.list_teachers`.
+            :func:`~robotics_bridge.policies.shipped.list_policies`.
         env: environments with the same observation groups and actions.
 
     Raises:

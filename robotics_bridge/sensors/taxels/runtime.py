@@ -15,8 +15,7 @@ from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
 from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
 from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityArrays, ProximityParams, proximity_kernel
-from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
-from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
+from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
 wp = warp()
 
