@@ -235,7 +235,7 @@ class TeacherRun:
     """
 
     iterations: int | None = None
-    """In total; the settings' by default."""
+    """In total, earlier ones of the run included; the settings' by default."""
     minutes: float | None = None
     """Stop after this time and save."""
     seed: int = 0
@@ -248,7 +248,7 @@ class TeacherRun:
     start: Path | None = None
     """Another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with."""
     start_std: float | None = None
-    """Standard deviation of actions that it begins with; by default that of the other run."""
+    """Standard deviation of actions that it begins with, to explore anew; by default that of the other run."""
 
     def __post_init__(self) -> None:
         if self.start_std is not None and (self.start is None or not self.start_std > 0):
