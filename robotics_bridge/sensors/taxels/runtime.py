@@ -91,6 +91,7 @@ class ProximityRuntime(ProbeRuntime):
         own.near = context.zeros((context.num_envs, room) if self.gathered else (1, 1), int)
         if self.gathered:
             own.members, own.cells, own.around = self._cluster(list(sensors.values()))
+            self.scratch = [own.near]
         self._own = own
 
     def update(self, state: HandState, dt: float) -> None:
@@ -101,11 +102,6 @@ class ProximityRuntime(ProbeRuntime):
         inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self._own, state.arrays]
         c.launch(kernel, dim, *inputs)
         self.finish(dt)
-
-    @property
-    def scratch_bytes(self) -> int:
-        """Memory per environment [bytes] that every update writes anew: points near a cell of probes."""
-        return 4 * self._own.near.shape[1] if self.gathered else 0
 
     def _cluster(self, sensors: list[ProximityTaxel]) -> tuple[Any, Any, Any]:
         """Return the probes [N] by cell, cells (first, end, slot) [C, 3], and spheres [C, 4] around their reach."""
