@@ -145,7 +145,8 @@ class _Trial:
         pose = d.qpos[self._address : self._address + 7].copy()
         axis = d.xmat[self._object].reshape(3, 3) @ np.array([0.0, 1.0, 0.0])
         lost = np.linalg.norm(d.xpos[self._object] - start) > s.max_displacement or axis[2] < 0.995
-        if lost or not np.isfinite(d.qpos).all() or self._penetration() > s.max_penetration or self._fingers() < 2:
+        fingers = {body for body, _ in self._tips} & set(self._contacts()[0].tolist())
+        if lost or not np.isfinite(d.qpos).all() or self._penetration() > s.max_penetration or len(fingers) < 2:
             return None
         return {"joints": d.qpos[self._joints].copy(), "target": target, "object": pose}
 
@@ -157,7 +158,8 @@ class _Trial:
         self._closing = np.zeros(len(joints))
         for _ in range(12):
             self._put(chosen, place, yaw)
-            depth = self._tip_depths()
+            touched, depths = self._contacts()
+            depth = [max([0.0, *depths[touched == body]]) for body, _ in self._tips]
             if all(value <= 1e-3 for value in depth):
                 break
             for columns, value in zip(self._chains, depth, strict=True):
@@ -199,28 +201,14 @@ class _Trial:
             body = int(self._m.body_parentid[body])
         return np.array(found, dtype=np.int64)
 
-    def _tip_depths(self) -> list[float]:
-        depth = {body: 0.0 for body, _ in self._tips}
-        for contact in self._d.contact:
-            bodies = self._m.geom_bodyid[list(contact.geom)].tolist()
-            for body, deepest in depth.items():
-                if body in bodies and self._object in bodies:
-                    depth[body] = max(deepest, -contact.dist)
-        return list(depth.values())
+    def _contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the other body and the depth (m) of every contact of the tool."""
+        bodies = self._m.geom_bodyid[self._d.contact.geom]
+        mine = (bodies == self._object).any(axis=1)
+        return bodies[mine].sum(axis=1) - self._object, -self._d.contact.dist[mine]
 
     def _penetration(self) -> float:
-        depths = [-c.dist for c in self._d.contact if self._object in self._m.geom_bodyid[list(c.geom)]]
-        return max(depths, default=0.0)
-
-    def _fingers(self) -> int:
-        """Return how many finger tips touch the tool."""
-        tips = {body for body, _ in self._tips}
-        touching = set()
-        for contact in self._d.contact:
-            bodies = set(self._m.geom_bodyid[list(contact.geom)].tolist())
-            if self._object in bodies:
-                touching |= bodies & tips
-        return len(touching)
+        return max([0.0, *self._contacts()[1]])
 
     def _near(self) -> int:
         """Return how many finger tips are near the tool."""

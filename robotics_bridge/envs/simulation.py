@@ -18,7 +18,6 @@ from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
 
 mujoco = mujoco_module()
 
-
 FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "geom_friction")
 """Numbers of the model that differ between environments and change at resets."""
 

@@ -14,41 +14,33 @@ from robotics_bridge.hands.hand import Hand, palmar_directions
 
 mujoco = mujoco_module()
 
-
 OBJECT = "object"
 """Name of the free body and of its geometry."""
 _STIFFNESS, _DAMPING, _ARMATURE = 2.0, 0.2, 0.01
 """Servo of a hinge without a drive: N·m/rad, N·m·s/rad, kg·m²."""
 
 
-def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: float = 0.002, reach: float = 0.6) -> Any:
-    """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm.
+def holding(hand: Hand, **settings: float) -> Any:
+    """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm; see :func:`holding_spec`."""
+    return _raised(holding_spec(hand, **settings).compile())
+
+
+def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
+    """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
     A hand whose file has no drives (a URDF) gets a weak position servo on every hinge.
 
     Args:
         hand: Any hand.
-        radius: Of the ball [m].
-        mass: Of the ball [kg].
+        radius: Of the ball of 100 g [m].
         timestep: Of the engine [s].
         reach: Place of the ball between the middle of the palm (0) and the roots of the fingers (1).
 
     Raises:
-        UsageError: the palm's side is unknown, or radius or mass are not positive.
+        UsageError: the palm's side is unknown, or the radius is not positive.
     """
-    return _raised(holding_spec(hand, radius=radius, mass=mass, timestep=timestep, reach=reach).compile())
-
-
-def holding_spec(
-    hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: float = 0.002, reach: float = 0.6
-) -> Any:
-    """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
-
-    Raises:
-        UsageError: the palm's side is unknown, or radius or mass are not positive.
-    """
-    if not (radius > 0 and mass > 0):
-        raise UsageError(f"A ball has a positive radius (m) and mass (kg); received {radius!r} and {mass!r}.")
+    if not radius > 0:
+        raise UsageError(f"A ball has a positive radius (m); received {radius!r}.")
     up, surface, step = palm_surface(hand)
     # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
     surface = surface + reach * step
@@ -62,7 +54,7 @@ def holding_spec(
     ball = spec.worldbody.add_body(name=OBJECT, pos=(0.0, 0.0, radius + 1e-3))
     ball.add_freejoint()
     ball.add_geom(
-        name=OBJECT, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=mass, condim=4,
+        name=OBJECT, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=0.1, condim=4,
         friction=(1.0, 0.01, 1e-4),
     )  # fmt: skip
     return spec

@@ -45,13 +45,12 @@ def cast_grid(
     *,
     facing: ArrayLike,
     radius: float,
-    along: ArrayLike | None = None,
     extent: float = 0.8,
 ) -> Probes:
     """Lay a grid on the side of a link that faces a direction.
 
-    Rays run against ``facing`` over a share ``extent`` of the link; columns run along ``along``, by default the longest
-    extent across ``facing``. Rays that miss the link leave fillers.
+    Rays run against ``facing`` over a share ``extent`` of the link; columns run along its longest extent across
+    ``facing``. Rays that miss the link leave fillers.
 
     Raises:
         UsageError: the model has no such link, or the link has no surface there.
@@ -63,7 +62,7 @@ def cast_grid(
     if not len(corners):
         raise UsageError(f"Link {link!r} has no geometry, so no probe can lie on it.")
     up = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
-    u, v = _plane(up, corners, along)
+    u, v = _plane(up, corners)
     # Extent of the link across and along the rays: the grid covers its shadow, and rays start just above its top.
     seen = corners @ np.stack([u, v, up], axis=1)
     low, high = seen.min(axis=0), seen.max(axis=0)
@@ -83,15 +82,13 @@ def cast_grid(
     return Probes(position, normal, radii, (rows, columns))
 
 
-def _plane(up: NDArray, corners: NDArray, along: ArrayLike | None) -> tuple[NDArray, NDArray]:
+def _plane(up: NDArray, corners: NDArray) -> tuple[NDArray, NDArray]:
     """Return the directions of columns and rows across ``up``."""
-    if along is None:
-        # The axis nearest to the rays is no candidate for the direction of columns.
-        extent = np.ptp(corners, axis=0)
-        extent[np.argmax(np.abs(up))] = -1
-        along = np.eye(3)[np.argmax(extent)]
-    u = np.asarray(along, dtype=float)
-    # Gram–Schmidt: columns run across the rays even if the given direction does not.
+    # The axis nearest to the rays is no candidate for the direction of columns.
+    extent = np.ptp(corners, axis=0)
+    extent[np.argmax(np.abs(up))] = -1
+    u = np.eye(3)[np.argmax(extent)]
+    # Gram–Schmidt: columns run across the rays even if that axis does not.
     u = u - up * (u @ up)
     u = u / np.linalg.norm(u)
     return u, np.cross(up, u)

@@ -10,7 +10,6 @@ from brainbench.core.devices import mujoco_module
 
 mujoco = mujoco_module()
 
-
 EDGE = 0.25
 """Edge of a box (m)."""
 SPACING = 0.999

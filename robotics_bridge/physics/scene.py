@@ -20,7 +20,6 @@ from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
 
-
 KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "other")
 """Kinds of geometries; ``other`` (height fields and the like) collides in the engine, but no sensor can query it."""
 

@@ -18,7 +18,6 @@ from robotics_bridge.tasks.task import Pose, Task
 
 mujoco = mujoco_module()
 
-
 _STIFFNESS, _DAMPING, _ARMATURE, _EFFORT = 2.0, 0.2, 0.01, 2.0
 """Drive of a joint for which the hand's file names none: N·m/rad, N·m·s/rad, kg·m², N·m."""
 _PALM_TOP = 0.4975

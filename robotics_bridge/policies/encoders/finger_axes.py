@@ -22,7 +22,6 @@ from robotics_bridge.hands.layouts import Layout
 
 mujoco = mujoco_module()
 
-
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Rows of the grid, from the radial side on."""
 _WORDS = {

@@ -226,12 +226,12 @@ class _Run:
             self.memory = torch.where(ended[:, None], 0.0, memory.float())
             if self.front is not None:
                 self.touched = torch.where(ended[:, None], 0.0, self.touched)
-        return recorder.finish([*self.groups, *targets])
+        return recorder.rollout
 
     def _learn(self, rollout: Rollout) -> dict[str, float]:
         """Take the steps of one iteration; return the mean losses over its first epoch on the new rollout."""
         self.learner.train()
-        self.student.update_normalization(rollout.groups)
+        self.student.update_normalization(rollout.parts)
         if self.config.aggregate:
             self.kept = [*self.kept, (self.iteration, rollout)][-self.config.aggregate :]
         losses: dict[str, torch.Tensor] = {}
@@ -247,10 +247,10 @@ class _Run:
         """Go once through a rollout, a gradient step every ``gradient_length`` steps."""
         length = self.config.gradient_length or 1
         memory = rollout.memory
-        scale = torch.ones(rollout.teacher.shape[-1], device=self.device)
+        scale = torch.ones(rollout.parts["teacher"].shape[-1], device=self.device)
         if self.config.loss == "inv_var_mse":
             # Error of each joint in units of the teacher's own variance, bounded below for joints that hardly move.
-            scale = 1 / rollout.teacher.flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
+            scale = 1 / rollout.parts["teacher"].flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
         sums: dict[str, torch.Tensor] = {}
         for first in range(0, rollout.steps, length):
             chunk = rollout.chunk(first, length)
