@@ -17,7 +17,6 @@ from scipy.integrate import dblquad
 
 from benchmarks.report import table, write_section
 from benchmarks.tactile.scene import bumpy_box
-from brainbench.cli.tactile.checks import CHECKS
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors import (
     ContactDepthProbe,
@@ -29,6 +28,7 @@ from robotics_bridge.sensors import (
     SurfaceDistanceProbe,
     TemperatureGrid,
 )
+from robotics_bridge.sensors.checks import CHECKS
 
 PAD = Geometry(name="pad", link="hand", kind="box", size=(0.02, 0.02, 0.005))
 LYING = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)

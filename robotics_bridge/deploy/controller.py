@@ -10,21 +10,18 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from robotics_bridge.deploy.driver import Driver, HandReading
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
 from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
 from robotics_bridge.envs import ActionMap
 from robotics_bridge.envs.observations import VELOCITY
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.deploy.driver import Driver, HandReading
-    from robotics_bridge.policies.export import Runner
+from robotics_bridge.policies.export import Runner
 
 _log = logging.getLogger(__name__)
 

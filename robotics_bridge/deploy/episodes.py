@@ -12,17 +12,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.core.files import atomic_path, write_json
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.policies.encoders.finger_axes import FingerAxes
+from robotics_bridge.policies.encoders.finger_axes import FingerAxes
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.deploy.driver import HandReading
-    from robotics_bridge.hands import Hand
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.hands import Hand
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.core.files import read_json
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import Actuation, Controller
+from robotics_bridge.deploy.controller import Actuation, Controller, Source
+from robotics_bridge.deploy.driver import Driver
 from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.deploy.touch import Fallback, PressureCalibration, RealTouch
 from robotics_bridge.policies.export import read_policy
-
-if TYPE_CHECKING:
-    from robotics_bridge.deploy.controller import Source
-    from robotics_bridge.deploy.driver import Driver
 
 
 @dataclass(frozen=True)

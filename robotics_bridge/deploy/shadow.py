@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
+from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.simulated_hand import SimulatedHand
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.deploy.driver import HandReading
 
 
 class ShadowTouch:

@@ -11,16 +11,19 @@ import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
+from robotics_bridge import hands
 from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.deploy.udp import COMMAND, STATE, STOP, decode, encode
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from robotics_bridge.hands.observations import observation_type, observe, sensors_for
+from robotics_bridge.hands.scenes import OBJECT, holding
+from robotics_bridge.physics import MujocoEngine
+from robotics_bridge.sensors import SensorSuite
 
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""
@@ -104,12 +107,6 @@ class SimulatedHand:
         placement: str = "tips",
         resolution: str = "med",
     ) -> None:
-        from robotics_bridge import hands
-        from robotics_bridge.hands.observations import sensors_for
-        from robotics_bridge.hands.scenes import OBJECT, holding
-        from robotics_bridge.physics import MujocoEngine
-        from robotics_bridge.sensors import SensorSuite
-
         self.hand, self.rate = hands.load(hand), rate
         self.engine = MujocoEngine(holding(self.hand, timestep=1 / rate), 1, threads=1)
         self.observe, self.layout = observe, self.hand.layout(resolution, placement)
@@ -151,8 +148,6 @@ class SimulatedHand:
 
     def touch(self) -> NDArray[np.float32]:
         """Return what the skin gives [N, C]: items of the observation type, in the layout's order."""
-        from robotics_bridge.hands.observations import observation_type, observe
-
         values = observe(self.observe, {link: self.suite.read(link) for link in self.layout}, self.layout)
         return values.view(-1, observation_type(self.observe).channels).numpy()
 

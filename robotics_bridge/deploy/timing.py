@@ -8,14 +8,12 @@ import math
 import os
 from collections import deque
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 PRIORITY = 20
 """Of SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)."""

@@ -9,16 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.driver import HandReading
 
 REAL_TYPES = ("agg_bool", "agg_force")
 """Observation types that a real hand can measure."""

@@ -12,17 +12,13 @@ import socket
 import struct
 import time
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 MAGIC = b"BBH1"
 STATE, COMMAND = 1, 2
@@ -86,18 +82,10 @@ class UdpDriver:
         address: Host and port of the hand.
         joints: Names of its joints, in its order.
         fingers: Names of its sensing fingers, in its order.
-        clock: Seconds; of the controller.
     """
 
-    def __init__(
-        self,
-        address: tuple[str, int],
-        joints: tuple[str, ...],
-        fingers: tuple[str, ...],
-        *,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.address, self.joints, self.fingers, self.clock = address, joints, fingers, clock
+    def __init__(self, address: tuple[str, int], joints: tuple[str, ...], fingers: tuple[str, ...]) -> None:
+        self.address, self.joints, self.fingers = address, joints, fingers
         self.counters = LinkCounters()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -136,7 +124,7 @@ class UdpDriver:
         counters.lost += message.sequence - last - 1
         position, velocity, pressure = np.split(message.values, [joints, 2 * joints])
         self._newest = HandReading(
-            message.sequence, message.time, self.clock(), position, velocity, pressure.reshape(fingers, 3)
+            message.sequence, message.time, time.monotonic(), position, velocity, pressure.reshape(fingers, 3)
         )
 
     def send(self, targets: NDArray[np.float64]) -> None:
@@ -148,20 +136,21 @@ class UdpDriver:
         if np.shape(targets) != (len(self.joints),):
             raise UsageError(f"A command has {len(self.joints)} targets; received {np.shape(targets)}.")
         if not self._stopped:
-            self._sequence += 1
-            self._send(encode(COMMAND, targets, joints=len(self.joints), sequence=self._sequence, time=self.clock()))
+            self._send(self._command(targets))
 
     def stop(self) -> None:
         """Hold where the hand is, and refuse targets until it is connected anew."""
         self._stopped = True
         where = self._newest.position if self._newest is not None else np.zeros(len(self.joints))
-        self._sequence += 1
-        message = encode(
-            COMMAND, where, joints=len(self.joints), sequence=self._sequence, time=self.clock(), flags=STOP
-        )
+        message = self._command(where, STOP)
         # The one message that must not be lost; the hand's own watchdog is behind it.
         for _ in range(5):
             self._send(message)
+
+    def _command(self, targets: NDArray[np.float64], flags: int = 0) -> bytes:
+        self._sequence += 1
+        facts = {"sequence": self._sequence, "time": time.monotonic(), "flags": flags}
+        return encode(COMMAND, targets, joints=len(self.joints), **facts)
 
     def close(self) -> None:
         """End the connection."""

@@ -7,18 +7,16 @@ joint's motion); below the deadband it counts as none. Letters: B environment, J
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import warp
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.simulation import Simulation
-    from robotics_bridge.tasks.scenes import TaskModel
-    from robotics_bridge.tasks.task import ActuatorRandomisation
+from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
+from robotics_bridge.envs.simulation import Simulation
+from robotics_bridge.tasks.scenes import TaskModel
+from robotics_bridge.tasks.task import ActuatorRandomisation
 
 _IMPERFECTIONS = ("strength", "bias", "deadband", "backlash", "kick")
 
@@ -35,8 +33,6 @@ class Actuators:
         substeps: int,
         seed: int,
     ) -> None:
-        import torch
-
         self._simulation, self._changes, self._substeps = simulation, changes, substeps
         device, first = simulation.device, simulation.model
         ids = [first.joint(name).id for name in model.joints]
@@ -64,8 +60,6 @@ class Actuators:
         self.seed(seed)
         self._noise = self.nominal["effort"] * (changes.torque_noise if changes else 0.0)
         wp = warp()
-        from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
-
         self._actuate, self._count = actuate, count_launch
         self._arrays = ActuatorArrays()
         for name, value in self.values.items():
@@ -86,8 +80,6 @@ class Actuators:
             mask: which.
             draw: ``draw(n, low, high)`` returns uniform random numbers [B, n].
         """
-        import torch
-
         column, joints = mask.unsqueeze(1), self.target.shape[1]
         position, c = self._simulation.qpos[:, self.qpos_columns], self._changes
         values = {"stiffness": self.nominal["stiffness"], "damping": self.nominal["damping"]}

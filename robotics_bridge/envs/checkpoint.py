@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+
+import torch
 
 from brainbench.core.devices import warp
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.state import EnvState
+from robotics_bridge.envs.state import EnvState
 
 FORMER_NAMES = {
     "episode_length_buf": "age", "_steps": "steps", "_return": "returns", "_push_left": "push_left",

@@ -5,18 +5,17 @@ Letters: B environment, F finger tip, K object.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.rotations import conjugate, from_xyzw, rotate
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.simulation import Simulation
-    from robotics_bridge.tasks.scenes import TaskModel
+from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
+from robotics_bridge.envs.simulation import Simulation
+from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
+from robotics_bridge.tasks.scenes import TaskModel
 
 _REACH = 0.5
 """Largest distance that is told (m)."""
@@ -28,11 +27,6 @@ class Contacts:
     """Privileged senses of a task, read once per control step."""
 
     def __init__(self, simulation: Simulation, model: TaskModel, *, step_dt: float, seed: int) -> None:
-        import torch
-
-        from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
-        from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
-
         wp, scene, device = warp(), simulation.engine.scene, simulation.warp_device
         self._simulation, self._kernel, self._dt = simulation, add_contact_forces, step_dt
         tips = list(model.tips)

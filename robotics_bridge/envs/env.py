@@ -5,8 +5,11 @@ Letters: B environment, A action, J joint, L tactile link.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError
@@ -16,17 +19,9 @@ from robotics_bridge.envs.observations import observe
 from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.state import EnvState
-from robotics_bridge.envs.step import STATISTICS, ActionMap, apply_action, compute_step, run_physics
+from robotics_bridge.envs.step import STATISTICS, ActionMap, StepResult, apply_action, compute_step, run_physics
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
-
-if TYPE_CHECKING:
-    import os
-
-    import torch
-
-    from robotics_bridge.envs.step import StepResult
-    from robotics_bridge.envs.tactile import TactileLayout
 
 _ADVICE = (
     "Terms and the state of a task may not copy from the processor or wait for it (brainbench.core.rotations.constant "
@@ -37,33 +32,17 @@ _ADVICE = (
 def make(
     name: str | Task,
     *,
-    num_envs: int = 1,
-    device: str = "cpu",
     hand: str | os.PathLike[str] | hands.Hand = "xhand1",
     config: str = "default",
-    observe: str = "none",
-    placement: str = "hand",
-    resolution: str = "med",
-    noisy: bool = False,
-    seed: int = 0,
-    engine: str | None = None,
     **options: Any,
 ) -> Env:
     """Return the batched environment of a task.
 
     Args:
         name: of a task (:func:`robotics_bridge.tasks.list_tasks`), or a :class:`~robotics_bridge.tasks.Task`.
-        num_envs: number of environments B.
-        device: ``cpu`` or ``cuda``.
         hand: a hand, its name, or the path of a URDF or MJCF file.
         config: configuration of a named task: ``default`` or ``published``.
-        observe: tactile observation type (``brainbench policy observations`` lists them); ``none`` builds no sensor.
-        placement: ``hand``, ``fingers``, ``tips`` or ``palm``.
-        resolution: of the taxels: ``low``, ``med`` or ``high``.
-        noisy: with the published imperfections of the sensors.
-        seed: of all random numbers.
-        engine: ``mujoco`` or ``warp``; by default C MuJoCo on processors and MuJoCo Warp on GPUs.
-        **options: further fields of :class:`~robotics_bridge.envs.options.EnvOptions`.
+        **options: fields of :class:`~robotics_bridge.envs.options.EnvOptions`: ``num_envs``, ``device``, ``observe``, …
 
     Raises:
         UsageError: a name or number is not valid.
@@ -75,11 +54,7 @@ def make(
         observations, reward, terminated, truncated, info = env.step(torch.zeros(16, env.num_actions))
     """
     task = name if isinstance(name, Task) else load(name, config)
-    chosen = EnvOptions(
-        num_envs=num_envs, device=device, engine=engine, observe=observe, placement=placement, resolution=resolution,
-        noisy=noisy, seed=seed, **options,
-    )  # fmt: skip
-    return Env(task, hand if isinstance(hand, hands.Hand) else hands.load(hand), chosen)
+    return Env(task, hand if isinstance(hand, hands.Hand) else hands.load(hand), EnvOptions(**options))
 
 
 class Env:
@@ -153,11 +128,6 @@ class Env:
         return {name: value for name, value in rest if name not in self.model.moved}
 
     @property
-    def tactile(self) -> TactileLayout | None:
-        """Layout of the columns of the group ``tactile``; None without touch."""
-        return None if self.touch is None else self.touch.layout
-
-    @property
     def observations(self) -> dict[str, torch.Tensor]:
         """Observations of the last step or reset, by group."""
         return self.state.observations
@@ -196,8 +166,6 @@ class Env:
 
     def reset(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Start new episodes in some environments ([B] bool; all by default) and return the observations."""
-        import torch
-
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         elif mask.shape != (self.num_envs,) or mask.dtype != torch.bool:

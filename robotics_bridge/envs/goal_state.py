@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from brainbench.core.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.tasks.task import Task
+from robotics_bridge.tasks.task import Task
 
 
 class GoalState:
     """Buffers of goals, of rotation since the start, and of what happened in the last step."""
 
     def __init__(self, task: Task, num_envs: int, device: torch.device) -> None:
-        import torch
-
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
 
@@ -49,8 +45,6 @@ class GoalState:
 
     def reset(self, mask: torch.Tensor, quat: torch.Tensor, draw: Any) -> None:
         """Start new episodes in some environments [B] bool, whose objects have orientations ``quat`` [B, 4]."""
-        import torch
-
         self.previous.copy_(torch.where(mask.unsqueeze(1), quat, self.previous))
         for name in ("count", "rate", "off_axis", "turned", "turned_held"):
             getattr(self, name).masked_fill_(mask, 0.0)
@@ -99,8 +93,6 @@ class GoalState:
 
     def count_episodes(self, done: torch.Tensor) -> None:
         """Count the episodes that end [B] bool, and narrow the threshold when enough of them succeeded."""
-        import torch
-
         if self.goal is None or self.goal.start_threshold is None:
             return
         won = done & (self.count >= self._won)
@@ -125,8 +117,6 @@ class GoalState:
             self._set(self.reached | self.missed, following, quat, draw)
 
     def _set(self, mask: torch.Tensor, goal: torch.Tensor, quat: torch.Tensor, draw: Any) -> None:
-        import torch
-
         self.quat.copy_(torch.where(mask.unsqueeze(1), goal, self.quat))
         angle = angle_of(multiply(self.quat, conjugate(quat)))
         self.angle.copy_(torch.where(mask, angle, self.angle))

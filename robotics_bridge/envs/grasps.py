@@ -9,20 +9,19 @@ settings are the defaults).
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, cache_dir, content_hash
+from robotics_bridge.hands import Hand
+from robotics_bridge.tasks.scenes import TaskModel
+from robotics_bridge.tasks.task import Task
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.hands import Hand
-    from robotics_bridge.tasks.scenes import TaskModel
-    from robotics_bridge.tasks.task import Task
+mujoco = mujoco_module()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +120,7 @@ class _Trial:
     """Tries candidates in one simulation."""
 
     def __init__(self, task: Task, model: TaskModel, shape: int, settings: GraspSampling) -> None:
-        mujoco = mujoco_module()
-        self._mujoco, self._task, self._settings, self._model = mujoco, task, settings, model
+        self._task, self._settings, self._model = task, settings, model
         self._m: Any = model.models[shape]
         self._d = mujoco.MjData(self._m)
         self._joints = np.array([self._m.joint(name).qposadr[0] for name in model.joints])
@@ -147,7 +145,8 @@ class _Trial:
         pose = d.qpos[self._address : self._address + 7].copy()
         axis = d.xmat[self._object].reshape(3, 3) @ np.array([0.0, 1.0, 0.0])
         lost = np.linalg.norm(d.xpos[self._object] - start) > s.max_displacement or axis[2] < 0.995
-        if lost or not np.isfinite(d.qpos).all() or self._penetration() > s.max_penetration or self._fingers() < 2:
+        fingers = {body for body, _ in self._tips} & set(self._contacts()[0].tolist())
+        if lost or not np.isfinite(d.qpos).all() or self._penetration() > s.max_penetration or len(fingers) < 2:
             return None
         return {"joints": d.qpos[self._joints].copy(), "target": target, "object": pose}
 
@@ -159,7 +158,8 @@ class _Trial:
         self._closing = np.zeros(len(joints))
         for _ in range(12):
             self._put(chosen, place, yaw)
-            depth = self._tip_depths()
+            touched, depths = self._contacts()
+            depth = [max([0.0, *depths[touched == body]]) for body, _ in self._tips]
             if all(value <= 1e-3 for value in depth):
                 break
             for columns, value in zip(self._chains, depth, strict=True):
@@ -172,7 +172,7 @@ class _Trial:
         return chosen if self._penetration() <= self._settings.max_penetration else None
 
     def _put(self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float) -> None:
-        d, mujoco = self._d, self._mujoco
+        d = self._d
         mujoco.mj_resetData(self._m, d)
         d.qpos[self._joints] = joints
         quat = np.zeros(4)
@@ -186,7 +186,7 @@ class _Trial:
         # The same law as the environment's actuators, without their imperfections.
         torque = model.stiffness * (target - d.qpos[self._joints]) - model.damping * d.qvel[self._speeds]
         d.ctrl[self._drive] = np.clip(torque, -model.effort, model.effort)
-        self._mujoco.mj_step(self._m, d)
+        mujoco.mj_step(self._m, d)
 
     def _above(self, body: int) -> NDArray[np.int64]:
         """Return the numbers of the flexing joints that move a body; those that spread a finger are left alone."""
@@ -201,28 +201,14 @@ class _Trial:
             body = int(self._m.body_parentid[body])
         return np.array(found, dtype=np.int64)
 
-    def _tip_depths(self) -> list[float]:
-        depth = {body: 0.0 for body, _ in self._tips}
-        for contact in self._d.contact:
-            bodies = self._m.geom_bodyid[list(contact.geom)].tolist()
-            for body, deepest in depth.items():
-                if body in bodies and self._object in bodies:
-                    depth[body] = max(deepest, -contact.dist)
-        return list(depth.values())
+    def _contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the other body and the depth (m) of every contact of the tool."""
+        bodies = self._m.geom_bodyid[self._d.contact.geom]
+        mine = (bodies == self._object).any(axis=1)
+        return bodies[mine].sum(axis=1) - self._object, -self._d.contact.dist[mine]
 
     def _penetration(self) -> float:
-        depths = [-c.dist for c in self._d.contact if self._object in self._m.geom_bodyid[list(c.geom)]]
-        return max(depths, default=0.0)
-
-    def _fingers(self) -> int:
-        """Return how many finger tips touch the tool."""
-        tips = {body for body, _ in self._tips}
-        touching = set()
-        for contact in self._d.contact:
-            bodies = set(self._m.geom_bodyid[list(contact.geom)].tolist())
-            if self._object in bodies:
-                touching |= bodies & tips
-        return len(touching)
+        return max([0.0, *self._contacts()[1]])
 
     def _near(self) -> int:
         """Return how many finger tips are near the tool."""

@@ -6,11 +6,14 @@ the same call, with the last observation in ``info["final_obs"]``. Importing thi
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.errors import UsageError, missing_dependency
+from robotics_bridge import tasks
+from robotics_bridge.envs.env import Env
 
 try:
     import gymnasium
@@ -18,8 +21,6 @@ try:
 except ImportError as error:
     raise missing_dependency("gymnasium", extra="policies", purpose="The gymnasium adapter") from error
 
-if TYPE_CHECKING:
-    from robotics_bridge.envs.env import Env
 
 IDS = {
     "brainbench/InPalmRotate-v0": "in_palm_rotate",
@@ -75,8 +76,6 @@ class GymVectorEnv(VectorEnv):
         Raises:
             UsageError: seeds differ between environments, whose random numbers are drawn together.
         """
-        import torch
-
         super().reset(seed=None)
         if isinstance(seed, list):
             raise UsageError("Environments draw their random numbers together: give one seed, not a list.")
@@ -90,8 +89,6 @@ class GymVectorEnv(VectorEnv):
         self, actions: np.ndarray
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance by one control step with actions [B, A]."""
-        import torch
-
         tensor = torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.native.device)
         observations, reward, terminated, truncated, info = self.native.step(tensor)
         ended = (terminated | truncated).cpu().numpy()
@@ -162,8 +159,6 @@ def make(task: str, *, groups: tuple[str, ...] = (), **options: Any) -> GymEnv:
 
 def make_vec(task: str, num_envs: int = 1, *, groups: tuple[str, ...] = (), **options: Any) -> GymVectorEnv:
     """Return the environments of a task for gymnasium; options are those of :func:`robotics_bridge.tasks.make`."""
-    from robotics_bridge import tasks
-
     return GymVectorEnv(tasks.make(task, num_envs=num_envs, keep_final=True, **options), groups)
 
 

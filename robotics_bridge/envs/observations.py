@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+
+import torch
 
 from brainbench.core.rotations import conjugate, constant, multiply, rotate, six_numbers
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.state import EnvState
+from robotics_bridge.envs.state import EnvState
 
 VELOCITY = 0.2
 """Factor on velocities of joints and on angular velocities of the object (released settings)."""
@@ -26,8 +23,6 @@ def observe(state: EnvState) -> dict[str, torch.Tensor]:
 
 
 def _joints(state: EnvState, *, noisy: bool) -> torch.Tensor:
-    import torch
-
     simulation, noise = state.simulation, state.task.noise
     position = simulation.qpos[:, state.actuators.qpos_columns]
     velocity = VELOCITY * simulation.qvel[:, state.actuators.qvel_columns]
@@ -40,8 +35,6 @@ def _joints(state: EnvState, *, noisy: bool) -> torch.Tensor:
 
 
 def _goal(state: EnvState) -> torch.Tensor:
-    import torch
-
     goals = state.goals
     # Rotation from the object to its goal, g q⁻¹, in world axes.
     difference = multiply(goals.quat, conjugate(state.target_pose[:, 3:]))
@@ -50,8 +43,6 @@ def _goal(state: EnvState) -> torch.Tensor:
 
 
 def _object(state: EnvState) -> torch.Tensor:
-    import torch
-
     pose, (velocity, spin) = state.target_pose, state.target_velocity
     parts = [pose[:, :3], six_numbers(pose[:, 3:]), velocity, VELOCITY * spin]
     if state.task.distances_in == "priv_obj_state":
@@ -60,8 +51,6 @@ def _object(state: EnvState) -> torch.Tensor:
 
 
 def _properties(state: EnvState) -> torch.Tensor:
-    import torch
-
     parts = [state.episode.friction.unsqueeze(1), state.episode.mass.unsqueeze(1)]
     if state.task.distances_in == "priv_obj_props":
         parts.append(state.contacts.surface_distance)
@@ -69,8 +58,6 @@ def _properties(state: EnvState) -> torch.Tensor:
 
 
 def _privileged_joints(state: EnvState) -> torch.Tensor:
-    import torch
-
     return torch.cat((_joints(state, noisy=False), state.contacts.tip_force.flatten(1)), dim=1)
 
 

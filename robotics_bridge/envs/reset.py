@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import torch
 
 from brainbench.core.rotations import about, constant, multiply
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.state import EnvState
+from robotics_bridge.envs.grasps import grasps_for
+from robotics_bridge.envs.state import EnvState
 
 
 class EpisodeReset:
     """Starts new episodes of an environment batch, without looking at which from the host."""
 
     def __init__(self, state: EnvState) -> None:
-        import torch
-
         self._nominal = {name: value.clone() for name, value in state.simulation.fields.items()}
         bodies = state.object_bodies.cpu().numpy()
         geoms = np.flatnonzero(np.isin(np.asarray(state.simulation.model.geom_bodyid), bodies))
@@ -31,8 +25,6 @@ class EpisodeReset:
         self._bottom = floats([shape.bottom for shape in state.model.shapes])[state.shape_of]
         self._grasps = None
         if state.task.starts == "grasps":
-            from robotics_bridge.envs.grasps import grasps_for
-
             self._grasps = {k: floats(v) for k, v in grasps_for(state.task, state.hand, state.model).items()}
             # Grasps belong to a shape: each environment takes one of its own.
             self._grasp_rows = self._grasps["rows"][state.shape_of].long()
@@ -41,8 +33,6 @@ class EpisodeReset:
 
     def __call__(self, state: EnvState, mask: torch.Tensor) -> None:
         """Start new episodes where the mask [B] bool is set."""
-        import torch
-
         column, episode, simulation = mask.unsqueeze(1), state.episode, state.simulation
         qpos, targets = self._starts(state)
         episode.rest_targets.copy_(torch.where(column, targets, episode.rest_targets))
@@ -71,8 +61,6 @@ class EpisodeReset:
 
     def _starts(self, state: EnvState) -> tuple[torch.Tensor, torch.Tensor]:
         """Return positions [B, nq] for new episodes, and the actuators' targets [B, J] without action."""
-        import torch
-
         place, count, joints = state.task.placement, len(state.model.objects), state.actuators.qpos_columns
         qpos = state.simulation.start.clone()
         if self._grasps is not None:
@@ -101,8 +89,6 @@ class EpisodeReset:
 
     def _randomise_objects(self, state: EnvState, mask: torch.Tensor) -> None:
         """Draw friction and mass of the objects anew where the mask [B] is set."""
-        import torch
-
         nominal, changes, fields = self._nominal, state.task.object_changes, state.simulation.fields
         if state.started and not changes.each_reset:
             return

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from brainbench.core.errors import missing_dependency
 
 if TYPE_CHECKING:
-    import torch
     from tensordict import TensorDict
 
     from robotics_bridge.envs.env import Env

@@ -7,15 +7,16 @@ in step, so that what stands above knows no engine.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import mujoco_module, pick_device, warp
 from brainbench.core.errors import UsageError
+from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
 
-if TYPE_CHECKING:
-    import torch
+mujoco = mujoco_module()
 
 FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "geom_friction")
 """Numbers of the model that differ between environments and change at resets."""
@@ -38,15 +39,11 @@ class Simulation:
     def __init__(
         self, models: Sequence[Any], num_envs: int, *, device: str, engine: str | None, threads: int | None = None
     ) -> None:
-        import torch
-
-        from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
-
         if engine == "mujoco" and device != "cpu":
             raise UsageError("C MuJoCo runs on the processor: use device='cpu', or engine='warp'.")
         self.model = models[0]
         self.num_envs = num_envs
-        free = int(mujoco_module().mjtJoint.mjJNT_FREE)
+        free = int(mujoco.mjtJoint.mjJNT_FREE)
         starts = zip(self.model.jnt_bodyid, self.model.jnt_type, self.model.jnt_dofadr, strict=True)
         # A body whose centre of mass is not its origin is not simple: its inertia depends on how it lies.
         self._free = {int(b): int(d) for b, kind, d in starts if kind == free and self.model.body_simple[b]}
@@ -66,7 +63,7 @@ class Simulation:
         else:
             for each in models:
                 # An environment that diverges shows it; C MuJoCo would put it back silently.
-                each.opt.disableflags |= mujoco_module().mjtDisableBit.mjDSBL_AUTORESET
+                each.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             self.engine = MujocoEngine(list(models), num_envs, fields=nominal, threads=threads)
             self.qpos = torch.from_numpy(self.engine.qpos.astype(np.float32))
             self.qvel = torch.from_numpy(self.engine.qvel.astype(np.float32))
@@ -116,8 +113,6 @@ class Simulation:
             mask: which [B] bool.
             qpos: positions [B, nq]; rows of other environments are not looked at.
         """
-        import torch
-
         column = mask.unsqueeze(1)
         self.qpos.copy_(torch.where(column, qpos, self.qpos))
         self.qvel.masked_fill_(column, 0.0)
@@ -127,7 +122,6 @@ class Simulation:
         if self.uses_warp:
             self._warmstart.masked_fill_(column, 0.0)
             return
-        mujoco = mujoco_module()
         for env in torch.nonzero(mask).flatten().tolist():
             data = self.engine.data[env]
             mujoco.mj_resetData(self.engine.model_of(env), data)
@@ -136,8 +130,6 @@ class Simulation:
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return everything that the next step depends on."""
-        import torch
-
         own = {"ctrl": self.ctrl, "push": self.push, "qpos": self.qpos, "qvel": self.qvel}
         own |= {f"field.{name}": value for name, value in self.fields.items()}
         if self.uses_warp:

@@ -6,26 +6,23 @@ Letters: B environment, A action, J joint, F finger tip, K object, L tactile lin
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import conjugate, from_xyzw, multiply, rotate
 from robotics_bridge.envs.actuators import Actuators
 from robotics_bridge.envs.contacts import Contacts
 from robotics_bridge.envs.goal_state import GoalState
+from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.simulation import Simulation
+from robotics_bridge.envs.tactile import TactileObservation
+from robotics_bridge.hands import Hand
 from robotics_bridge.tasks.scenes import TaskModel, build
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.options import EnvOptions
-    from robotics_bridge.envs.tactile import TactileObservation
-    from robotics_bridge.hands import Hand
-    from robotics_bridge.tasks.task import Task
-    from robotics_bridge.tasks.task_state import TaskState
+from robotics_bridge.tasks.task import Task
+from robotics_bridge.tasks.task_state import TaskState
 
 
 @dataclass(eq=False)
@@ -69,7 +66,6 @@ class EpisodeState:
         cls, num_envs: int, device: torch.device, *, actions: int, terms: int, rest: torch.Tensor
     ) -> EpisodeState:
         """Return the state before the first episode, with rest positions [J] as targets."""
-        import torch
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
@@ -100,8 +96,6 @@ class EnvState:
     """
 
     def __init__(self, task: Task, hand: Hand, options: EnvOptions) -> None:
-        import torch
-
         self.task, self.hand, self.options, self.num_envs = task, hand, options, options.num_envs
         self.model: TaskModel = build(task, hand)
         self.simulation = Simulation(
@@ -137,7 +131,6 @@ class EnvState:
 
     def _index(self) -> None:
         """Set the constants of the task, and where its joints, objects and links stand in the physics."""
-        import torch
 
         def floats(values: Any) -> torch.Tensor:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
@@ -169,13 +162,11 @@ class EnvState:
         """[B, 3] edges of the box around the object (m)."""
         scene = self.simulation.engine.scene
         self._palm = scene.link_index(self.hand.palm)
-        links = () if self.touch is None else self.touch.layout.links
+        links = () if self.touch is None else self.touch.links
         self._tactile_links = integers([scene.link_index(link) for link in links])
 
     def draw(self, count: int, low: float, high: float) -> torch.Tensor:
         """Return uniform random numbers [B, count]."""
-        import torch
-
         # Numbers are drawn for all environments, whoever needs them: the draws of one do not depend on the resets of
         # others.
         numbers = torch.rand(self.num_envs, count, generator=self.generator, device=self.device)
@@ -205,8 +196,6 @@ class EnvState:
         Raises:
             UsageError: there are no tactile links.
         """
-        import torch
-
         if self.touch is None:
             raise UsageError("There are no tactile links; make the environment with an observation type.")
         pose = self.simulation.pose

@@ -6,20 +6,17 @@ Letters: B environment, A action, K object.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from robotics_bridge.envs.observations import observe
+from robotics_bridge.envs.reset import EpisodeReset
+from robotics_bridge.envs.state import EnvState
 from robotics_bridge.tasks.step_context import StepContext
 
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.envs.reset import EpisodeReset
-    from robotics_bridge.envs.state import EnvState
-
-    StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
+StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
 
 _DIVERGED_SPEED = 1e4
 """Speed (m/s or rad/s) beyond which an environment counts as diverged."""
@@ -47,8 +44,6 @@ class ActionMap:
 
 def apply_action(state: EnvState) -> None:
     """Set the actuators' targets for the action, and what pushes the object."""
-    import torch
-
     target, moved = state.actuators.target, state.moved
     target.copy_(state.episode.rest_targets)
     wanted = target[:, moved] + state.action_scale * state.episode.action
@@ -112,8 +107,6 @@ def compute_step(state: EnvState, reset: EpisodeReset) -> StepResult:
 
 def isolate_diverged(state: EnvState) -> torch.Tensor:
     """Return which environments [B] diverged, and put numbers back into them until they are reset."""
-    import torch
-
     simulation = state.simulation
     # A sum times zero is NaN as soon as one of its terms is NaN or infinite: one number per environment to look at.
     flaw = (simulation.qpos.sum(dim=1) * 0 + simulation.qvel.sum(dim=1) * 0).isnan()
@@ -148,8 +141,6 @@ def step_context(state: EnvState) -> StepContext:
 
 def _reward(state: EnvState, context: StepContext, diverged: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the reward [B] and its terms [B, terms], zero where diverged."""
-    import torch
-
     # Weights are per second, so that rewards do not depend on the control rate.
     parts = [r.weight * r.term(context, **r.params) * state.step_dt for r in state.task.rewards.values()]
     if not parts:
@@ -162,8 +153,6 @@ def _count_episodes(
     state: EnvState, parts: torch.Tensor, done: torch.Tensor, diverged: torch.Tensor
 ) -> dict[str, torch.Tensor]:
     """Add rewards and metric to the running episodes and ended ones to the totals; return means over these."""
-    import torch
-
     episode, success = state.episode, state.task.success
     episode.reward_sums += parts
     episode.returns += parts.sum(dim=1)

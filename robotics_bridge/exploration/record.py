@@ -9,15 +9,20 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+import xarray as xr
+from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_json
+from brainbench.core.progress import Progress
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
+from brainbench.geometry import Mesh
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
 from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
@@ -29,14 +34,6 @@ from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.finger_axes import FINGERS
 from robotics_bridge.policies.encoders.taxel_grid import SITES, TaxelGrid
 from robotics_bridge.sensors import SensorSuite
-
-if TYPE_CHECKING:
-    import torch
-    import xarray as xr
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.geometry import Mesh
 
 _STEPS = 2
 """Physics steps per frame."""
@@ -104,8 +101,6 @@ class HandRecording:
         Raises:
             UsageError: the frames do not divide into time steps of five sub-steps.
         """
-        import torch
-
         count, frames = self.wrench.shape[:2]
         if frames % SUB_STEPS:
             raise UsageError(f"{frames} frames do not divide into time steps of {SUB_STEPS} sub-steps.")
@@ -121,8 +116,6 @@ class HandRecording:
         Args:
             calibration: From newtons on the hand to a whisker's; :meth:`calibration` if None.
         """
-        import xarray as xr
-
         used = calibration or self.calibration()
         gains = np.array(used.gains(1), dtype=np.float32)
         rows, cols = np.divmod(np.arange(SITES), GRID_SHAPE[1])

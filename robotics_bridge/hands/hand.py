@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +16,6 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, palm_side, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Mapping
 
 _AUTO_GRIDS = {
     "low": {"tips": (3, 3, 0.004), "fingers": (2, 3, 0.004), "palm": (4, 3, 0.004)},

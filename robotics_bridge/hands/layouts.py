@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import read_json, write_json
 from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link, Pad
 from robotics_bridge.sensors.probes.placement import Probes
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
 
 RESOLUTIONS = ("low", "med", "high")
 PLACEMENTS = ("hand", "tips", "fingers", "palm")

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from brainbench.core.errors import UsageError, unknown_name
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.hands.layouts import Layout
-    from robotics_bridge.sensors.sensor import Sensor
+from robotics_bridge import sensors
+from robotics_bridge.hands.layouts import Layout
+from robotics_bridge.sensors.sensor import Sensor
 
 PATCH_FORCE_SCALE = 1e4
 """From summed depth (m) to the reading of the real finger tip (4.29)."""
@@ -83,8 +82,6 @@ def sensors_for(
     Raises:
         UsageError: there is no such type, or a knob has a wrong value.
     """
-    from robotics_bridge import sensors
-
     kind = observation_type(name)
     if kind.sensor is None:
         return {}
@@ -116,8 +113,6 @@ def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> 
     Raises:
         UsageError: the type is unknown, or a link's reading is missing or has another shape.
     """
-    import torch
-
     kind = observation_type(name)
     if kind.sensor is None:
         batch = next((reading.shape[0] for reading in readings.values()), 0)
@@ -142,8 +137,6 @@ def _by_taxel(reading: torch.Tensor, count: int, link: str) -> torch.Tensor:
 
 def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
     """Return the observation [B, F] of one link."""
-    import torch
-
     active = torch.as_tensor(probes.active.copy(), device=values.device)
     values = values[:, active].float()
     if name == "agg_bool":
@@ -155,13 +148,3 @@ def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
     if name == "force":
         values = values[..., :3]
     return values.flatten(1)
-
-
-def real_contact(pressure: torch.Tensor, threshold: float) -> torch.Tensor:
-    """Return ``agg_bool`` [B, L] of a real hand's summed finger-tip forces [B, L, 3] (4.31)."""
-    return (pressure.norm(dim=-1) > threshold).float()
-
-
-def repeat_slots(reading: torch.Tensor, slots: int) -> torch.Tensor:
-    """Fill the history slots [B, L·slots·C] of a policy with a real hand's one value per link [B, L, C]."""
-    return reading[:, :, None].expand(-1, -1, slots, -1).flatten(1)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.hands.hand import Hand, palmar_directions
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+mujoco = mujoco_module()
 
 OBJECT = "object"
 """Name of the free body and of its geometry."""
@@ -20,35 +20,27 @@ _STIFFNESS, _DAMPING, _ARMATURE = 2.0, 0.2, 0.01
 """Servo of a hinge without a drive: N·m/rad, N·m·s/rad, kg·m²."""
 
 
-def holding(hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: float = 0.002, reach: float = 0.6) -> Any:
-    """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm.
+def holding(hand: Hand, **settings: float) -> Any:
+    """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm; see :func:`holding_spec`."""
+    return _raised(holding_spec(hand, **settings).compile())
+
+
+def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
+    """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
     A hand whose file has no drives (a URDF) gets a weak position servo on every hinge.
 
     Args:
         hand: Any hand.
-        radius: Of the ball [m].
-        mass: Of the ball [kg].
+        radius: Of the ball of 100 g [m].
         timestep: Of the engine [s].
         reach: Place of the ball between the middle of the palm (0) and the roots of the fingers (1).
 
     Raises:
-        UsageError: the palm's side is unknown, or radius or mass are not positive.
+        UsageError: the palm's side is unknown, or the radius is not positive.
     """
-    return _raised(holding_spec(hand, radius=radius, mass=mass, timestep=timestep, reach=reach).compile())
-
-
-def holding_spec(
-    hand: Hand, *, radius: float = 0.03, mass: float = 0.1, timestep: float = 0.002, reach: float = 0.6
-) -> Any:
-    """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
-
-    Raises:
-        UsageError: the palm's side is unknown, or radius or mass are not positive.
-    """
-    mujoco = mujoco_module()
-    if not (radius > 0 and mass > 0):
-        raise UsageError(f"A ball has a positive radius (m) and mass (kg); received {radius!r} and {mass!r}.")
+    if not radius > 0:
+        raise UsageError(f"A ball has a positive radius (m); received {radius!r}.")
     up, surface, step = palm_surface(hand)
     # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
     surface = surface + reach * step
@@ -62,7 +54,7 @@ def holding_spec(
     ball = spec.worldbody.add_body(name=OBJECT, pos=(0.0, 0.0, radius + 1e-3))
     ball.add_freejoint()
     ball.add_geom(
-        name=OBJECT, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=mass, condim=4,
+        name=OBJECT, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=0.1, condim=4,
         friction=(1.0, 0.01, 1e-4),
     )  # fmt: skip
     return spec
@@ -70,7 +62,6 @@ def holding_spec(
 
 def _raised(model: Any) -> Any:
     """Lift the ball of a model until it touches nothing: hulls of meshes reach above the palm they stand for."""
-    mujoco = mujoco_module()
     ball, body = model.geom(OBJECT).id, model.body(OBJECT).id
     for _ in range(60):
         data = mujoco.MjData(model)
@@ -95,7 +86,6 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
 
 def _add_servos(spec: Any) -> None:
     """Give every hinge of a hand without drives, as URDF files are, a weak position servo."""
-    mujoco = mujoco_module()
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             joint.armature = max(joint.armature, _ARMATURE)
@@ -114,7 +104,6 @@ def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     Raises:
         UsageError: the joints do not tell which side the palm is.
     """
-    mujoco = mujoco_module()
     facing = palmar_directions(hand.model, hand.palm, hand.fingers)
     if hand.palm not in facing:
         raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")

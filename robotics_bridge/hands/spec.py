@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import from_rpy
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 Vector = tuple[float, float, float]
 

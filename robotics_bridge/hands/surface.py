@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.probes.placement import Probes
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+mujoco = mujoco_module()
 
 
 def link_points(model: Any, body: int) -> NDArray[np.float64]:
     """Return points [n, 3] that span a body's solids, in its frame (m): vertices of meshes, corners of the rest."""
-    mujoco = mujoco_module()
     points = []
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for geom in geoms_of(model, body):
@@ -46,19 +45,16 @@ def cast_grid(
     *,
     facing: ArrayLike,
     radius: float,
-    along: ArrayLike | None = None,
     extent: float = 0.8,
 ) -> Probes:
     """Lay a grid on the side of a link that faces a direction.
 
-    Rays run against ``facing`` over a share ``extent`` of the link; columns run along ``along``, by default the longest
-    extent across ``facing``. Rays that miss the link leave fillers.
+    Rays run against ``facing`` over a share ``extent`` of the link; columns run along its longest extent across
+    ``facing``. Rays that miss the link leave fillers.
 
     Raises:
         UsageError: the model has no such link, or the link has no surface there.
     """
-    mujoco = mujoco_module()
-
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link)
     if body < 0:
         raise UsageError(f"The model has no link {link!r}.")
@@ -66,7 +62,7 @@ def cast_grid(
     if not len(corners):
         raise UsageError(f"Link {link!r} has no geometry, so no probe can lie on it.")
     up = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
-    u, v = _plane(up, corners, along)
+    u, v = _plane(up, corners)
     # Extent of the link across and along the rays: the grid covers its shadow, and rays start just above its top.
     seen = corners @ np.stack([u, v, up], axis=1)
     low, high = seen.min(axis=0), seen.max(axis=0)
@@ -86,15 +82,13 @@ def cast_grid(
     return Probes(position, normal, radii, (rows, columns))
 
 
-def _plane(up: NDArray, corners: NDArray, along: ArrayLike | None) -> tuple[NDArray, NDArray]:
+def _plane(up: NDArray, corners: NDArray) -> tuple[NDArray, NDArray]:
     """Return the directions of columns and rows across ``up``."""
-    if along is None:
-        # The axis nearest to the rays is no candidate for the direction of columns.
-        extent = np.ptp(corners, axis=0)
-        extent[np.argmax(np.abs(up))] = -1
-        along = np.eye(3)[np.argmax(extent)]
-    u = np.asarray(along, dtype=float)
-    # Gram–Schmidt: columns run across the rays even if the given direction does not.
+    # The axis nearest to the rays is no candidate for the direction of columns.
+    extent = np.ptp(corners, axis=0)
+    extent[np.argmax(np.abs(up))] = -1
+    u = np.eye(3)[np.argmax(extent)]
+    # Gram–Schmidt: columns run across the rays even if that axis does not.
     u = u - up * (u @ up)
     u = u / np.linalg.norm(u)
     return u, np.cross(up, u)
@@ -102,8 +96,6 @@ def _plane(up: NDArray, corners: NDArray, along: ArrayLike | None) -> tuple[NDAr
 
 def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) -> tuple[float, NDArray] | None:
     """Return distance and surface normal where a ray first meets one of the geometries (body's frame)."""
-    mujoco = mujoco_module()
-
     data = mujoco.MjData(model)
     best: tuple[float, NDArray] | None = None
     for geom in geoms:

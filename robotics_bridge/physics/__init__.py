@@ -1,7 +1,7 @@
 """One state interface for tactile sensors, filled by C MuJoCo on the processor or MuJoCo Warp on the GPU.
 
-``scene`` says what there is to touch, ``cpu`` and ``gpu`` step it and fill a ``state``; ``variants`` and
-``model_fields`` make environments differ.
+``scene`` says what there is to touch, ``cpu`` and ``gpu`` step it and fill a ``state``; ``variants`` make
+environments differ.
 """
 
 from __future__ import annotations

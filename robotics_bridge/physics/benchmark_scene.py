@@ -8,6 +8,8 @@ import numpy as np
 
 from brainbench.core.devices import mujoco_module
 
+mujoco = mujoco_module()
+
 EDGE = 0.25
 """Edge of a box (m)."""
 SPACING = 0.999
@@ -22,8 +24,6 @@ def pyramid() -> Any:
     Numbers run up each leaning column, so that ``box1`` rests on ``box0`` (and on its neighbour), as published.
     The boxes start one thousandth of an edge into one another, so that the published warm-up settles them.
     """
-    mujoco = mujoco_module()
-
     half, pitch = EDGE / 2, EDGE * SPACING
     boxes = []
     for column in range(ROWS):

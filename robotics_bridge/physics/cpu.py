@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics.model_fields import check_fields
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
+from robotics_bridge.physics.variants import check_fields
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+mujoco = mujoco_module()
 
 
 class MujocoEngine:
@@ -48,8 +49,6 @@ class MujocoEngine:
         assignment: Sequence[int] = (),
         contacts: int = 64,
     ) -> None:
-        mujoco = mujoco_module()
-
         if num_envs < 1:
             raise UsageError(f"An engine needs at least one environment; received {num_envs}.")
         models = list(model) if isinstance(model, (list, tuple)) else [model]
@@ -124,8 +123,6 @@ class MujocoEngine:
 
     def integration_state(self) -> NDArray[np.float64]:
         """Return all that the next step of every environment depends on, [B, n]."""
-        mujoco = mujoco_module()
-
         kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         rows = np.zeros((self.num_envs, mujoco.mj_stateSize(self.model, kind)))
         for env, row in enumerate(rows):
@@ -134,15 +131,12 @@ class MujocoEngine:
 
     def set_integration_state(self, rows: NDArray[np.float64]) -> None:
         """Take up what :meth:`integration_state` returned."""
-        mujoco = mujoco_module()
-
         kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         for env, row in enumerate(rows):
             mujoco.mj_setState(self._models[env], self._data[env], row, kind)
 
     def kinematics(self) -> None:
         """Refresh poses and velocities of the state at the current positions; contacts stay those of the last step."""
-        mujoco = mujoco_module()
 
         def work(env: int) -> None:
             model, data = self._models[env], self._data[env]
@@ -154,20 +148,14 @@ class MujocoEngine:
 
     def step(self, steps: int = 1) -> None:
         """Advance every environment and refresh the state."""
-        mujoco = mujoco_module()
-
         self._each(lambda env: mujoco.mj_step(self._models[env], self._data[env], steps))
 
     def forward(self) -> None:
         """Refresh the state at the current positions and velocities, without advancing."""
-        mujoco = mujoco_module()
-
         self._each(lambda env: mujoco.mj_forward(self._models[env], self._data[env]))
 
     def reset(self, env_ids: Sequence[int] | NDArray[np.int64] | None = None) -> None:
         """Put environments (all by default) back to the model's start and refresh the state."""
-        mujoco = mujoco_module()
-
         for env in range(self.num_envs) if env_ids is None else np.asarray(env_ids, dtype=int).reshape(-1).tolist():
             mujoco.mj_resetData(self._models[env], self._data[env])
         self.forward()
@@ -260,10 +248,6 @@ class _Gatherer:
 
 
 def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:
-    import copy
-
-    mujoco = mujoco_module()
-
     varied = copy.copy(model)
     for name, value in values.items():
         getattr(varied, name)[...] = value

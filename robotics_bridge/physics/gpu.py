@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
-from robotics_bridge.physics.model_fields import check_fields, differing_fields
+from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
-
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import ArrayLike
+from robotics_bridge.physics.variants import check_fields, differing_fields
 
 _DERIVED = ("dof_length",)
 """Fields that the compiler derives for the thresholds of sleeping bodies; the first variant's serve all."""
@@ -138,8 +137,6 @@ class MujocoWarpEngine:
 
     def set(self, **values: ArrayLike | torch.Tensor) -> None:
         """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
-        import torch
-
         for name, value in values.items():
             view = warp().to_torch(getattr(self._d, name))
             rows = value if isinstance(value, torch.Tensor) else torch.as_tensor(np.array(value))
@@ -174,8 +171,6 @@ class MujocoWarpEngine:
         with wp.ScopedDevice(self._device):
             mask = None
             if env_ids is not None:
-                import torch
-
                 chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=wp.device_to_torch(self._device))
                 chosen[torch.as_tensor(env_ids, device=chosen.device, dtype=torch.long)] = True
                 mask = wp.from_torch(chosen)
@@ -187,16 +182,12 @@ class MujocoWarpEngine:
         self._fill()
 
     def _fill_links(self) -> None:
-        from robotics_bridge.physics.kernels.state import fill_links
-
         wp, d, state = warp(), self._d, self.state
         # MuJoCo's quaternions are (w, x, y, z); the kernel stores them as Warp's (x, y, z, w).
         poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
         wp.launch(fill_links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
 
     def _fill(self) -> None:
-        from robotics_bridge.physics.kernels.state import fill_contacts
-
         wp, d, state = warp(), self._d, self.state
         self._fill_links()
         pyramidal = int(self.model.opt.cone == 0)

@@ -9,17 +9,16 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.geometry import Mesh
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.geometry import Mesh
+mujoco = mujoco_module()
 
 KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "other")
 """Kinds of geometries; ``other`` (height fields and the like) collides in the engine, but no sensor can query it."""
@@ -229,14 +228,10 @@ class TouchScene:
 
 
 def _name(model: Any, what: int, index: int) -> str:
-    mujoco = mujoco_module()
-
     return mujoco.mj_id2name(model, what, index) or f"{'link' if what == 1 else 'geometry'}{index}"
 
 
 def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
-    mujoco = mujoco_module()
-
     found = []
     meshes: dict[int, Mesh] = {}
     for index in range(model.ngeom):
@@ -261,8 +256,6 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
 
 
 def _mesh(model: Any, index: int) -> Mesh:
-    from brainbench.geometry import Mesh
-
     first, count = int(model.mesh_vertadr[index]), int(model.mesh_vertnum[index])
     face, faces = int(model.mesh_faceadr[index]), int(model.mesh_facenum[index])
     return Mesh(
@@ -281,8 +274,6 @@ def _differs(first: Geometry, second: Geometry) -> bool:
 
 def _never(model: Any) -> frozenset[tuple[int, int]]:
     """Return the pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
-    mujoco = mujoco_module()
-
     pairs = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in model.exclude_signature}
     weld, parent = model.body_weldid, model.body_parentid
     filtering = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT

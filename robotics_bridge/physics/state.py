@@ -6,20 +6,18 @@ whose quaternions are (x, y, z, w): views of them copy nothing.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    import torch
-    from numpy.typing import ArrayLike
+from robotics_bridge.physics.kernels.state import StateArrays, check_state
 
 DIVERGED = 1
 """Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
@@ -98,8 +96,6 @@ class HandState:
     @cached_property
     def arrays(self) -> Any:
         """The Warp structure of the buffers that kernels take."""
-        from robotics_bridge.physics.kernels.state import StateArrays
-
         struct = StateArrays()
         for name in StateArrays.vars:
             setattr(struct, name, getattr(self, name))
@@ -185,8 +181,6 @@ class HandState:
 
     def check(self) -> None:
         """Refresh :attr:`status`: which environments diverged, and whether contacts were lost."""
-        from robotics_bridge.physics.kernels.state import check_state
-
         warp().launch(check_state, dim=self.num_envs, inputs=[self.arrays], device=self.device)
 
     def aliasing(self, buffers: Mapping[str, Any]) -> HandState:
@@ -203,8 +197,6 @@ class HandState:
 
 
 def _copy(view: torch.Tensor, values: Any) -> None:
-    import torch
-
     if not isinstance(values, torch.Tensor):
         values = torch.from_numpy(np.array(values))
     view.copy_(values)

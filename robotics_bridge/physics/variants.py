@@ -1,15 +1,72 @@
-"""Different objects in different environments: variants of a MuJoCo model that differ in numbers only."""
+"""Numbers of a MuJoCo model that differ between environments: domain randomisation, and variants of objects."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.physics.scene import KINDS, Geometry
 
-if TYPE_CHECKING:
-    from robotics_bridge.physics.scene import Geometry
+mujoco = mujoco_module()
+
+
+def model_fields(model: Any) -> tuple[str, ...]:
+    """Return the names of the numeric array fields of a ``mujoco.MjModel``."""
+    names = (name for name in dir(model) if not name.startswith("_"))
+    return tuple(name for name in names if isinstance(getattr(model, name, None), np.ndarray))
+
+
+def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> dict[str, NDArray]:
+    """Return the fields as arrays [B, ...] after checking names and shapes.
+
+    Raises:
+        UsageError: the model has no such field, or its shape is not one value per environment.
+    """
+    checked = {}
+    for name, values in fields.items():
+        own = getattr(model, name, None)
+        if not isinstance(own, np.ndarray):
+            raise unknown_name("model field", name, model_fields(model))
+        array = np.asarray(values, dtype=own.dtype)
+        if array.shape != (num_envs, *own.shape):
+            raise UsageError(
+                f"The field {name!r} needs one value per environment, shape {(num_envs, *own.shape)}; "
+                f"received {array.shape}."
+            )
+        checked[name] = array
+    return checked
+
+
+def differing_fields(models: Sequence[Any], order: Sequence[int], num_envs: int) -> dict[str, NDArray]:
+    """Stack per environment [B, ...] every field in which variants of a model differ.
+
+    Args:
+        models: compiled variants of one model.
+        order: variant of environment e is ``order[e % len(order)]``.
+        num_envs: B.
+
+    Raises:
+        UsageError: variants differ in structure, not only in numbers.
+    """
+    first = models[0]
+    rows = np.array([order[env % len(order)] for env in range(num_envs)])
+    found = {}
+    for name in model_fields(first):
+        values = [getattr(model, name) for model in models]
+        if any(value.shape != values[0].shape for value in values):
+            raise UsageError(
+                f"Variants of a model must differ in numbers only; the shape of {name!r} differs "
+                f"({', '.join(sorted({str(value.shape) for value in values}))}). Give every variant all the meshes, "
+                "as compile_variants does."
+            )
+        if any(not np.array_equal(value, values[0], equal_nan=value.dtype.kind == "f") for value in values[1:]):
+            found[name] = np.stack(values)[rows]
+    return found
 
 
 def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, density: float = 1000.0) -> list[Any]:
@@ -28,13 +85,10 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
     Raises:
         UsageError: the spec has no such geometry, or a kind cannot be an object.
     """
-    mujoco = mujoco_module()
-
-    kinds = {"sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
     models = []
     for shape in shapes:
-        if shape.kind not in kinds:
-            raise UsageError(f"A {shape.kind} cannot be a variant of an object; use one of {', '.join(kinds)}.")
+        if shape.kind not in KINDS[1:-1]:
+            raise UsageError(f"A {shape.kind} cannot be a variant of an object; use one of {', '.join(KINDS[1:-1])}.")
         copy = spec.copy()
         for index, other in enumerate(shapes):
             if other.mesh is not None:
@@ -46,7 +100,7 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
         target = next((g for g in copy.geoms if g.name == geometry), None)
         if target is None:
             raise unknown_name("geometry", geometry, [g.name for g in copy.geoms if g.name])
-        target.type = mujoco.mjtGeom(kinds[shape.kind])
+        target.type = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}")
         target.size = [*shape.size, 0.0, 0.0, 0.0][:3]
         target.density = density
         if shape.mesh is not None:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtr, stdtrit
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval
@@ -57,8 +58,6 @@ def contrast(one: Sequence[float], other: Sequence[float], spread: float, freedo
         spread: Standard deviation between training seeds (:func:`pooled_spread`).
         freedom: Its degrees of freedom.
     """
-    from scipy.special import stdtr, stdtrit
-
     difference = float(np.mean(one) - np.mean(other))
     # Two-sample t with the pooled spread: its degrees of freedom are those of all students, not of these two.
     error = spread * math.sqrt(1 / len(one) + 1 / len(other))

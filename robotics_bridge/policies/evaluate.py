@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.statistics import wilson_interval
-
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import ArrayLike
-
-    from robotics_bridge.envs.env import Env
+from robotics_bridge.envs.env import Env
 
 QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
 """Quantities of each episode beside its success."""
@@ -98,8 +95,6 @@ def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch
     Raises:
         UsageError: there is no such agent.
     """
-    import torch
-
     if name not in AGENTS:
         raise unknown_name("agent", name, AGENTS)
     generator = torch.Generator(device=env.device)
@@ -136,8 +131,6 @@ def evaluate(
     Raises:
         UsageError: no episode or seed is asked for.
     """
-    import torch
-
     seeds = (seed,) if isinstance(seed, int) else tuple(seed)
     if episodes < 1 or not seeds:
         raise UsageError(f"An evaluation needs at least one episode and one seed; received {episodes} and {seeds}.")

@@ -175,16 +175,16 @@ class _JitRunner:
             return self.module(torch.from_numpy(flat)[None])[0].numpy()
 
 
-def compare(policy: TactilePolicy, run: Runner, *, steps: int = STEPS, seed: int = 0) -> float:
+def compare(policy: TactilePolicy, run: Runner) -> float:
     """Return the largest difference of actions between a file and its policy on a random stream with resets.
 
     It is relative to the largest action; infinite where the file gives no numbers or fails.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     h = policy.zeros(1)
     worst, largest = 0.0, 1e-12
-    for step in range(steps):
-        forget = step in (0, steps // 3, steps // 3 + 1, 2 * steps // 3)
+    for step in range(STEPS):
+        forget = step in (0, STEPS // 3, STEPS // 3 + 1, 2 * STEPS // 3)
         # Unit noise on flat groups; touch as large as the hand's.
         obs = {
             name: torch.randn(1, *shape, generator=generator) * (0.2 if len(shape) > 1 else 1.0)

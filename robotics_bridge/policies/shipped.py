@@ -12,44 +12,28 @@ FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""
 
 
-def list_teachers(task: str | None = None) -> list[str]:
-    """Return their names ``<task>.<how it was trained>``, of one task or all."""
-    return _names(task, student=False)
+def list_policies(kind: str, task: str | None = None) -> list[str]:
+    """Return the names ``<task>.<what sets it apart>`` of policies of one task or all.
 
-
-def list_students(task: str | None = None) -> list[str]:
-    """Return their names ``<task>.<what it feels>``, of one task or all."""
-    return _names(task, student=True)
-
-
-def teacher_path(name: str | os.PathLike[str]) -> Path:
-    """Return the folder of a teacher by name; what is there on the disk is taken as it is.
-
-    Raises:
-        UsageError: neither is there.
+    Args:
+        kind: ``teacher`` or ``student``.
+        task: None for all.
     """
-    return _path(name, "teacher", list_teachers())
-
-
-def student_path(name: str | os.PathLike[str]) -> Path:
-    """Return the folder of a student by name; what is there on the disk is taken as it is.
-
-    Raises:
-        UsageError: neither is there.
-    """
-    return _path(name, "student", list_students())
-
-
-def _names(task: str | None, *, student: bool) -> list[str]:
     files = sorted(FOLDER.glob("*/config.json"))
-    found = [file.parent.name for file in files if ("brainbench_student" in read_json(file)) == student]
+    found = [file.parent.name for file in files if ("brainbench_student" in read_json(file)) == (kind == "student")]
     return [name for name in found if task in (None, name.partition(".")[0])]
 
 
-def _path(name: str | os.PathLike[str], kind: str, known: list[str]) -> Path:
+def policy_path(kind: str, name: str | os.PathLike[str]) -> Path:
+    """Return the folder of a teacher or student by name; what is there on the disk is taken as it is.
+
+    Raises:
+        UsageError: neither is there.
+    """
     path = Path(name)
     if path.exists():
         return path
+    known = list_policies(kind)
     if str(name) not in known:
         raise unknown_name(kind, str(name), known, hint="Or give the folder of a training run.")
     return FOLDER / str(name)

@@ -22,6 +22,7 @@ from torch import nn
 
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.policies.encoders.arms import EncoderConfig, TactileEncoder, perceptron
+from robotics_bridge.policies.exported import JitPolicy, StepPolicy
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -332,14 +333,10 @@ class TactilePolicy(MLPModel):
 
     def as_jit(self) -> nn.Module:
         """Return a scriptable module: forward(obs [1, all groups flattened, in order]) → actions; it remembers."""
-        from robotics_bridge.policies.exported import JitPolicy
-
         return JitPolicy(self)
 
     def as_onnx(self, verbose: bool = False) -> nn.Module:
         """Return a module of one step for ONNX: (group …, h_in) → (actions, h_out)."""
-        from robotics_bridge.policies.exported import StepPolicy
-
         return StepPolicy(self)
 
     def _get_obs_dim(self, obs: Any, obs_groups: dict[str, list[str]], obs_set: str) -> tuple[list[str], int]:

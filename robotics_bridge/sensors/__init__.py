@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from robotics_bridge.sensors.probes.placement import Probes
     from robotics_bridge.sensors.probes.sensors import ContactDepthProbe, ContactProbe, SurfaceDistanceProbe
     from robotics_bridge.sensors.suite import SensorSuite
-    from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
-    from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
+    from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
     from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 
 __all__ = [
@@ -53,8 +52,7 @@ _MODULES = {
     ".probes.placement": ("Probes",),
     ".probes.sensors": ("ContactDepthProbe", "ContactProbe", "SurfaceDistanceProbe"),
     ".suite": ("SensorSuite",),
-    ".taxels.kinematic": ("KinematicTaxel",),
-    ".taxels.proximity": ("ProximityTaxel",),
+    ".taxels.sensors": ("KinematicTaxel", "ProximityTaxel"),
     ".temperature.grid": ("TemperatureGrid",),
 }
 __getattr__, __dir__ = lazy_exports(__name__, {name: path for path, names in _MODULES.items() for name in names})

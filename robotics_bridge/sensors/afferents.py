@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.signal import butter, sosfilt_zi
 
 from brainbench.core.errors import UsageError, unknown_name
 
@@ -47,8 +48,6 @@ class Band:
         Raises:
             UsageError: the band does not fit below half the rate.
         """
-        from scipy.signal import butter
-
         if self.high >= rate / 2:
             raise UsageError(
                 f"A band up to {self.high:g} Hz needs more than {2 * self.high:g} readings per second; "
@@ -136,7 +135,5 @@ class AfferentFilter:
 
     def _rest(self, name: str, x: torch.Tensor) -> list[list[torch.Tensor]]:
         """Return the memories at which a constant signal stays as it is: those of a unit step, times the signal."""
-        from scipy.signal import sosfilt_zi
-
         level = x.double()
         return [[(level * float(z)).to(x.dtype) for z in pair] for pair in sosfilt_zi(self._sections[name])]

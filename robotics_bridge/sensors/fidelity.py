@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.files import read_json
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from robotics_bridge.sensors.sensor import Sensor
 
@@ -86,8 +87,6 @@ PRESETS: dict[str, SensorFidelity] = {
 
 @cache
 def _table() -> dict[str, Any]:
-    from brainbench.core.files import read_json
-
     return read_json(TABLE)
 
 

@@ -1,6 +1,6 @@
 """Runtimes: the arrays and launches that serve all sensors of one kind. Letters: B environment, N probe, C channel.
 
-Readings are stored planar [C, B, N]. :class:`ReadoutRuntime` keeps readings and noise, :class:`ProbeRuntime` adds
+Readings are stored planar [C, B, N]. :class:`Runtime` keeps readings and noise, :class:`ProbeRuntime` adds
 probes that meet geometries.
 """
 
@@ -8,61 +8,25 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
 from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
 from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.probes.placement import Probes
-    from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
+from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
 
 wp = warp()
 
 
 class Runtime(abc.ABC):
-    """Serves the sensors of one group. Updates launch kernels and do nothing else, so that they can be recorded."""
+    """Serves the sensors of one group; noise is fused into the sensor's kernel where that can be, in stages otherwise.
 
-    slices: Mapping[str, ReadoutSlice]
-    """Place of the reading of each sensor, by name."""
-    recordable: bool = True
-    """True if its updates can become part of a CUDA graph."""
-
-    @abc.abstractmethod
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state; ``dt`` seconds have passed since the last update."""
-
-    @abc.abstractmethod
-    def measured(self) -> Any:
-        """Return the planar Warp array of measured readings."""
-
-    @abc.abstractmethod
-    def truth(self) -> Any:
-        """Return the planar Warp array of readings without noise."""
-
-    @property
-    @abc.abstractmethod
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes], readings included, without history and delay."""
-
-    @property
-    def ring_bytes(self) -> int:
-        """Memory per environment [bytes] of delays that the user asked for."""
-        return 0
-
-    @property
-    def scratch_bytes(self) -> int:
-        """Memory per environment [bytes] that every update writes anew."""
-        return 0
-
-
-class ReadoutRuntime(Runtime):
-    """Readings of a group with their noise: fused into the sensor's kernel where that can be, in stages otherwise.
+    Updates launch kernels and do nothing else, so that they can be recorded.
 
     Args:
         sensors: by name.
@@ -71,6 +35,9 @@ class ReadoutRuntime(Runtime):
         fusable: whether the sensor's kernel applies the noise itself when no crosstalk forbids it.
         active: which probes [N] are none of the fillers.
     """
+
+    recordable: bool = True
+    """True if its updates can become part of a CUDA graph."""
 
     def __init__(
         self,
@@ -82,7 +49,12 @@ class ReadoutRuntime(Runtime):
         active: np.ndarray | None = None,
     ) -> None:
         self.context = context
-        self.slices = {}
+        self.slices: dict[str, ReadoutSlice] = {}
+        """Place of the reading of each sensor, by name."""
+        self.lasting: list[Any] = []
+        """Further Warp arrays of environments that later updates read; the runtime of a class enters its own."""
+        self.scratch: list[Any] = []
+        """Those that every update writes anew."""
         self.count = 0
         """Probes N of all sensors."""
         for name, sensor in sensors.items():
@@ -122,6 +94,10 @@ class ReadoutRuntime(Runtime):
         self.io = io
         self._channels = channels
 
+    @abc.abstractmethod
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state; ``dt`` seconds have passed since the last update."""
+
     def measured(self) -> Any:
         """Return the planar Warp array of measured readings."""
         return self._delay.out if self._delay else self._measured
@@ -145,15 +121,24 @@ class ReadoutRuntime(Runtime):
     def state_bytes(self) -> int:
         """Lasting memory per environment [bytes], readings included, without history and delay."""
         planes = 1 + int(self.noisy) + sum(self.stores)
-        return 4 * self._channels * self.count * planes + (self._stage.state_bytes if self._stage else 0)
+        own = 4 * self._channels * self.count * planes + (self._stage.state_bytes if self._stage else 0)
+        return own + self._bytes(self.lasting)
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Memory per environment [bytes] that every update writes anew."""
+        return self._bytes(self.scratch)
 
     @property
     def ring_bytes(self) -> int:
         """Memory per environment [bytes] of delays that the user asked for."""
         return self._delay.ring_bytes if self._delay else 0
 
+    def _bytes(self, arrays: list[Any]) -> int:
+        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) // self.context.num_envs
 
-class ProbeRuntime(ReadoutRuntime):
+
+class ProbeRuntime(Runtime):
     """Probes of all sensors of a group, one after another, with their slots.
 
     Args:

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+import torch
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import DIVERGED, HandState
 from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
+from robotics_bridge.sensors.fidelity import SensorFidelity
+from robotics_bridge.sensors.probes.runtime import DistanceRuntime
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
+from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_clock
+from robotics_bridge.sensors.queries.pairs import PairTable
+from robotics_bridge.sensors.queries.solids import Solids
+from robotics_bridge.sensors.runtime import History, Runtime
 from robotics_bridge.sensors.sensor import QueryRequirements, Sensor
 
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.physics.scene import TouchScene
-    from robotics_bridge.sensors.fidelity import SensorFidelity
-    from robotics_bridge.sensors.probes.runtime import DistanceRuntime
-    from robotics_bridge.sensors.runtime import Runtime
+wp = warp()
 
 
 class _RecordedUpdate(NamedTuple):
@@ -75,11 +77,6 @@ class SensorSuite:
         resolution: int | None = None,
         fidelity: SensorFidelity | None = None,
     ) -> None:
-        from robotics_bridge.sensors.queries.pairs import PairTable
-        from robotics_bridge.sensors.queries.solids import Solids
-        from robotics_bridge.sensors.runtime import History
-
-        wp = warp()
         if fidelity is not None:
             sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
         resolution = resolution or 64
@@ -147,7 +144,7 @@ class SensorSuite:
             replay()
         else:
             # The first update of a state compiles and allocates; the next ones replay what it does.
-            with warp().ScopedDevice(self.device):
+            with wp.ScopedDevice(self.device):
                 self._launch(state, dt)
             self._recorded = None
         self._status = state.status
@@ -173,7 +170,7 @@ class SensorSuite:
         kept = self._histories[name]
         first = self._updates % kept.length
         # Every reading stands twice in the ring, so the window is a slice of it and no copy.
-        window = warp().to_torch(kept.ring)[first : first + kept.length]
+        window = wp.to_torch(kept.ring)[first : first + kept.length]
         tensor = window.permute(2, 0, 3, 1).unflatten(2, kept.part.layout)
         return tensor.squeeze(-1) if kept.part.scalar else tensor
 
@@ -187,7 +184,7 @@ class SensorSuite:
         if not (isinstance(sensor, SurfaceDistanceProbe) and sensor.nearest):
             raise UsageError(f"{name!r} keeps no nearest points; it needs SurfaceDistanceProbe(..., nearest=True).")
         part = runtime.slices[name]
-        points = warp().to_torch(cast("DistanceRuntime", runtime).points)[:, :, part.span]
+        points = wp.to_torch(cast(DistanceRuntime, runtime).points)[:, :, part.span]
         return points.permute(1, 2, 0).unflatten(1, part.layout)
 
     def reset(self, env_ids: Sequence[int] | np.ndarray | torch.Tensor | None = None) -> None:
@@ -196,11 +193,6 @@ class SensorSuite:
         Raises:
             UsageError: an environment does not exist.
         """
-        import torch
-
-        from robotics_bridge.sensors.queries.kernels.pairs import reset_clock
-
-        wp = warp()
         where = wp.device_to_torch(self.device)
         chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=where)
         if env_ids is None:
@@ -223,12 +215,12 @@ class SensorSuite:
         """Mask [B] of environments that held numbers that are not finite at the last update; their readings are NaN."""
         if self._status is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
-        return (warp().to_torch(self._status) & DIVERGED) != 0
+        return (wp.to_torch(self._status) & DIVERGED) != 0
 
     @property
     def crowded(self) -> torch.Tensor:
         """Mask [B] of environments that ever had more geometries in contact with one sensor link than are looked at."""
-        return warp().to_torch(self.pairs.crowded) != 0
+        return wp.to_torch(self.pairs.crowded) != 0
 
     @property
     def state_bytes(self) -> dict[str, int]:
@@ -247,8 +239,6 @@ class SensorSuite:
         for name, history in self._histories.items():
             history.launch(self._owner[name].measured(), self._counter)
         if self._histories:
-            from robotics_bridge.sensors.queries.kernels.pairs import count_update
-
             self.context.launch(count_update, 1, self._counter)
 
     def _check(self, state: HandState) -> None:
@@ -282,5 +272,5 @@ class SensorSuite:
 
     def _view(self, name: str, planes: Any) -> torch.Tensor:
         part = self._slice(name)
-        tensor = warp().to_torch(planes)[:, :, part.span].permute(1, 2, 0).unflatten(1, part.layout)
+        tensor = wp.to_torch(planes)[:, :, part.span].permute(1, 2, 0).unflatten(1, part.layout)
         return tensor.squeeze(-1) if part.scalar else tensor

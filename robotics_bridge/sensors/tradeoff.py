@@ -16,28 +16,26 @@ from __future__ import annotations
 import os
 import platform
 import time
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from trimesh.triangles import closest_point
 
+from brainbench.core.errors import missing_dependency
 from brainbench.core.files import write_json
+from brainbench.core.progress import Progress
+from brainbench.geometry import Mesh, winding_number
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.surface_points import surface_points
 from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.suite import SensorSuite
-from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
-from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.geometry import Mesh
+from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
 RESOLUTIONS = (16, 32, 64, 128)
 POINTS = (250, 500, 1000, 2000, 4000, 16_000)
@@ -77,10 +75,6 @@ def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[
 
     The inside is where the winding number exceeds one half.
     """
-    from trimesh.triangles import closest_point
-
-    from brainbench.geometry import winding_number
-
     corners = mesh.vertices[mesh.faces]
     # All triangles by brute force in double precision: an own reference that shares no code with the kernels.
     sign = np.where(winding_number(mesh, points) > 0.5, -1.0, 1.0)
@@ -130,10 +124,6 @@ def _grid() -> Probes:
 
 @cache
 def _torus() -> Geometry:
-    import trimesh
-
-    from brainbench.geometry import Mesh
-
     made = trimesh.creation.torus(0.012, 0.005, major_sections=72, minor_sections=32)
     return Geometry(name="o", link="object", kind="mesh", mesh=Mesh(made.vertices, made.faces))
 
@@ -224,8 +214,6 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    from brainbench.core.errors import missing_dependency
-
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from brainbench.core.devices import mujoco_module
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import ball
-from robotics_bridge.tasks.registry import register
+from robotics_bridge.tasks.registry import register, register_bounded
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import ACTION_LIMIT, ObservationNoise, Placement, Reward, Success, Task
+from robotics_bridge.tasks.task import ObservationNoise, Placement, Reward, Success, Task
 from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 
 if TYPE_CHECKING:
@@ -41,8 +41,6 @@ _SITES = tuple((0.13 * (i - 1), 0.13 * (j - 1), -0.13 * (i - 1) * math.sin(TILT)
 
 def bin_walls(spec: Any) -> None:
     """Add the tilted bin, its floor's middle at the origin."""
-    from brainbench.core.devices import mujoco_module
-
     mujoco = mujoco_module()
     body = spec.worldbody.add_body(name="bin", quat=(math.cos(TILT / 2), 0.0, math.sin(TILT / 2), 0.0))
     edge, half = SIDE / 2, WALL / 2
@@ -114,7 +112,4 @@ def with_thermal(thermal: ThermalSettings) -> Task:
     )  # fmt: skip
 
 
-@register("hot_ball")
-def default() -> Task:
-    """Return the task on which we train: the published one with bounded actions."""
-    return replace(published(), action_limit=ACTION_LIMIT)
+register_bounded("hot_ball", published)

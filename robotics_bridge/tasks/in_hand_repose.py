@@ -6,16 +6,13 @@ released with it (neuroagents-lab/tactile-genesis).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import TimedRotation
 from robotics_bridge.tasks.in_palm_rotate import PALM_UP
 from robotics_bridge.tasks.objects import PRIMITIVES
-from robotics_bridge.tasks.registry import register
+from robotics_bridge.tasks.registry import register, register_bounded
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import (
-    ACTION_LIMIT,
     Ending,
     ObjectRandomisation,
     ObservationNoise,
@@ -70,7 +67,4 @@ def published() -> Task:
     )
 
 
-@register("in_hand_repose")
-def default() -> Task:
-    """Return the task on which we train: the published one with bounded actions."""
-    return replace(published(), action_limit=ACTION_LIMIT)
+register_bounded("in_hand_repose", published)

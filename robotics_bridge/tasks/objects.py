@@ -160,12 +160,6 @@ def add_object(
         **contact: settings of the geometries, e.g. ``friction``.
     """
     mujoco = mujoco_module()
-    types = {
-        "box": mujoco.mjtGeom.mjGEOM_BOX,
-        "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-        "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    }
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
     waiting = list(shape.solids)
@@ -177,7 +171,8 @@ def add_object(
         used = solid or ObjectPrimitive(kind, (GRAIN,) * _SIZES[kind], middle.position)
         # What the shape takes part in decides: friction of the object alone, whatever the hand is made of.
         body.add_geom(
-            name=f"{name}_{index}", type=types[kind], size=[*used.size, 0.0, 0.0][:3], pos=used.position,
+            name=f"{name}_{index}", type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
+            size=[*used.size, 0.0, 0.0][:3], pos=used.position,
             quat=used.quaternion, density=density if solid is not None else 0.0, priority=1, **contact,
         )  # fmt: skip
 

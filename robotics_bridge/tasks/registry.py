@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 
 from brainbench.core.errors import UsageError, unknown_name
-from robotics_bridge.tasks.task import Task
+from robotics_bridge.tasks.task import ACTION_LIMIT, Task
 
 Maker = Callable[[], Task]
 _MADE: dict[str, dict[str, Maker]] = {}
@@ -38,6 +39,11 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
         return maker
 
     return keep
+
+
+def register_bounded(name: str, published: Maker) -> None:
+    """Register the task on which we train as the default: the published one with bounded actions."""
+    register(name)(lambda: replace(published(), action_limit=ACTION_LIMIT))
 
 
 def forget(name: str) -> None:

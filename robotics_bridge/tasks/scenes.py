@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from robotics_bridge.hands.hand import Hand
+from robotics_bridge.hands.scenes import palm_surface
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
+from robotics_bridge.tasks.task import Pose, Task
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.tasks.task import Pose, Task
+mujoco = mujoco_module()
 
 _STIFFNESS, _DAMPING, _ARMATURE, _EFFORT = 2.0, 0.2, 0.01, 2.0
 """Drive of a joint for which the hand's file names none: N·m/rad, N·m·s/rad, kg·m², N·m."""
@@ -102,7 +102,6 @@ def build(task: Task, hand: Hand) -> TaskModel:
 
 def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, float, float]]]:
     """Return the scene without objects and the drives: joint → stiffness, damping, effort."""
-    mujoco = mujoco_module()
     spec = hand.mjspec()
     option, solver = spec.option, task.solver
     option.timestep, option.iterations, option.ls_iterations = solver.timestep, solver.iterations, solver.line_search
@@ -225,9 +224,6 @@ def palm_up(hand: Hand) -> Pose:
     Raises:
         UsageError: the joints do not tell which side the palm is.
     """
-    from robotics_bridge.hands.scenes import palm_surface
-
-    mujoco = mujoco_module()
     up, surface, step = palm_surface(hand)
     forward = step / np.linalg.norm(step)
     # Columns: where the palm's own directions (forward, up × forward, up) go in the world.
@@ -244,7 +240,6 @@ def palm_up(hand: Hand) -> Pose:
 
 def _apart(spec: Any, samples: int = 1500, margin: float = 2e-3) -> list[tuple[str, str]]:
     """Return pairs of the hand's bodies that never come within a margin (m), found in random poses."""
-    mujoco = mujoco_module()
     trial = spec.copy()
     for geom in trial.geoms:
         geom.margin = margin

@@ -7,15 +7,14 @@ released with it (neuroagents-lab/tactile-genesis). Episodes start from sampled 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
+from brainbench.core.devices import mujoco_module
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import SCREWDRIVERS
-from robotics_bridge.tasks.registry import register
+from robotics_bridge.tasks.registry import register, register_bounded
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import (
-    ACTION_LIMIT,
     Ending,
     ObjectRandomisation,
     ObservationNoise,
@@ -48,8 +47,6 @@ POSES = {
 
 def table(spec: Any) -> None:
     """Add the plane on which the tip stands."""
-    from brainbench.core.devices import mujoco_module
-
     plane = mujoco_module().mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name="table", type=plane, size=(0.0, 0.0, 1.0))
 
@@ -110,7 +107,4 @@ def published() -> Task:
     )
 
 
-@register("screwdriver")
-def default() -> Task:
-    """Return the task on which we train: the published one with bounded actions."""
-    return replace(published(), action_limit=ACTION_LIMIT)
+register_bounded("screwdriver", published)

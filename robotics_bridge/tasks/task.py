@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
-
-if TYPE_CHECKING:
-    from robotics_bridge.tasks.task_state import TaskEnvironment, TaskState
+from robotics_bridge.tasks.task_state import TaskEnvironment, TaskState
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""

@@ -12,8 +12,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from robotics_bridge.sensors import SensorSuite, TemperatureGrid
-from robotics_bridge.sensors.temperature.grid import link_temperature
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature
 from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial
 
 if TYPE_CHECKING:
@@ -88,6 +87,8 @@ class Thermometers:
 
     def __init__(self, env: TaskEnvironment, thermal: ThermalSettings, *, chooses: bool = True) -> None:
         import torch
+
+        from robotics_bridge.sensors import SensorSuite
 
         wp, scene = warp(), env.simulation.engine.scene
         self._env, self.thermal, self._chooses = env, thermal, chooses

@@ -36,7 +36,7 @@ def test_check_compares_this_machine_with_closed_forms(run):
 
 
 def test_check_fails_where_a_truth_is_missed(run, monkeypatch):
-    from brainbench.cli.tactile import checks as _checks
+    from robotics_bridge.sensors import checks as _checks
 
     monkeypatch.setattr(_checks, "CHECKS", {"planted": lambda device: (1.1, 1.0, 0.05)})
     found = run("tactile", "check")

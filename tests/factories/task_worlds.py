@@ -22,7 +22,9 @@ class TouchWorld:
         self.action_map = SimpleNamespace(
             names=("a", "b"), default=np.zeros(2), scale=np.ones(2), low=-np.ones(2), high=np.ones(2)
         )
-        self.touch = observation_type(observe).sensor is not None
+        self.touch: Any = None
+        if observation_type(observe).sensor is not None:
+            self.touch = SimpleNamespace(links=tuple(f"tip{i}" for i in range(5)))
         student = ("proprio", "goal", "tactile") if self.touch else ("proprio", "goal")
         self.task = SimpleNamespace(
             groups={"student": student},
@@ -34,9 +36,6 @@ class TouchWorld:
         if self.touch:
             config = EncoderConfig(placement="tips", resolution="low", observe=observe, name="mlp")
             self.shape = config.build().shape
-            self.tactile: Any = SimpleNamespace(links=tuple(f"tip{i}" for i in range(5)))
-        else:
-            self.tactile = None
         self.generator = torch.Generator().manual_seed(seed)
         self.place, self.aim = torch.zeros(num_envs, 2), torch.zeros(num_envs, 2)
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)

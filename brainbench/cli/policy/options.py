@@ -18,11 +18,9 @@ TaskFileOption = Annotated[
 ]
 EnvsOption = Annotated[int, typer.Option("--envs", help="Environments at once.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu, or cuda for MuJoCo Warp.")]
-SeedOption = Annotated[int, typer.Option(help="Of all random numbers.")]
-ObserveOption = Annotated[str, typer.Option(help="Tactile observation type (table 4.3); none builds no sensor.")]
-PlacementOption = Annotated[str, typer.Option(help="Taxels on: hand, fingers, tips or palm.")]
-ResolutionOption = Annotated[str, typer.Option(help="Of the taxels: low, med or high.")]
-NoisyOption = Annotated[bool, typer.Option("--noisy", help="Taxels with the published imperfections.")]
+ENV = "robotics_bridge.envs.options:EnvOptions"
+TOUCH = ("observe", "placement", "resolution", "noisy")
+"""Fields of the options of an environment that a student fixes."""
 
 
 def make_env(name: str, *, task_file: Path | None = None, **options: Any) -> Env:
@@ -49,7 +47,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
-    known = (*evaluate.AGENTS, *shipped.list_teachers(), *shipped.list_students())
+    known = (*evaluate.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
     if name not in known and not Path(name).exists():
         raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
     if _student(name):
@@ -82,7 +80,7 @@ def touch_of(names: list[str]) -> dict[str, Any]:
     for name in names:
         if facts := _student(name):
             kept = facts.get("distill", facts)
-            found[name] = {key: kept[key] for key in ("observe", "placement", "resolution", "noisy") if key in kept}
+            found[name] = {key: kept[key] for key in TOUCH if key in kept}
     if any(senses != next(iter(found.values())) for senses in found.values()):
         raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")
     return next(iter(found.values()), {})

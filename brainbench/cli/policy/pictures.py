@@ -10,6 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.cli.tactile import figures
+from brainbench.stimuli.figures.camera import Camera
+from brainbench.stimuli.figures.films import require_writer, write_film
+from brainbench.stimuli.figures.raster import Triangles
+from brainbench.stimuli.figures.scenes import Style
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,8 +43,6 @@ class Stage:
     """
 
     def __init__(self, env: Env, size: tuple[int, int] = (480, 400), number: int = 0) -> None:
-        from brainbench.stimuli.figures.camera import Camera
-
         self._env, self._number = env, number
         self._scene = env.simulation.engine.scene
         self._parts: list[tuple[int, Any]] = []
@@ -61,8 +63,6 @@ class Stage:
 
     def frame(self) -> NDArray[np.uint8]:
         """Return the picture [H, W, 3] of this moment."""
-        from brainbench.stimuli.figures.raster import Triangles
-
         pose = self._pose()
         solids = Triangles.joined([figures.placed(solid, pose[link]) for link, solid in self._parts])
         image, _, _ = figures.shaded(solids, self._lens, 0.05)
@@ -85,9 +85,6 @@ def write_video(
     path: Path, frames: Iterable[NDArray[np.uint8]], count: int, size: tuple[int, int], rate: float
 ) -> None:
     """Write frames to an ``.mp4`` or ``.gif``."""
-    from brainbench.stimuli.figures.films import require_writer, write_film
-    from brainbench.stimuli.figures.scenes import Style
-
     require_writer(path.suffix.lower())
     kept = list(frames) if path.suffix.lower() == ".gif" else frames
     sample: Sequence[Any] = kept[:: max(1, count // 4)] if isinstance(kept, list) else ()

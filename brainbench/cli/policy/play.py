@@ -8,17 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
+from brainbench.cli.options import with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_of
 from brainbench.cli.policy.options import (
+    ENV,
+    TOUCH,
     ConfigOption,
     DeviceOption,
     EnvsOption,
     HandOption,
-    NoisyOption,
-    ObserveOption,
-    PlacementOption,
-    ResolutionOption,
-    SeedOption,
     TaskArgument,
     TaskFileOption,
     agent_of,
@@ -30,7 +28,7 @@ from brainbench.cli.policy.options import (
 def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
-    from robotics_bridge.policies.shipped import list_students, list_teachers
+    from robotics_bridge.policies.shipped import list_policies
 
     found = []
     for name in tasks.list_tasks():
@@ -45,7 +43,7 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "success_from": task.success.threshold,
                 "student": student,
                 "teacher": list(task.groups["actor"]),
-                "shipped": [*list_teachers(name), *list_students(name)],
+                "shipped": [*list_policies("teacher", name), *list_policies("student", name)],
             }
         )
     columns = {
@@ -59,8 +57,10 @@ def list_tasks(as_json: JsonOption = False) -> None:
     emit(found, table_of("", found, columns), as_json=as_json)
 
 
+@with_options(ENV, (*TOUCH, "device", "seed"), build=False)
 def play(
     task: TaskArgument,
+    options: dict[str, Any],
     agent: Annotated[str, typer.Option(help="zero, random, a shipped policy, or a run's folder.")] = "random",
     video: Annotated[Path | None, typer.Option(help="Write a film here (.mp4 or .gif).")] = None,
     strip: Annotated[Path | None, typer.Option(help="Write six frames side by side here (.png).")] = None,
@@ -70,12 +70,6 @@ def play(
     hand: HandOption = "xhand1",
     config: ConfigOption = "default",
     task_file: TaskFileOption = None,
-    observe: ObserveOption = "none",
-    placement: PlacementOption = "hand",
-    resolution: ResolutionOption = "med",
-    noisy: NoisyOption = False,
-    device: DeviceOption = "cpu",
-    seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
@@ -87,11 +81,9 @@ def play(
             f"A film has a positive length and rate, and 64 pixels or more across; received {seconds} s, "
             f"{rate} frames/s and {width} pixels."
         )
-    touch = {"observe": observe, "placement": placement, "resolution": resolution, "noisy": noisy} | touch_of([agent])
-    env = make_env(
-        task, task_file=task_file, num_envs=1, hand=hand, config=config, device=device, seed=seed, threads=1, **touch
-    )
-    act = agent_of(agent, env, seed=seed)
+    options |= touch_of([agent])
+    env = make_env(task, task_file=task_file, num_envs=1, hand=hand, config=config, threads=1, **options)
+    act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
     pictures = [path for path in (video, strip) if path is not None]
     rewards: list[float] = []

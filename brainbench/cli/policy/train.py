@@ -14,40 +14,34 @@ from brainbench.cli.policy.options import (
     ConfigOption,
     DeviceOption,
     HandOption,
-    SeedOption,
     TaskArgument,
     TaskFileOption,
     read_task_file,
 )
 
 
+@with_options(
+    "robotics_bridge.policies.training.teacher:TeacherRun",
+    ("iterations", "minutes", "start", "start_std", "save_every", "seed"),
+)
 def train(
     task: TaskArgument,
+    options: Any,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder of the run; started again, it goes on.")
     ] = None,
     envs: Annotated[int | None, typer.Option("--envs", help="Environments at once (published: 8192).")] = None,
-    iterations: Annotated[int | None, typer.Option(help="In total, earlier ones of the run included.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Stop and save after this time.")] = None,
     hand: HandOption = "xhand1",
     config: ConfigOption = "default",
     task_file: TaskFileOption = None,
     steps: Annotated[int | None, typer.Option(help="Control steps per environment and iteration.")] = None,
     curiosity: Annotated[float | None, typer.Option(help="Weight of the RND reward (published: 100).")] = None,
     initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
-    start: Annotated[
-        Path | None, typer.Option(help="Begin with the networks of another run: its folder or one of its models.")
-    ] = None,
-    start_std: Annotated[
-        float | None, typer.Option(help="Of the actions of --start's policy, to explore anew.")
-    ] = None,
     change: Annotated[
         list[str] | None,
         typer.Option(help="Another number of the task: is_dropped=-300, goal.start_threshold=0.4, entropy=0, …"),
     ] = None,
-    save_every: Annotated[int, typer.Option(help="Iterations between checkpoints.")] = 50,
     device: DeviceOption = "cpu",
-    seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Train the teacher of a task by PPO, or go on with a run.
@@ -62,15 +56,12 @@ def train(
     count = envs or (8192 if device != "cpu" else 64)
     read_task_file(task_file)
     chosen_task = apply_overrides(tasks.load(task, config), change or ())
-    env = tasks.make(chosen_task, num_envs=count, hand=hand, device=device, seed=seed)
+    env = tasks.make(chosen_task, num_envs=count, hand=hand, device=device, seed=options.seed)
     given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
     chosen = {name: value for name, value in given.items() if value is not None}
     settings = replace(chosen_task.teacher, num_envs=count, **chosen)
-    run = out or Path("runs") / f"{task}-{env.hand.name}-{seed}"
+    run = out or Path("runs") / f"{task}-{env.hand.name}-{options.seed}"
     with progress_bar() as progress:
-        options = teacher.TeacherRun(
-            iterations=iterations, minutes=minutes, seed=seed, save_every=save_every, start=start, start_std=start_std
-        )
         result = teacher.train(env, run, options, settings=settings, progress=progress)
     last = dict(result.history[-1]) if result.history else {}
     told = {

@@ -131,7 +131,7 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Compare sensors with closed forms on this machine; exit status 1 if one is off."""
-    from brainbench.cli.tactile.checks import CHECKS
+    from robotics_bridge.sensors.checks import CHECKS
 
     results = []
     with progress_bar() as progress:

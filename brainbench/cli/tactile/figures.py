@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import spectrogram
 
 from brainbench.core.errors import missing_dependency
 from brainbench.core.files import atomic_path
 from brainbench.core.rotations import to_matrices
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.figures.camera import Lens
-    from brainbench.stimuli.figures.raster import Triangles
+from brainbench.stimuli.figures.camera import Camera, Lens
+from brainbench.stimuli.figures.raster import Triangles, draw
+from brainbench.stimuli.figures.shading import lamp, paint, shade
+from brainbench.stimuli.figures.surfaces import ball, corner_normals, tube
+from robotics_bridge.sensors.queries.solids import tessellate
 
 SIZE = (1100, 900)
 SKIN, OBJECT = (0.80, 0.82, 0.86), (0.95, 0.75, 0.45)
@@ -56,10 +56,6 @@ def link_rotation(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def surface(geometry: Any, color: tuple[float, float, float]) -> Triangles:
     """Return the triangles of a geometry in the frame of its link; a plane has none."""
-    from brainbench.stimuli.figures.raster import Triangles
-    from brainbench.stimuli.figures.surfaces import corner_normals
-    from robotics_bridge.sensors.queries.solids import tessellate
-
     if geometry.kind == "plane":
         return Triangles.joined([])
     mesh, rotation = tessellate(geometry), to_matrices(geometry.quaternion)
@@ -75,9 +71,6 @@ def placed(solid: Triangles, pose: NDArray[np.float64]) -> Triangles:
 
 def shaded(solids: Triangles, lens: Lens, gloss: float) -> tuple[NDArray[np.float64], Any, Any]:
     """Draw triangles on white through a supersampled lens; return picture [H, W, 3], layer and light."""
-    from brainbench.stimuli.figures.raster import draw
-    from brainbench.stimuli.figures.shading import lamp, paint, shade
-
     light = lamp(lens, SAMPLES, solids.corners.reshape(-1, 3), solids)
     image = np.ones((lens.size[1], lens.size[0], 3))
     layer = draw(solids, lens)
@@ -99,11 +92,6 @@ def draw_forces(
     readings: Mapping[str, NDArray[np.float64]],
 ) -> None:
     """Draw a hand with its taxels coloured by force, and arrows along the force (link frame)."""
-    from brainbench.stimuli.figures.camera import Camera
-    from brainbench.stimuli.figures.raster import Triangles, draw
-    from brainbench.stimuli.figures.shading import shade
-    from brainbench.stimuli.figures.surfaces import ball, tube
-
     plots = pyplot()
     peak = max(float(np.linalg.norm(force, axis=1).max()) for force in readings.values()) or 1e-9
     hand, held, marks = [], [], []
@@ -223,8 +211,6 @@ def draw_temperature(
 
 def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: float) -> None:
     """Draw spectrograms of signals [T] at a sample rate (Hz)."""
-    from scipy.signal import spectrogram
-
     plots = pyplot()
     figure, axes = plots.subplots(1, len(signals), figsize=(12, 3.8), layout="constrained", sharey=True)
     shown = None

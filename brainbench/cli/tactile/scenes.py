@@ -7,15 +7,22 @@ from __future__ import annotations
 
 import statistics
 import time
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from brainbench.cli.tactile import figures
+from brainbench.core.devices import mujoco_module as mujoco
+from brainbench.core.devices import warp
 from brainbench.core.errors import unknown_name
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from robotics_bridge import hands, sensors
+from robotics_bridge.hands.scenes import closing, holding
+from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWarpEngine, TouchScene
+from robotics_bridge.sensors import ContactAudio, ElastomerTaxel, Noise, Probes, SensorSuite, TemperatureGrid
+from robotics_bridge.sensors.audio.materials import Modes
+from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
+from robotics_bridge.sensors.temperature.materials import ThermalBody
 
 CLASSES = {
     "ContactProbe": "published-bool",
@@ -34,10 +41,6 @@ class Grip:
     """A hand, palm up, that closes around a ball in every environment."""
 
     def __init__(self, hand: str, *, envs: int = 1, device: str = "cpu", radius: float = 0.028) -> None:
-        from robotics_bridge import hands
-        from robotics_bridge.hands.scenes import closing, holding
-        from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
-
         self.hand, self.device, self.radius = hands.load(hand), device, radius
         self.model = holding(self.hand, radius=radius, reach=0.9)
         self.engine: Any = (
@@ -56,10 +59,6 @@ class Grip:
 
     def sensors(self, name: str, resolution: str, placement: str, *, noisy: bool = False) -> dict[str, Any]:
         """Return a sensor of one class on every link of a layout, by link."""
-        from robotics_bridge import sensors
-        from robotics_bridge.sensors.audio.materials import Modes
-        from robotics_bridge.sensors.temperature.materials import ThermalBody
-
         if name not in CLASSES:
             raise unknown_name("sensor class", name, CLASSES)
         kind = getattr(sensors, name)
@@ -79,9 +78,6 @@ class Grip:
 
 def time_class(grip: Grip, name: str, resolution: str, placement: str, *, noisy: bool, repeats: int) -> dict[str, Any]:
     """Return the median time of an update of one class and its memory per environment."""
-    from brainbench.core.devices import warp
-    from robotics_bridge.sensors import SensorSuite
-
     wp, engine = warp(), grip.engine
     members = grip.sensors(name, resolution, placement, noisy=noisy)
     suite = SensorSuite(engine.scene, members, num_envs=engine.state.num_envs, device=grip.device)
@@ -103,8 +99,6 @@ def time_class(grip: Grip, name: str, resolution: str, placement: str, *, noisy:
 
 def forces(path: Path, hand: str, resolution: str, *, noisy: bool) -> dict[str, float]:
     """Draw the forces on all taxels of a hand that holds a ball."""
-    from robotics_bridge.sensors import SensorSuite
-
     grip = Grip(hand)
     members = grip.sensors("KinematicTaxel", resolution, "hand", noisy=noisy)
     suite = SensorSuite(grip.engine.scene, members, num_envs=1)
@@ -124,9 +118,6 @@ def forces(path: Path, hand: str, resolution: str, *, noisy: bool) -> dict[str, 
 
 def markers(path: Path, *, noisy: bool) -> dict[str, float]:
     """Draw the markers of an elastomer pad that a ball presses, drags and twists."""
-    from robotics_bridge.physics import Geometry, HandState, TouchScene
-    from robotics_bridge.sensors import ElastomerTaxel, Noise, Probes, SensorSuite
-
     probes = Probes.grid(15, 15, size=(0.018, 0.018), radius=0.001)
     shapes = (
         Geometry(name="pad", link="pad", kind="box", size=(0.012, 0.012, 0.002), position=(0, 0, -0.002)),
@@ -166,9 +157,6 @@ def markers(path: Path, *, noisy: bool) -> dict[str, float]:
 
 def temperature(path: Path, hand: str) -> dict[str, float]:
     """Draw the warming of the finger tips by a ball of 45 °C, for three materials."""
-    from robotics_bridge.sensors import SensorSuite, TemperatureGrid
-    from robotics_bridge.sensors.temperature.materials import ThermalBody
-
     grip = Grip(hand)
     tips = grip.hand.tips
     members = {
@@ -197,11 +185,6 @@ def temperature(path: Path, hand: str) -> dict[str, float]:
 
 def sound(path: Path) -> dict[str, float]:
     """Draw spectrograms of a ball that bounces on plates of wood, metal and glass."""
-    from brainbench.core.devices import mujoco_module as mujoco
-    from robotics_bridge.physics import MujocoEngine
-    from robotics_bridge.sensors import ContactAudio, SensorSuite
-    from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
-
     model = mujoco().MjModel.from_xml_string("""
     <mujoco><option timestep="0.005"/><worldbody>
       <body name="slab"><geom type="box" size="0.15 0.1 0.01" solref="0.004 0.3"/></body>

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE
-
-if TYPE_CHECKING:
-    import torch
 
 _TOUCHING = 1e-3
 """Cells below this share of the strongest one do not count as touched."""
@@ -51,8 +50,6 @@ class HandCalibration:
         Raises:
             DataError: nothing touches in the recording, or it holds values that are no numbers.
         """
-        import torch
-
         if grid.ndim < 3 or grid.shape[-2:] != GRID_SHAPE or grid.shape[-3] % len(CHANNELS):
             raise UsageError(f"A recording has the shape [..., S·6, 5, 7]; received {list(grid.shape)}.")
         if not torch.isfinite(grid).all():

@@ -8,15 +8,11 @@ nothing else needs to know. Letters: N picture, C channel, P = rows × columns c
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import nn
 
+from brainbench.models.cells import GRU
 from brainbench.models.cells.cell import FORGET_BIAS
-
-if TYPE_CHECKING:
-    from brainbench.models.cells import GRU
 
 MOST_CELLS = 64
 """Cells of a picture beyond which the products outweigh what they save (they grow with the square of P)."""

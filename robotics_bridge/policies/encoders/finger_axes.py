@@ -9,19 +9,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from robotics_bridge.hands import Hand
+from robotics_bridge.hands.layouts import Layout
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.hands import Hand
-    from robotics_bridge.hands.layouts import Layout
+mujoco = mujoco_module()
 
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Rows of the grid, from the radial side on."""
@@ -119,7 +118,6 @@ def finger_axes_of(hand: Hand, reference: Layout) -> FingerAxes:
     Raises:
         UsageError: the hand has more than five fingers, or a taxel sits on a link that is no part of it.
     """
-    mujoco = mujoco_module()
     data = mujoco.MjData(hand.model)
     mujoco.mj_kinematics(hand.model, data)
     palm = hand.model.body(hand.palm).id

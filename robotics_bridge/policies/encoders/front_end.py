@@ -7,8 +7,9 @@ in one array [B, H]: zeros are the state before the first step and rows are inde
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -20,10 +21,7 @@ from brainbench.models.registry import load_model
 from brainbench.models.streaming import StreamingStep
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
-from robotics_bridge.policies.encoders.timing import CONTROL_SUB_STEP, TIMES, Resampler, Time
-
-if TYPE_CHECKING:
-    import os
+from robotics_bridge.policies.encoders.timing import TIMES, Resampler, Time
 
 Learning = Literal["frozen", "finetuned"]
 LEARNING = ("frozen", "finetuned")
@@ -38,7 +36,6 @@ class FrontEnd(nn.Module):
         time: ``native`` or ``resampled`` (:mod:`~robotics_bridge.policies.encoders.timing`).
         learning: ``frozen`` computes no gradients and never leaves evaluation mode.
         calibration: What a unit of force is to the network; a mapping of its fields will do.
-        sub_step: Seconds between the readings of a control step.
         seed: Of untrained weights.
         pretrained: File or folder of weights for a tagged name.
         options: What the network's builder takes, such as ``{"unroll": "full"}``.
@@ -58,7 +55,6 @@ class FrontEnd(nn.Module):
         time: Time = "native",
         learning: Learning = "frozen",
         calibration: HandCalibration | Mapping[str, Any] | None = None,
-        sub_step: float = CONTROL_SUB_STEP,
         seed: int = 0,
         pretrained: str | os.PathLike[str] | None = None,
         options: Mapping[str, Any] | None = None,
@@ -88,7 +84,7 @@ class FrontEnd(nn.Module):
         gains = torch.tensor(HandCalibration.of(calibration).gains(self.sub_steps)).view(-1, 1, 1)
         self.register_buffer("gain", gains, persistent=False)
         values = network.spec.input_shape[0] // self.sub_steps * GRID_SHAPE[0] * GRID_SHAPE[1]
-        self.resampler = Resampler(values, sub_steps=self.sub_steps, seconds=sub_step) if time == "resampled" else None
+        self.resampler = Resampler(values, sub_steps=self.sub_steps) if time == "resampled" else None
         self.features: int = network.features
         """F."""
         held = self.features + self.resampler.state_size if self.resampler is not None else 0

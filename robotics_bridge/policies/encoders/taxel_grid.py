@@ -17,29 +17,23 @@ Letters: B batch, S sub-step, N item (an active taxel, or a link of the ``agg_``
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.hands import layouts
-from robotics_bridge.hands.observations import observation_type, observe
-from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from robotics_bridge.hands import Hand
-    from robotics_bridge.hands.layouts import Layout
-    from robotics_bridge.policies.encoders.finger_axes import FingerAxes
-    from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.hands import Hand, layouts
+from robotics_bridge.hands.layouts import Layout
+from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
+from robotics_bridge.sensors.probes.placement import Probes
 
 SITES = GRID_SHAPE[0] * GRID_SHAPE[1]
 """Cells of the grid."""
@@ -114,20 +108,6 @@ class TaxelGrid(nn.Module):
         sites = nn.functional.linear(taxels.flatten(2), self.matrix)
         grid = sites.unflatten(2, (SITES, len(CHANNELS))).transpose(2, 3)
         return grid.reshape(taxels.shape[0], -1, *GRID_SHAPE)
-
-    def from_readings(self, steps: Mapping[str, torch.Tensor] | list[Mapping[str, torch.Tensor]]) -> torch.Tensor:
-        """Return the grid of the sensors' own readings (fillers included) of one sub-step, or of several in turn.
-
-        Raises:
-            UsageError: a link's reading is missing or has another shape.
-        """
-        several = steps if isinstance(steps, list) else [steps]
-        rows = [observe(self.observe, readings, self.layout) for readings in several]
-        return self(torch.stack(rows, 1).unflatten(2, (self.items, self.channels)))
-
-    def extra_repr(self) -> str:
-        """Return what the module is called when printed."""
-        return f"{self.observe}: {self.items} × {self.channels} → {SITES} sites"
 
 
 def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArray[np.float64]:

@@ -21,6 +21,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
@@ -28,7 +31,7 @@ from brainbench.core.files import atomic_path, provenance, read_json, to_plain, 
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
-from robotics_bridge.policies.shipped import student_path
+from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -223,12 +226,12 @@ class _Run:
             self.memory = torch.where(ended[:, None], 0.0, memory.float())
             if self.front is not None:
                 self.touched = torch.where(ended[:, None], 0.0, self.touched)
-        return recorder.finish([*self.groups, *targets])
+        return recorder.rollout
 
     def _learn(self, rollout: Rollout) -> dict[str, float]:
         """Take the steps of one iteration; return the mean losses over its first epoch on the new rollout."""
         self.learner.train()
-        self.student.update_normalization(rollout.groups)
+        self.student.update_normalization(rollout.parts)
         if self.config.aggregate:
             self.kept = [*self.kept, (self.iteration, rollout)][-self.config.aggregate :]
         losses: dict[str, torch.Tensor] = {}
@@ -244,10 +247,10 @@ class _Run:
         """Go once through a rollout, a gradient step every ``gradient_length`` steps."""
         length = self.config.gradient_length or 1
         memory = rollout.memory
-        scale = torch.ones(rollout.teacher.shape[-1], device=self.device)
+        scale = torch.ones(rollout.parts["teacher"].shape[-1], device=self.device)
         if self.config.loss == "inv_var_mse":
             # Error of each joint in units of the teacher's own variance, bounded below for joints that hardly move.
-            scale = 1 / rollout.teacher.flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
+            scale = 1 / rollout.parts["teacher"].flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
         sums: dict[str, torch.Tensor] = {}
         for first in range(0, rollout.steps, length):
             chunk = rollout.chunk(first, length)
@@ -357,8 +360,6 @@ def build_student(
     Raises:
         UsageError: the shapes do not fit the tactile encoder.
     """
-    from tensordict import TensorDict
-
     example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
     tactile = config.tactile
     return TactilePolicy(
@@ -388,7 +389,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "joints": list(env.joint_names),
             "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},
             "frozen": dict(env.frozen),
-            "links": list(env.tactile.links) if env.tactile is not None else [],
+            "links": list(env.touch.links) if env.touch is not None else [],
         },
         "provenance": provenance(),
     }
@@ -396,8 +397,6 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
 
 def save_student(path: Path, student: TactilePolicy) -> None:
     """Write a student's weights and normalisers."""
-    from safetensors.torch import save_file
-
     state = {name: value.detach().cpu().contiguous().clone() for name, value in student.state_dict().items()}
     with atomic_path(path) as temporary:
         save_file(state, temporary)
@@ -407,17 +406,14 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     """Return a distilled student in evaluation mode, and its run's configuration.
 
     Args:
-        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_students`.
+        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_policies`.
         device: Of its weights.
 
     Raises:
         UsageError: there is no such folder or name.
         DataError: the folder holds no student, or its weights are damaged.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    folder = student_path(folder)
+    folder = policy_path("student", folder)
     described = read_json(folder / CONFIG)
     if not isinstance(described, dict) or described.get("brainbench_student") != 1:
         raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
-
-if TYPE_CHECKING:
-    from robotics_bridge.tasks.settings import StudentSettings
+from robotics_bridge.tasks.settings import StudentSettings
 
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""

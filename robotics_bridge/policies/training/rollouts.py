@@ -3,89 +3,61 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 import torch
+from safetensors.torch import load_file, save_file
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
+from brainbench.core.files import atomic_path
 
 
 @dataclass
 class Rollout:
     """T control steps of B environments."""
 
-    groups: dict[str, torch.Tensor]
-    """Observation groups [T, B, …] that the student or its decoders read."""
-    features: torch.Tensor | None
-    """Features [T, B, F] that a frozen encoder gave, in place of the readings."""
-    teacher: torch.Tensor
-    """Actions [T, B, A] of the teacher."""
-    student: torch.Tensor
-    """Actions [T, B, A] of the student at the time."""
-    ended: torch.Tensor
-    """Steps [T, B] after which an episode ended."""
+    parts: dict[str, torch.Tensor]
+    """By name [T, B, …]: observation groups that the student or its decoders read; ``features`` [F] of a frozen encoder
+    in place of the readings; actions [A] of ``teacher`` and ``student``; ``ended``: an episode did after the step."""
     memory: torch.Tensor
     """The student's memory [B, H] before the first step."""
 
     @property
     def steps(self) -> int:
         """T."""
-        return len(self.teacher)
+        return len(self.parts["teacher"])
 
     def chunk(self, first: int, length: int) -> dict[str, torch.Tensor]:
         """Return the steps from one on, ``length`` or what is left: views [L, B, …] of all but the memory."""
-        span = slice(first, first + length)
-        parts = {name: value[span] for name, value in self.groups.items()}
-        parts |= {name: getattr(self, name)[span] for name in ("teacher", "student", "ended")}
-        return parts if self.features is None else {**parts, "features": self.features[span]}
+        return {name: value[first : first + length] for name, value in self.parts.items()}
 
     def save(self, path: Path) -> None:
         """Write the rollout to a safetensors file."""
-        from safetensors.torch import save_file
-
-        from brainbench.core.files import atomic_path
-
-        parts: dict[str, Any] = {f"groups.{name}": value for name, value in self.groups.items()}
-        parts |= {name: getattr(self, name) for name in ("teacher", "student", "ended", "memory")}
-        if self.features is not None:
-            parts["features"] = self.features
+        parts = {**self.parts, "memory": self.memory}
         with atomic_path(path) as temporary:
             save_file({name: value.detach().cpu().contiguous() for name, value in parts.items()}, temporary)
 
     @classmethod
     def load(cls, path: Path, device: torch.device) -> Rollout:
-        """Read what :meth:`save` wrote."""
-        from safetensors.torch import load_file
-
-        parts = {name: value.to(device) for name, value in load_file(path).items()}
-        groups = {name.removeprefix("groups."): parts.pop(name) for name in list(parts) if name.startswith("groups.")}
-        return cls(groups, parts.pop("features", None), **parts)
+        """Read what :meth:`save` wrote; version 0.1 put ``groups.`` before the names of groups."""
+        parts = {name.removeprefix("groups."): value.to(device) for name, value in load_file(path).items()}
+        return cls(parts, parts.pop("memory"))
 
 
 class Recorder:
     """Collects the steps of a rollout in tensors of their final size."""
 
     def __init__(self, steps: int, memory: torch.Tensor) -> None:
-        self.steps, self.memory = steps, memory.clone()
-        self._parts: dict[str, torch.Tensor] = {}
-        self._step = 0
+        self.rollout = Rollout({}, memory.clone())
+        self._steps, self._step = steps, 0
 
     def put(self, **values: torch.Tensor) -> None:
         """Keep values of the present step."""
+        parts = self.rollout.parts
         for name, value in values.items():
-            if name not in self._parts:
-                self._parts[name] = torch.empty(self.steps, *value.shape, dtype=value.dtype, device=value.device)
-            self._parts[name][self._step].copy_(value)
+            if name not in parts:
+                parts[name] = torch.empty(self._steps, *value.shape, dtype=value.dtype, device=value.device)
+            parts[name][self._step].copy_(value)
 
     def next(self) -> None:
         """Go on to the next step."""
         self._step += 1
-
-    def finish(self, groups: Iterable[str]) -> Rollout:
-        """Return the rollout."""
-        parts = self._parts
-        features = parts.get("features")
-        kept = {name: parts[name] for name in groups if name in parts}
-        return Rollout(kept, features, parts["teacher"], parts["student"], parts["ended"], self.memory)

@@ -6,21 +6,20 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import atomic_path
-
-if TYPE_CHECKING:
-    import torch
 
 _LEAF = "__tensor__"
 
 
 def flatten(tree: Any, prefix: str = "") -> tuple[dict[str, torch.Tensor], Any]:
     """Split a tree of dictionaries, lists, tensors and numbers into named tensors and a JSON-able rest."""
-    import torch
-
     tensors: dict[str, torch.Tensor] = {}
     if isinstance(tree, torch.Tensor):
         return {prefix: tree}, {_LEAF: prefix}
@@ -58,8 +57,6 @@ def restore(rest: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
 
 def save(path: str | os.PathLike[str], tree: Any) -> None:
     """Write a tree to one safetensors file, replaced as a whole."""
-    from safetensors.torch import save_file
-
     tensors, rest = flatten(tree)
     ready = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     with atomic_path(path) as target:
@@ -72,8 +69,6 @@ def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
     Raises:
         DataError: the file is missing or holds no tree.
     """
-    from safetensors import SafetensorError, safe_open
-
     if not Path(path).is_file():
         raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
     try:

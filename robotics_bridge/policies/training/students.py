@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,16 @@ import torch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, write_json
 from brainbench.core.progress import Progress
+from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.evaluate import evaluate
 from robotics_bridge.policies.report import EVALUATION, GRADED
-from robotics_bridge.policies.shipped import list_teachers
+from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import CONFIG, DistillResult, StudentPolicy, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.teacher import load_teacher
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +47,6 @@ def train_student(
     *,
     device: str = "cpu",
     episodes: int = 100,
-    seeds: Sequence[int] = SEEDS,
     stop_after: float | None = None,
     stop_at: int | None = None,
     progress: Progress | None = None,
@@ -57,7 +58,6 @@ def train_student(
         out: The run's folder; a finished and evaluated run is left as it is.
         device: ``cpu``, or ``cuda`` for MuJoCo Warp.
         episodes: Per evaluation seed; 0 evaluates nothing. An evaluation says how many iterations the student had.
-        seeds: Of the evaluation.
         stop_after: Seconds after which the state is saved and learning stops.
         stop_at: Iterations after which it does.
         progress: Called with (done, in all, what).
@@ -66,13 +66,10 @@ def train_student(
         UsageError: no teacher is named, or something does not fit.
         DataError: a file is missing or damaged.
     """
-    from robotics_bridge import tasks
-    from robotics_bridge.policies.training.teacher import load_teacher
-
     if not config.teacher:
         raise UsageError(
             "A student needs a teacher: the folder of a run of brainbench policy train, or a shipped one "
-            f"({', '.join(list_teachers())})."
+            f"({', '.join(list_policies('teacher'))})."
         )
     out = Path(out)
     env = tasks.make(
@@ -82,15 +79,10 @@ def train_student(
     )  # fmt: skip
     teacher = load_teacher(config.teacher, env)
     config = calibrated(config, env, teacher, out)
-    result = distill(
-        config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress
-    )  # fmt: skip
+    result = distill(config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress)
     if result.status == "diverged" or not episodes:
         return Student(out, result, ())
-    found = evaluate_student(
-        out, env, episodes=episodes, seeds=seeds, iterations=result.iterations, progress=progress
-    )  # fmt: skip
-    return Student(out, result, found)
+    return Student(out, result, evaluate_student(out, env, episodes, result.iterations, progress))
 
 
 def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:
@@ -127,22 +119,18 @@ def _measure(config: DistillConfig, env: Any, teacher: Any) -> HandCalibration:
 def evaluate_student(
     folder: str | Path,
     env: Any,
-    *,
-    episodes: int = 100,
-    seeds: Sequence[int] = SEEDS,
-    iterations: int | None = None,
-    progress: Progress | None = None,
+    episodes: int,
+    iterations: int,
+    progress: Progress | None,
 ) -> tuple[dict[str, Any], ...]:
     """Run whole episodes with a student and write ``evaluation.json``, one entry per seed.
 
     An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
     ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
     """
-    from robotics_bridge.policies.evaluate import evaluate
-
     student, _ = load_student(folder, device=str(env.device))
     policy, found = StudentPolicy(student), []
-    for number, seed in enumerate(seeds):
+    for number, seed in enumerate(SEEDS):
         result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
         found.append(
             {
@@ -152,6 +140,6 @@ def evaluate_student(
             }
         )  # fmt: skip
         if progress is not None:
-            progress(number + 1, len(seeds), "evaluating")
+            progress(number + 1, len(SEEDS), "evaluating")
     write_json(Path(folder) / EVALUATION, found)
     return tuple(found)

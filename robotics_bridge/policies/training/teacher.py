@@ -17,15 +17,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
-from robotics_bridge.policies.shipped import teacher_path
+from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.tasks.settings import TeacherSettings
 
 if TYPE_CHECKING:
-    import torch
     from tensordict import TensorDict
 
     from robotics_bridge.envs.env import Env
@@ -61,7 +62,6 @@ class Policy:
 
     def act(self, observations: Mapping[str, torch.Tensor] | TensorDict) -> torch.Tensor:
         """Return the mean actions [B, A]."""
-        import torch
         from tensordict import TensorDict
 
         if not isinstance(observations, TensorDict):
@@ -90,8 +90,6 @@ class Trainer:
     """
 
     def __init__(self, env: Env, settings: TeacherSettings | None = None, *, seed: int = 0) -> None:
-        import torch
-
         try:
             from rsl_rl.algorithms import PPO
         except ImportError as error:
@@ -116,16 +114,12 @@ class Trainer:
 
     def _spread_episodes(self) -> None:
         """Let first episodes end at different times, so that no batch holds only beginnings."""
-        import torch
-
         self.env.episode_length_buf = torch.randint_like(
             self.env.episode_length_buf, high=int(self.env.max_episode_length)
         )
 
     def iterate(self) -> dict[str, float]:
         """Collect steps, learn from them, and return losses, episode means and seconds spent."""
-        import torch
-
         env, algorithm = self.env, self.algorithm
         start = _now(env.device)
         reward = torch.zeros((), device=env.device)
@@ -201,8 +195,6 @@ class Trainer:
 
     def state(self) -> dict[str, Any]:
         """Return all that the next iteration depends on, random numbers included."""
-        import torch
-
         state = {"algorithm": self.algorithm.save(), "env": self.env.unwrapped.state_dict()}
         state |= {name: value.clone() for name, value in _named(self._curriculum).items()}
         state |= {"iteration": self.iteration, "torch_rng": torch.get_rng_state()}
@@ -217,8 +209,6 @@ class Trainer:
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on from what :meth:`state` returned."""
-        import torch
-
         self.env.unwrapped.load_state_dict(state["env"])
         self.algorithm.load(dict(state["algorithm"]), None, strict=True)
         for name, value in _named(self._curriculum).items():
@@ -245,7 +235,7 @@ class TeacherRun:
     """
 
     iterations: int | None = None
-    """In total; the settings' by default."""
+    """In total, earlier ones of the run included; the settings' by default."""
     minutes: float | None = None
     """Stop after this time and save."""
     seed: int = 0
@@ -258,7 +248,7 @@ class TeacherRun:
     start: Path | None = None
     """Another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with."""
     start_std: float | None = None
-    """Standard deviation of actions that it begins with; by default that of the other run."""
+    """Standard deviation of actions that it begins with, to explore anew; by default that of the other run."""
 
     def __post_init__(self) -> None:
         if self.start_std is not None and (self.start is None or not self.start_std > 0):
@@ -389,7 +379,7 @@ def model_file(path: Path) -> Path:
         UsageError: there is no such file, folder or name.
         DataError: the folder holds no model.
     """
-    found = teacher_path(path)
+    found = policy_path("teacher", path)
     return newest(found) if found.is_dir() else found
 
 
@@ -398,15 +388,13 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
 
     Args:
         run: folder of a run, one of its ``model_<iteration>.safetensors``, or a name of
-            :func:`~robotics_bridge.policies.shipped.list_teachers`.
+            :func:`~robotics_bridge.policies.shipped.list_policies`.
         env: environments with the same observation groups and actions.
 
     Raises:
         UsageError: there is no such file, folder or name.
         DataError: there is no model, or it was trained on other observations.
     """
-    import torch
-
     path = Path(run)
     file = model_file(path)
     facts = read_json(file.parent / "config.json")
@@ -436,7 +424,5 @@ def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def _now(device: torch.device) -> float:
     if device.type == "cuda":
-        import torch
-
         torch.cuda.synchronize(device)
     return time.perf_counter()

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
+
+import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.audio.kernels import sound as k
 from robotics_bridge.sensors.audio.sensors import AudioSensor
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.suite import SensorSuite
+from robotics_bridge.sensors.suite import SensorSuite
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class Listener:
         found = [name for name, sensor in suite.sensors.items() if isinstance(sensor, AudioSensor)]
         names = microphone.sources or found
         self._sources = {name: suite.runtime_of(name, AudioSensor, "source of sound") for name in names}
-        lengths = {cast("AudioSensor", suite.sensors[name]).samples for name in names}
+        lengths = {cast(AudioSensor, suite.sensors[name]).samples for name in names}
         if len(lengths) != 1:
             raise UsageError(
                 "A microphone needs sources with one length of block; "
@@ -89,8 +88,6 @@ class Listener:
         Raises:
             UsageError: the time step changed.
         """
-        from robotics_bridge.sensors.audio.kernels import sound as k
-
         c, m, envs = self._suite.context, self.microphone, self._suite.num_envs
         rate, age, block = self.samples / dt, c.clock.age, (self.samples, envs)
         # The ring holds the longest delay, reach / c, a few samples for the interpolation, and the block being written.

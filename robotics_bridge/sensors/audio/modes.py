@@ -8,19 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.linalg import eigsh
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import cache_dir, content_hash, read_json, to_plain, write_json
+from brainbench.geometry import Mesh
 from robotics_bridge.sensors.audio import tetrahedra
 from robotics_bridge.sensors.audio.materials import ElasticMaterial, Modes, elastic_material
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.geometry import Mesh
 
 _VERSION = 1
 SHAPES = ("box", "sphere", "ellipsoid", "cylinder", "mesh")
@@ -117,8 +115,6 @@ def solve(
     Raises:
         UsageError: the mesh is too coarse for so many modes.
     """
-    from scipy.sparse.linalg import eigsh
-
     fem = tetrahedra.skfem()
     helpers, elasticity = import_module("skfem.helpers"), import_module("skfem.models.elasticity")
     # K φ = ω² M φ (4.33) with a consistent mass and quadratic elements.

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels.sound import (
     ContactSoundArrays,
     DriveSoundArrays,
@@ -19,14 +20,10 @@ from robotics_bridge.sensors.audio.kernels.sound import (
     ring_modes,
     sound_drives,
 )
+from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.noise.model import stream_seed
-from robotics_bridge.sensors.runtime import ReadoutRuntime
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
-    from robotics_bridge.sensors.context import SuiteContext
-
+from robotics_bridge.sensors.runtime import Runtime
 
 wp = warp()
 
@@ -37,7 +34,7 @@ def _keyed(item: Any, seed: int, name: str) -> Any:
     return item
 
 
-class ContactAudioRuntime(ReadoutRuntime):
+class ContactAudioRuntime(Runtime):
     """Serves contact sounds of one block length."""
 
     def __init__(self, sensors: Mapping[str, ContactAudio], context: SuiteContext) -> None:
@@ -53,7 +50,7 @@ class ContactAudioRuntime(ReadoutRuntime):
         own.drive = context.zeros((self.samples, envs, count))
         own.first, own.second, own.gain = (context.zeros((quads, count), wp.vec4) for _ in range(3))
         own.y1, own.y2 = (context.zeros((quads, envs, count), wp.vec4) for _ in range(2))
-        self._own = own
+        self._own, self.lasting = own, [own.force, own.before, own.rubbing, own.drive, own.y1, own.y2]
 
     def _set_step(self, dt: float) -> None:
         """Compute the poles for a sample rate of K / dt; modes beyond its half stay silent."""
@@ -96,13 +93,8 @@ class ContactAudioRuntime(ReadoutRuntime):
         c.launch(ring_modes, many, own, self.io, self.samples)
         self.finish(dt)
 
-    @property
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes]."""
-        return super().state_bytes + 4 * len(self._sensors) * (8 * self._quads + self.samples + 3)
 
-
-class DriveAudioRuntime(ReadoutRuntime):
+class DriveAudioRuntime(Runtime):
     """Serves actuation sounds of one block length."""
 
     def __init__(self, sensors: Mapping[str, ActuationAudio], context: SuiteContext) -> None:
@@ -119,6 +111,7 @@ class DriveAudioRuntime(ReadoutRuntime):
         own.settings, own.part, own.number = context.array(settings, DriveSoundParams), self.part, self.probe
         for name in ("effort", "speed", "last_loud", "last_speed", "phase", "hum_phase"):
             setattr(own, name, context.zeros(shape))
+            self.lasting.append(getattr(own, name))
         self._own, self.effort, self.speed = own, own.effort, own.speed
 
     def update(self, state: HandState, dt: float) -> None:
@@ -127,8 +120,3 @@ class DriveAudioRuntime(ReadoutRuntime):
         c = self.context
         c.launch(sound_drives, (c.num_envs, self.count), self._own, self.io, self.samples)
         self.finish(dt)
-
-    @property
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes]."""
-        return super().state_bytes + 4 * 6 * self.count

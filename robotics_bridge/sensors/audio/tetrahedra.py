@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from brainbench.core.errors import UsageError, missing_dependency
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.geometry import Mesh
+from brainbench.geometry import Mesh, winding_number
+from robotics_bridge.sensors.probes.placement import face_areas, spread_over
 
 SMALLEST = 0.05
 """A tetrahedron may shrink to this share of its volume when its corners are moved to a surface."""
@@ -62,11 +61,6 @@ def voxels(surface: Mesh, cells: int) -> Any:
     Raises:
         UsageError: no voxel lies inside; the body is too thin for so few cells.
     """
-    from scipy.spatial import KDTree
-
-    from brainbench.geometry import winding_number
-    from robotics_bridge.sensors.probes.placement import face_areas, spread_over
-
     vertices = np.asarray(surface.vertices, dtype=float)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     edge = float((high - low).max()) / cells

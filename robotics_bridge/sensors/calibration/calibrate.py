@@ -12,24 +12,20 @@ as white noise of variance q²/12, which is right while the white noise is not m
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import beta
 
 from brainbench.core.errors import DataError
 from robotics_bridge.sensors.calibration.delays import align, extent, find_delays, find_lags
-from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, fit_dynamics
+from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, Fit, fit_dynamics
 from robotics_bridge.sensors.calibration.log import Log, find_dead, find_quantum, segments
 from robotics_bridge.sensors.noise.model import Noise
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from robotics_bridge.sensors.calibration.likelihood import Fit
 
 NOT_FITTED = ("radius", "crosstalk")
 """Knobs that a log of one signal cannot tell: they need known places."""
@@ -131,8 +127,6 @@ def _delay(
 
 def _dead(stuck: NDArray, values: NDArray, knobs: dict[str, Any], estimates: dict[str, Estimate]) -> None:
     """Enter the share of dead probes with its exact binomial interval (Clopper & Pearson), and their values."""
-    from scipy.stats import beta
-
     count, dead = len(stuck), int(stuck.sum())
     low = float(beta.ppf(0.025, dead, count - dead + 1)) if dead else 0.0
     high = float(beta.ppf(0.975, dead + 1, count - dead)) if dead < count else 1.0

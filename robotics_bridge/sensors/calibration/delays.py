@@ -5,15 +5,11 @@ Letters: T reading, N probe.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.sensors.calibration.likelihood import Aligned, Fit
-    from robotics_bridge.sensors.calibration.log import Episode
+from robotics_bridge.sensors.calibration.likelihood import Aligned, Fit
+from robotics_bridge.sensors.calibration.log import Episode
 
 _SURE = 25.0
 """Difference of the misfit, in units of the noise's variance, at which one lag beats the next."""

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import dst
 from scipy.linalg import solveh_banded
 from scipy.optimize import minimize
 from scipy.signal import lfilter
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Aligned = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.int64]"]
 """x [T'] from the start of the episode, readings y [T, N], and for each reading the index of x that it shows."""

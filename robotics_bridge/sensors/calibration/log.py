@@ -6,18 +6,14 @@ Letters: T reading, N probe. An episode is (x [T], y [T, N]): the true signal an
 from __future__ import annotations
 
 import csv
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
 
 Episode = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 

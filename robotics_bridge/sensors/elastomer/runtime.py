@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext
 from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
 from robotics_bridge.sensors.elastomer.kernels.dilation import (
     ElastomerArrays,
@@ -18,15 +21,10 @@ from robotics_bridge.sensors.elastomer.kernels.dilation import (
     spread_kernel,
 )
 from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, sum_shear
-from robotics_bridge.sensors.elastomer.taxel import Layer
+from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel, Layer
 from robotics_bridge.sensors.queries.surface_points import sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext
-    from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel
 
 wp = warp()
 
@@ -53,7 +51,7 @@ class ElastomerRuntime(ProbeRuntime):
         )
         self.points = cloud.struct if cloud else CloudArrays()
         """Warp structure of the surface points that are followed."""
-        self._total = cloud.total if cloud else 0
+        total_points = cloud.total if cloud else 0
         own = [sensor.own(scene) if self._followed else () for sensor in self._sensors]
         members = [g for one in own for g in one]
         self._own_kinds = context.solids.kinds_of(sorted(set(members)))
@@ -63,7 +61,7 @@ class ElastomerRuntime(ProbeRuntime):
         self._in_turn = not context.device.is_cuda
         # Only a processor finds a grid's shear cheaper by rows and columns than marker by marker.
         self.apart = self._followed and self._way != "direct" and self._in_turn
-        self._blocks = -(-self._total // BLOCK)
+        self._blocks = -(-total_points // BLOCK)
         total, blocks = max(count * self._blocks * BLOCK, 1), max(count * self._blocks, 1)
         rows, columns = (max(side) for side in zip(*map(_sides, self.slices.values()), strict=True))
         pads = ElastomerArrays()
@@ -81,6 +79,12 @@ class ElastomerRuntime(ProbeRuntime):
             setattr(pads, name, context.zeros(shape if self.apart else (1,) * len(shape), dtype))
         self.pads = pads
         """Warp structure of gels, sums and anchors."""
+        self.lasting, self.scratch = [pads.stamp, pads.dragged], [pads.height]
+        self.scratch += [pads.spread] if self._way != "direct" else []
+        if total_points:
+            self.lasting += [pads.anchor, pads.held]
+            self.scratch += [pads.drive, pads.order, pads.moved]
+        self.scratch += [pads.drag, pads.along, pads.across] if self.apart else []
         self._spectra: list[Any] = []
 
     def _by_point(self, shape: tuple[int, ...], dtype: Any) -> Any:
@@ -89,20 +93,6 @@ class ElastomerRuntime(ProbeRuntime):
             return self.context.zeros(shape, dtype)
         order = (*range(1, len(shape)), 0)
         return self.context.zeros((shape[-1], *shape[:-1]), dtype).transpose(order)
-
-    @property
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes]: readings and anchors."""
-        return super().state_bytes + 4 * (3 * self._total + self._blocks + 2) * len(self._sensors)
-
-    @property
-    def scratch_bytes(self) -> int:
-        """Memory per environment [bytes] that every update writes anew: heights, their sums and drives of points."""
-        spread = 3 * self._planes if self._way != "direct" else 0
-        followed = (5 * self._total + 4 * self._blocks) * len(self._sensors)
-        if self.apart:
-            followed += 8 * self.count + CHUNK * (16 * self.pads.along.shape[1] + 8 * self.pads.across.shape[1])
-        return followed + 4 * self.count * (2 * self._planes + spread)
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
@@ -179,8 +169,6 @@ class ElastomerRuntime(ProbeRuntime):
 
     def _transform(self) -> None:
         """Convolve h with the three dilation kernels in Fourier space, zero outside the grid."""
-        import torch
-
         height, out = wp.to_torch(self.pads.height), wp.to_torch(self.pads.spread)
         if not self._spectra:
             self._spectra = [_spectrum(sensor, height.device) for sensor in self._sensors]
@@ -225,8 +213,6 @@ def _axes(sensor: ElastomerTaxel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any]:
     """Return the padded size of a grid and the spectra [3, …] of its kernels: along, across and normal."""
-    import torch
-
     rows, columns = sensor.probes.shape
     pitch = sensor.probes.pitch or (1.0, 1.0)
     # Kernels of 4.19 over all offsets between two markers, with the layer's factor 1 − κ λ_d r² on the tangential ones.

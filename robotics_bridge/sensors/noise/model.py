@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from brainbench.core.devices import warp
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import read_json, to_plain, write_json
-
-if TYPE_CHECKING:
-    import os
-
 
 BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
 """Knobs of every sensor (table 4.2)."""
@@ -122,7 +120,6 @@ class Noise:
 
     def params(self, seed: int) -> Any:
         """Return the Warp structure ``NoiseParams`` for a 64-bit ``seed`` (see :func:`stream_seed`)."""
-        from brainbench.core.devices import warp
         from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
 
         wp = warp()

@@ -8,18 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
 from robotics_bridge.sensors.noise.model import Noise, stream_seed
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 wp = warp()
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.probes.kernels.probe import depth_kernel, distance_kernel
-from robotics_bridge.sensors.probes.sensors import ContactProbe
+from robotics_bridge.sensors.probes.sensors import ContactDepthProbe, ContactProbe, SurfaceDistanceProbe
 from robotics_bridge.sensors.runtime import ProbeRuntime
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.probes.sensors import ContactDepthProbe, SurfaceDistanceProbe
 
 
 class DistanceRuntime(ProbeRuntime):
@@ -24,11 +21,11 @@ class DistanceRuntime(ProbeRuntime):
     def __init__(self, sensors: Mapping[str, SurfaceDistanceProbe], context: SuiteContext) -> None:
         super().__init__(sensors, 1, context, reach=None)
         first = next(iter(sensors.values()))
-        self._nearest = first.nearest
         self._kernel = distance_kernel(self.kinds, first.query == "raycast", first.nearest, self.mode, *self.stores)
         self._limits = context.array([sensor.max_range for sensor in sensors.values()], float)
         self.points: Any = context.zeros((3, context.num_envs, self.count) if first.nearest else (1, 1, 1))
         """Nearest points [3, B, N] in the link frame (m)."""
+        self.lasting = [self.points] if first.nearest else []
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
@@ -37,11 +34,6 @@ class DistanceRuntime(ProbeRuntime):
         inputs = [self.probes, c.solids.struct, c.pairs.struct, self.io]
         self.launch(self._kernel, *inputs, self._limits, self.points)
         self.finish(dt)
-
-    @property
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes], readings included, without history and delay."""
-        return super().state_bytes + (12 * self.count if self._nearest else 0)
 
 
 class DepthRuntime(ProbeRuntime):

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from brainbench.core.files import atomic_path, cache_dir
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.geometry import Mesh
+from brainbench.geometry import Mesh
+from robotics_bridge.sensors.queries.kernels import distance
 
 _log = logging.getLogger(__name__)
 _FORMAT = 3
@@ -78,8 +76,6 @@ def mesh_tree(mesh: Mesh, device: Any, *, winding: bool = False) -> Any:
 
 
 def _sample(mesh: Mesh, origin: NDArray, spacing: float, counts: NDArray, device: Any) -> NDArray[np.float32]:
-    from robotics_bridge.sensors.queries.kernels import distance
-
     wp = warp()
     tree = mesh_tree(mesh, device, winding=True)
     values = wp.zeros(tuple(int(n) for n in counts), dtype=wp.float32, device=device)

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from brainbench.core.devices import to_struct, warp
+from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.queries.solids import Solids
+from robotics_bridge.sensors.queries.solids import Solids
 
 _LISTED = 16
 

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics.scene import KINDS, Geometry
+from brainbench.geometry import Mesh
+from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
 from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
 from robotics_bridge.sensors.queries.kernels.distance import OTHER, SolidArrays
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.geometry import Mesh
-    from robotics_bridge.physics.scene import TouchScene
-    from robotics_bridge.sensors.sensor import QueryRequirements
+from robotics_bridge.sensors.sensor import QueryRequirements
 
 _UNBOUNDED = 1.0e6
 
@@ -48,8 +44,6 @@ def bounding_sphere(geometry: Geometry) -> NDArray[np.float32]:
 def tessellate(geometry: Geometry) -> Mesh:
     """Return the surface of a geometry as triangles; curved ones lie within 0.1 % of their radius."""
     import trimesh
-
-    from brainbench.geometry import Mesh
 
     if geometry.mesh is not None:
         return geometry.mesh

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct
+from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.sensors.probes.placement import cover_evenly, face_areas
 from robotics_bridge.sensors.queries.solids import tessellate
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.physics.scene import Geometry, TouchScene
 
 
 @dataclass(frozen=True, eq=False)

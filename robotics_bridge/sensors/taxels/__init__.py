@@ -1,4 +1,4 @@
-"""Taxels of force and torque: ``kinematic`` (depth, normal, velocity) and ``proximity`` (nearby surface points).
+"""Taxels of force and torque: ``sensors`` holds the configurations, ``runtime`` serves them.
 
-``runtime`` serves both; a kinematic field can be scaled to the load that the physics engine resolved.
+A kinematic field can be scaled to the load that the physics engine resolved (``kernels.contact_load``).
 """

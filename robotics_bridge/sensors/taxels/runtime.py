@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.probes.kernels.probe import KinematicParams, kinematic_kernel
 from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
 from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
 from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityArrays, ProximityParams, proximity_kernel
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
-    from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
+from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
 wp = warp()
 
@@ -94,6 +91,7 @@ class ProximityRuntime(ProbeRuntime):
         own.near = context.zeros((context.num_envs, room) if self.gathered else (1, 1), int)
         if self.gathered:
             own.members, own.cells, own.around = self._cluster(list(sensors.values()))
+            self.scratch = [own.near]
         self._own = own
 
     def update(self, state: HandState, dt: float) -> None:
@@ -104,11 +102,6 @@ class ProximityRuntime(ProbeRuntime):
         inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self._own, state.arrays]
         c.launch(kernel, dim, *inputs)
         self.finish(dt)
-
-    @property
-    def scratch_bytes(self) -> int:
-        """Memory per environment [bytes] that every update writes anew: points near a cell of probes."""
-        return 4 * self._own.near.shape[1] if self.gathered else 0
 
     def _cluster(self, sensors: list[ProximityTaxel]) -> tuple[Any, Any, Any]:
         """Return the probes [N] by cell, cells (first, end, slot) [C, 3], and spheres [C, 4] around their reach."""

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.runtime import ReadoutRuntime
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import SuiteContext
+from robotics_bridge.sensors.runtime import Runtime
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.kernels.heat import (
     CAPACITY,
     HeatArrays,
@@ -22,18 +26,10 @@ from robotics_bridge.sensors.temperature.kernels.heat import (
 )
 from robotics_bridge.sensors.temperature.materials import ThermalBody, material
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.physics.state import HandState
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.temperature.grid import TemperatureGrid
-
-
 wp = warp()
 
 
-class TemperatureRuntime(ReadoutRuntime):
+class TemperatureRuntime(Runtime):
     """Serves temperature grids."""
 
     def __init__(self, sensors: Mapping[str, TemperatureGrid], context: SuiteContext) -> None:
@@ -65,6 +61,8 @@ class TemperatureRuntime(ReadoutRuntime):
         self.heat = heat
         """Warp structure of contacts, bodies and fields."""
         self._buffers = [context.zeros(shape, wp.float64) for _ in range(2)]
+        self.lasting = [*self._buffers, heat.temperature, heat.element, heat.touched, heat.conductance, heat.inflow]
+        self.lasting += [heat.number, heat.kept, heat.link_temperature]
         self._axes = [axis for axis in range(3) if any(sensor.cells[axis] > 1 for sensor in self._sensors)]
         if not self.noisy and any(_lags(sensor) for sensor in self._sensors):
             self._measured = self.io.measured = wp.zeros_like(self._truth)
@@ -133,12 +131,6 @@ class TemperatureRuntime(ReadoutRuntime):
             now, spare = spare, now
         c.launch(sense_temperature, cells, heat, self.io, now)
         self.finish(dt)
-
-    @property
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes]."""
-        lists = len(self._sensors) * (1 + CAPACITY) * 4 + 4 * self.heat.link_temperature.shape[1]
-        return super().state_bytes + (4 * 8 + 3 * 4) * self.count + lists
 
 
 def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:

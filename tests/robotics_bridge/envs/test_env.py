@@ -15,7 +15,7 @@ from brainbench.core.rotations import to_matrices
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.envs.checkpoint import FORMER_NAMES
-from robotics_bridge.hands.observations import observe, sensors_for
+from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation
 
@@ -51,7 +51,6 @@ def test_groups_have_the_sizes_of_table_4_7() -> None:
 def test_without_touch_no_tactile_sensor_is_built() -> None:
     env = _make(1)
     assert env.touch is None
-    assert env.tactile is None
     assert "tactile" not in env.observations
 
 
@@ -214,7 +213,7 @@ def test_touch_is_what_the_sensors_of_the_hand_read(kind: str) -> None:
     from robotics_bridge.sensors import SensorSuite
 
     env = _make(2, observe=kind, placement="hand", resolution="low")
-    assert env.tactile is not None
+    assert env.touch is not None
     taxels = env.hand.layout("low", "hand")
     suite = SensorSuite(env.simulation.engine.scene, sensors_for(kind, taxels, track=("object",)), num_envs=2)
     suite.reset()
@@ -228,7 +227,11 @@ def test_touch_is_what_the_sensors_of_the_hand_read(kind: str) -> None:
     env.touch.update(env.simulation.state, 0.005, 4)  # type: ignore[union-attr]
     expected = observe(kind, {name: suite.read(name) for name in taxels}, taxels)
     assert torch.allclose(env.observations["tactile"][:, -1].flatten(1), expected, atol=1e-6)
-    assert env.observations["tactile"].shape[1:] == (5, len(env.tactile.link), env.tactile.channels)
+    assert env.observations["tactile"].shape[1:] == (
+        5,
+        expected.shape[1] // observation_type(kind).channels,
+        observation_type(kind).channels,
+    )
 
 
 def test_touch_is_felt_when_the_object_lies_on_the_palm() -> None:
@@ -244,25 +247,16 @@ def test_touch_is_felt_when_the_object_lies_on_the_palm() -> None:
     assert torch.equal(env.observations["tactile"][1], before)
 
 
-def test_resting_poses_of_the_layout_are_those_of_the_links() -> None:
-    env = _make(1, _calm(), observe="bool", placement="fingers", resolution="low")
-    layout = env.tactile
-    assert layout is not None
-    np.testing.assert_allclose(env.link_pose[0].numpy(), layout.rest, atol=1e-5)
-    assert layout.base_position.shape == layout.position.shape
-    np.testing.assert_allclose(np.linalg.norm(layout.base_normal, axis=1), 1.0, atol=1e-6)
-
-
 def test_poses_of_links_and_objects_are_quaternions_with_the_scalar_first() -> None:
     env = _make(2, observe="bool", placement="fingers", resolution="low", link_pose=True)
     for a in _actions(env, 3):
         env.step(a)
-    assert env.tactile is not None
+    assert env.touch is not None
     pose = env.observations["link_pose"].numpy()
     for number, data in enumerate(env.simulation.engine.data):
         palm = data.body(env.hand.palm)
         axes = palm.xmat.reshape(3, 3).T
-        for row, name in zip(pose[number], env.tactile.links, strict=True):
+        for row, name in zip(pose[number], env.touch.links, strict=True):
             body = data.body(name)
             np.testing.assert_allclose(row[:3], axes @ (body.xpos - palm.xpos), atol=1e-5, err_msg=name)
             turn = axes @ body.xmat.reshape(3, 3)

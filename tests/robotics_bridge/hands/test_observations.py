@@ -8,7 +8,7 @@ import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.hands.observations import OBSERVATIONS, observe, real_contact, repeat_slots, sensors_for
+from robotics_bridge.hands.observations import OBSERVATIONS, observe, sensors_for
 from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import Noise, SensorSuite
@@ -53,12 +53,6 @@ def test_sizes_of_a_hand_follow_from_counts_of_taxels_and_links():
     assert observe("agg_bool", scalar, layout).shape == (2, 5)
     assert observe("none", scalar, layout).shape == (2, 0)
     assert len(OBSERVATIONS) == 9
-
-
-def test_a_real_hand_gives_the_same_layout():
-    pressure = torch.tensor([[[0.0, 0, 0.4], [0, 0.3, 0.4]]])
-    assert real_contact(pressure, 0.45).tolist() == [[0.0, 1.0]]
-    assert repeat_slots(torch.tensor([[[1.0], [2.0]]]), 3).tolist() == [[1, 1, 1, 2, 2, 2]]
 
 
 def test_wrong_names_and_shapes_are_explained():

@@ -10,16 +10,16 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from robotics_bridge import tasks
-from robotics_bridge.policies.shipped import FOLDER, list_students, list_teachers, student_path, teacher_path
+from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
 from robotics_bridge.policies.training.distill import StudentPolicy, load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
 
 
-@pytest.mark.parametrize("name", list_teachers())
+@pytest.mark.parametrize("name", list_policies("teacher"))
 def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     facts = read_json(FOLDER / name / "config.json")
     assert facts["task"] == name.partition(".")[0]
-    assert name in list_teachers(facts["task"])
+    assert name in list_policies("teacher", facts["task"])
     assert f"# {name}\n" in (FOLDER / name / "README.md").read_text(encoding="utf-8")
     assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.7e6
     env = tasks.make(facts["task"], num_envs=2, hand=facts["hand"], threads=1)
@@ -29,7 +29,7 @@ def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     assert torch.isfinite(action).all()
 
 
-@pytest.mark.parametrize("name", list_students())
+@pytest.mark.parametrize("name", list_policies("student"))
 def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path: Path) -> None:
     from robotics_bridge.policies.export import export_policy
 
@@ -45,13 +45,13 @@ def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path
 
 
 def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -> None:
-    assert teacher_path("in_palm_rotate.careful") == FOLDER / "in_palm_rotate.careful"
-    assert teacher_path(tmp_path) == tmp_path
+    assert policy_path("teacher", "in_palm_rotate.careful") == FOLDER / "in_palm_rotate.careful"
+    assert policy_path("teacher", tmp_path) == tmp_path
     with pytest.raises(UsageError, match=r"'in_palm_rotate\.careful'.*folder"):
-        teacher_path("in_palm_rotate.carefull")
-    assert student_path("in_palm_rotate.force-torque-hand").parent == FOLDER
+        policy_path("teacher", "in_palm_rotate.carefull")
+    assert policy_path("student", "in_palm_rotate.force-torque-hand").parent == FOLDER
     with pytest.raises(UsageError, match=r"did you mean 'in_palm_rotate.force-torque-hand'"):
-        student_path("in_palm_rotate.force-torque-tips")
+        policy_path("student", "in_palm_rotate.force-torque-tips")
 
 
 def test_learning_goes_on_from_a_shipped_teacher() -> None:

@@ -1,4 +1,4 @@
-"""KinematicTaxel: force and torque per taxel from depth, normal and relative velocity (thesis 4.4–4.10)."""
+"""Taxels of force and torque: from depth, normal and relative velocity (thesis 4.4–4.10), or from nearby points."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from brainbench.core.errors import UsageError, unknown_name
-from robotics_bridge.sensors.noise.model import GRID_KNOBS
-from robotics_bridge.sensors.sensor import Convention, QuerySensor
+from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
+from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor
 
 CONVENTIONS = ("physical", "thesis")
 
 
-def check_convention(value: str) -> None:
+def _check_convention(value: str) -> None:
     """Refuse an unknown force convention with UsageError."""
     if value not in CONVENTIONS:
         raise unknown_name("force convention", value, CONVENTIONS)
@@ -56,7 +56,7 @@ class KinematicTaxel(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_convention(self.convention)
+        _check_convention(self.convention)
         if self.total not in ("law", "engine"):
             raise unknown_name("total of a force field", self.total, ("law", "engine"))
         if not self.exponent > 0:
@@ -65,3 +65,43 @@ class KinematicTaxel(QuerySensor):
     def group(self) -> Hashable:
         """Return what decides which kernels run."""
         return (self.query, self.convention, self.total)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProximityTaxel(ProbeSensor):
+    """Force (N) and torque (N·m) [N, 6] from surface points within the sensing radius, link frame (thesis 4.11–4.16).
+
+    Every tracked point p within R of the taxel adds its overlap P = R − |p − q|, scaled by density / point count:
+    a force k P along the normal a, and k_s P times the point's velocity across a.
+
+    ``thesis`` pulls along +a and takes the torque about the taxel (published); ``physical`` pushes the sensor along
+    −a and takes it about the link's origin, so that taxels add up to a wrench. Defaults: published parameters.
+
+    Raises:
+        UsageError: the convention is unknown, or it follows no surface point.
+    """
+
+    stiffness: float = 300.0
+    """k, N/m."""
+    coupling: float = 10.0
+    """k_s, N·s/m²."""
+    density: float = 100.0
+    """Scale of the point density (4.14)."""
+    points: int = 5000
+    """Surface points spread over all tracked geometries (the published configuration file has 1000)."""
+    convention: Convention = "physical"
+
+    channels: ClassVar[int] = 6
+    units: ClassVar[str] = "N, N m"
+    knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
+    runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:ProximityRuntime"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_convention(self.convention)
+        if self.points < 1:
+            raise UsageError(f"A proximity taxel needs at least one surface point; received {self.points}.")
+
+    def group(self) -> Hashable:
+        """Return the convention and the surface points that are shared."""
+        return (self.convention, self.points, self.track, self.link if not self.track else "")
