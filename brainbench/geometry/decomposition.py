@@ -8,11 +8,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,9 +21,6 @@ from brainbench.core.errors import DataError, UsageError, missing_dependency, un
 from brainbench.core.files import atomic_path, cache_dir, content_hash
 from brainbench.geometry.distance import Deviation, deviation, hausdorff
 from brainbench.geometry.mesh import Mesh, convex_hull
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 _LOG = logging.getLogger(__name__)
 

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.geometry.mesh import Mesh
+from brainbench.geometry.mesh import Mesh
 
 _NEIGHBOURS = 24
 _BLOCK = 4_000_000

@@ -30,17 +30,19 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError, unknown_name
 from brainbench.core.files import read_json, write_json, write_text
+from brainbench.core.progress import Progress
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import SOLVERS, Fidelity, list_presets
-from brainbench.stimuli.engines.protocol import Job
+from brainbench.stimuli.engines.protocol import Job, Trace
 from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.mesh_solids import touchable
@@ -49,13 +51,7 @@ from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import rodgers_solid
 from brainbench.stimuli.validation.bench_tests import peg, ringdown, run_stable
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.engines.protocol import Trace
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 PROTOCOL = 3
 """Counts up when the experiments change, so that points of different experiments never share a table."""

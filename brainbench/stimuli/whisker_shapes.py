@@ -7,24 +7,20 @@ instant it shows, and kept in the cache.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
-    from brainbench.stimuli.scenes.scene import Scene
+from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
+from brainbench.stimuli.scenes.scene import Scene
 
 _LOG = logging.getLogger(__name__)
 

@@ -16,13 +16,17 @@ from __future__ import annotations
 import os
 import platform
 import time
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.files import write_json
+from brainbench.core.progress import Progress
+from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.surface_points import surface_points
@@ -30,14 +34,6 @@ from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.taxels.kinematic import KinematicTaxel
 from robotics_bridge.sensors.taxels.proximity import ProximityTaxel
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.geometry import Mesh
 
 RESOLUTIONS = (16, 32, 64, 128)
 POINTS = (250, 500, 1000, 2000, 4000, 16_000)

@@ -10,15 +10,13 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.whiskers.chain import Chain
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from brainbench.stimuli.engines.protocol import Progress, Trace
+from brainbench.stimuli.engines.protocol import Progress, Trace
 
 
 def run_groups(

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.objects.obstacle import Obstacle
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.whiskers.chain import Chain
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 @dataclass(frozen=True)

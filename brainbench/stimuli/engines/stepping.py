@@ -5,20 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.trust import passed_unseen
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.chain import Chain
 
 
 def is_silent(job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64]) -> bool:

@@ -6,12 +6,8 @@ its surface and the margin rounds it, so its facets are smaller than dr and do n
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 LEAST_TAPER = 1e-6
 """Difference of the radii of a link's ends (mm) below which it is a capsule."""

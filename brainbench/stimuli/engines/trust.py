@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, Self, TypeVar
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, listing
-from brainbench.stimuli.engines.reach import distances
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
+from brainbench.stimuli.engines.reach import Reach, distances
 from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import build_chain
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
-    from brainbench.stimuli.engines.reach import Reach
-    from brainbench.stimuli.objects.obstacle import Obstacle
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 logger = logging.getLogger(__name__)
 

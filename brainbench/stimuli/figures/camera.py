@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 Vector = tuple[float, float, float]
 

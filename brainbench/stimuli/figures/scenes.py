@@ -9,30 +9,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.figures.annotation import Annotation
-from brainbench.stimuli.figures.camera import Camera
+from brainbench.stimuli.figures.camera import Camera, Lens
 from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, check_format, round_up
 from brainbench.stimuli.figures.films import require_writer, write_film
 from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
 from brainbench.stimuli.figures.shading import floor, lamp, paint, shade
 from brainbench.stimuli.figures.surfaces import DrawnSurface, ball, object_surface, smoothed, tube
 from brainbench.stimuli.motion.trajectories import Whisking
+from brainbench.stimuli.scenes.scene import Scene
 from brainbench.stimuli.whisker_shapes import Recording, record
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import WhiskerEngine
-    from brainbench.stimuli.figures.camera import Lens
-    from brainbench.stimuli.scenes.scene import Scene
 
 _LOG = logging.getLogger(__name__)
 

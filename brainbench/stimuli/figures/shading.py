@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.stimuli.figures.camera import Camera
+from brainbench.stimuli.figures.camera import Camera, Lens
 from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.figures.camera import Lens
 
 AMBIENT, KEY = 0.58, 0.50
 FLOOR_SHADE = 0.22

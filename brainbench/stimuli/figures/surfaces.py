@@ -7,22 +7,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.rotations import euler_matrix, to_matrices
 from brainbench.geometry import Mesh
 from brainbench.stimuli.figures.raster import Triangles
 from brainbench.stimuli.motion.trajectories import Path, Spin
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, Sphere
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, RigidMotion, Sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.procedural.bodies import transported_normals
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.stimuli.objects.obstacle import RigidMotion
-    from brainbench.stimuli.objects.placed_object import PlacedObject
 
 CREASE = math.cos(math.radians(35))
 """Neighbouring triangles at a smaller angle are shaded as one smooth surface."""

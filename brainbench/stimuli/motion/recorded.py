@@ -25,19 +25,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.whiskers.array import MountedWhisker
+from brainbench.stimuli.whiskers.array import MountedWhisker
 
 _LOG = logging.getLogger(__name__)
 

@@ -5,19 +5,15 @@ from __future__ import annotations
 import functools
 import logging
 import os
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.objects.obstacle import ConvexPart
+from brainbench.stimuli.objects.procedural import Shape
 from brainbench.stimuli.objects.solid import Solid, to_surface
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from brainbench.stimuli.objects.procedural import Shape
 
 _LOG = logging.getLogger(__name__)
 

@@ -18,15 +18,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import read_json
+from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.objects.mesh_solids import mesh_solid
 from brainbench.stimuli.objects.solid import Solid
-
-if TYPE_CHECKING:
-    from brainbench.geometry import DecompositionSettings
 
 _LOG = logging.getLogger(__name__)
 

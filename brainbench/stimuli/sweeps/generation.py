@@ -11,17 +11,15 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, to_plain, write_json
+from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
-
-if TYPE_CHECKING:
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
+from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
 
 _LOG = logging.getLogger(__name__)
 

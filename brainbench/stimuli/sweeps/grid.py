@@ -10,9 +10,10 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash
@@ -23,9 +24,6 @@ from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MOVERS = ("object", "head")
 PLACINGS = ("clear", "released")

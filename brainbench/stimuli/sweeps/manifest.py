@@ -5,18 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash, provenance
+from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
 from brainbench.stimuli.sweeps.shards import UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
 
 MANIFEST = "manifest.json"
 

@@ -12,14 +12,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.devices import usable_processors
 from brainbench.core.errors import DataError, UsageError, missing_dependency
+from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.shards import PreparedShard, make_shard, prepare_shard, simulate_shard, write_shard
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.plan import ShardTask
 
 Done = Callable[[int], None]
 """Called with the number of sweeps of a shard that is written."""

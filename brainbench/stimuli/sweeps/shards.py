@@ -9,23 +9,20 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.grid import Sweep
+from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.sweeps.plan import ShardTask
 
 OK, UNSTABLE, UNUSABLE = 0, 1, 2
 """Values of ``status``: fine; the simulation failed; the object could not be built."""

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.simulation import simulate_uncached
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import WhiskerEngine
-    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 _TOGETHER = 16
 """Sweeps whose scenes exist at the same time: bounds the memory of a batch."""

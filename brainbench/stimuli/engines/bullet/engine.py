@@ -24,16 +24,20 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld, engine
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.mujoco.drive import drive_scalars
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
+from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine, base_rotation
+from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
@@ -42,15 +46,6 @@ from brainbench.stimuli.engines.trust import (
     too_strong,
 )
 from brainbench.stimuli.engines.units import MICRO, MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, Progress
-    from brainbench.stimuli.engines.reach import Reach
 
 SEARCH = 0.02
 """Distance (mm), beside the way that the whisker may move in the step, within which contacts are sought."""

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import usable_processors
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE
 from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
+from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.engines.trust import (
     LARGEST_BEND,
@@ -28,15 +30,7 @@ from brainbench.stimuli.engines.trust import (
     too_strong,
 )
 from brainbench.stimuli.engines.units import MICRO, MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, Progress
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.chain import Chain
 
 logger = logging.getLogger(__name__)
 

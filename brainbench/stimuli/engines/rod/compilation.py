@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.devices import warp
 from brainbench.stimuli.engines.rod.limits import MESHES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def load_kernels(

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device, usable_processors
+from brainbench.core.progress import Progress as NamedProgress
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
+from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
@@ -20,20 +24,11 @@ from brainbench.stimuli.engines.rod.limits import WIDEST
 from brainbench.stimuli.engines.rod.packing import KNOT, PackedJobs, PackedMotions, capacity_for, follicle_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.stepping import is_silent, silent_trace
+from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
 from brainbench.stimuli.engines.units import MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress as NamedProgress
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, Progress
-    from brainbench.stimuli.engines.sweep_batch import SweepBatch
-    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.whiskers.chain import Chain
 
 SLICE = 65_536
 """Whiskers of one launch on a GPU: bounds the memory of a run."""

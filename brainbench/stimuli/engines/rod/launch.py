@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct, warp
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
-from brainbench.stimuli.engines.rod.packing import PackedChains, capacity_for
+from brainbench.stimuli.engines.rod.packing import PackedChains, PackedJobs, PackedMotions, capacity_for
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
+from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.trust import RunFacts, Verdict, judge, residual, strongest_force
 from brainbench.stimuli.engines.units import MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions
-    from brainbench.stimuli.engines.rod.shapes import PackedShapes
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.chain import Chain
 
 _NUMBERS = ("depth", "failed", "miss", "load")
 _COUNTS = ("status", "steps", "touching", "crowded", "unsolved")

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core import rotations
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.engines.protocol import Follicle, Load, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.units import MICRO, MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.protocol import Follicle, Load
-    from brainbench.stimuli.objects.obstacle import Obstacle
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.objects.obstacle import Obstacle
+from brainbench.stimuli.whiskers.chain import Chain
 
 KNOT = 1e-3
 """Spacing of the knots of a motion (s); cubic pieces between them follow whisking at 20 Hz to 1e-7 of its way."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core import rotations
 from brainbench.stimuli.engines.rod.limits import (
@@ -22,11 +24,6 @@ from brainbench.stimuli.engines.rod.mesh_bvh import spatial_order, tree_boxes
 from brainbench.stimuli.engines.rod.packing import PackedMotions, body_knots
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,15 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix, from_matrices
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
@@ -26,13 +28,8 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.trust import run_with_retries
 from brainbench.stimuli.engines.units import MILLI
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.objects.obstacle import TriangleMesh
-    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.objects.obstacle import TriangleMesh
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 BLOCK = 64
 """Threads of one block on a GPU."""
