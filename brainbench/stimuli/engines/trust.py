@@ -180,6 +180,17 @@ def too_strong(force: float, strongest: float) -> str:
     )
 
 
+def state_fault(hinges: NDArray[np.float64], wrench: NDArray[np.float64], whisker: Whisker) -> str:
+    """Return in words what is impossible in hinge angles [2N] (rad) or base wrench [6] (N first); empty for nothing."""
+    bend, strength, strongest = np.abs(hinges).max(), np.abs(wrench[:3]).max(), strongest_force(whisker)
+    if not (np.isfinite(bend) and np.isfinite(wrench).all()):
+        return "the state stopped being finite; choose a smaller time step"
+    if bend >= LARGEST_BEND:
+        joint = int(np.abs(hinges).argmax()) // 2
+        return f"joint {joint} bent by {bend:.2f} rad, more than a chain of links can represent"
+    return too_strong(strength, strongest) if strength > strongest else ""
+
+
 def step_travel(
     whisker: Whisker, position: NDArray, euler: NDArray, obstacle: Obstacle, times: NDArray
 ) -> NDArray[np.float64]:
