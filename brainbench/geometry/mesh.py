@@ -177,20 +177,25 @@ def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
     Raises:
         DataError: the points lie in a plane.
     """
-    from scipy.spatial import ConvexHull
-
     # The third singular value of centred points is their extent across the plane that fits them best.
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < 1e-9 * spread[0]:
         raise DataError(f"The mesh {name!r} has no volume: its points lie in a plane.")
+    used, renumbered = np.unique(hull_faces(points), return_inverse=True)
+    return Mesh(points[used], renumbered.reshape(-1, 3), name)
+
+
+def hull_faces(points: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Return the outward faces [F, 3] of the convex hull of points [n, 3], as indices of these."""
+    from scipy.spatial import ConvexHull
+
     hull = ConvexHull(points)
     faces = np.array(hull.simplices)
     # Qhull orders the corners of a facet as it likes; its equations know the way out.
     first, second, third = (points[faces[:, corner]] for corner in range(3))
     inward = np.einsum("fi,fi->f", np.cross(second - first, third - first), hull.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(points[used], renumbered.reshape(-1, 3), name)
+    return faces
 
 
 def face_owners(mesh: Mesh) -> NDArray[np.int64]:

@@ -26,9 +26,7 @@ def load_kernels(
 
     Args:
         device: a Warp device.
-        real: ``warp.float32`` or ``warp.float64``.
-        capacity: links that fit.
-        needs: what there is to touch (:func:`brainbench.stimuli.engines.rod.kernels.build_kernels`); for a GPU only.
+        real, capacity, needs: as for :func:`brainbench.stimuli.engines.rod.kernels.build_kernels`.
         compiling: called with True before compiling and with False after it; not at all for kernels that Warp has kept.
         **options: further arguments of ``build_kernels``; of them a processor knows ``sliced``.
     """
@@ -44,13 +42,9 @@ def load_kernels(
     block = 1 if device.is_cpu else None
     with kernels.loading:
         module = kernels.run.module
-        tell = compiling if compiling is not None and not _kept(module, block) else lambda begins: None
+        kept = Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()
+        tell = (lambda begins: None) if kept or compiling is None else compiling
         tell(True)
         module.load(device, block_dim=block)
         tell(False)
     return kernels
-
-
-def _kept(module: Any, block: int | None) -> bool:
-    """Return True when Warp has compiled a module before."""
-    return Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()
