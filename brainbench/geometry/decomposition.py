@@ -103,16 +103,11 @@ class Decomposition:
 
 
 def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cache: bool = True) -> Decomposition:
-    """Cut a mesh into convex pieces.
+    """Cut a mesh into convex pieces; holes of the surface are closed by CoACD's remeshing.
 
-    The pieces are computed for the mesh at a diagonal of 1 and kept under
+    The pieces are computed for the mesh at a diagonal of 1 and kept (with ``cache``) under
     ``brainbench.core.files.cache_dir("collision")`` by the hash of that mesh, the settings and the versions
     of the packages, so that one decomposition serves every size.
-
-    Args:
-        mesh: any surface; holes are closed by CoACD's remeshing.
-        settings: how; the defaults when None.
-        cache: read and keep results.
 
     Raises:
         MissingDependencyError: the package of the method is not installed.

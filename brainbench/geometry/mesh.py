@@ -148,11 +148,7 @@ class Mesh:
         return Mesh(self.vertices @ np.asarray(rotation).T + np.asarray(translation), self.faces, self.name)
 
     def hull(self) -> Mesh:
-        """Return the convex hull.
-
-        Raises:
-            DataError: the mesh is flat and has no volume.
-        """
+        """Return the convex hull; a flat mesh, which has none, is a :class:`DataError`."""
         return convex_hull(self.vertices, self.name)
 
     def pieces(self) -> tuple[Mesh, ...]:
@@ -210,9 +206,8 @@ def face_owners(mesh: Mesh) -> NDArray[np.int64]:
 def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
     """Read a mesh file (OBJ, STL, PLY, GLB, OFF, …); equal vertices are merged, nothing else is repaired.
 
-    Args:
-        path: the file; a scene with several meshes is joined into one.
-        unit: length unit of the file's numbers, one of :data:`UNITS` (most formats carry none).
+    A scene with several meshes is joined into one. ``unit`` is that of the file's numbers, one of :data:`UNITS` (most
+    formats carry none).
 
     Raises:
         UsageError: the unit is unknown.

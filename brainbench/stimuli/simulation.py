@@ -55,18 +55,15 @@ def simulate(
         cache: read and keep results under ``brainbench.core.files.cache_dir("stimuli")``.
 
     Returns:
-        The data set of :func:`brainbench.core.contracts.check_stimulus_set`: ``wrench`` [stimulus, time,
-        whisker, channel] (float32; N, N·m; action of the whisker on its base, about the base point,
-        world axes or the follicle's, as the frames say) with ``contact`` [stimulus, time, whisker],
-        ``contact_arc`` (m along the whisker, NaN without contact), ``first_contact`` (s, when the first
-        reading with contact was taken; NaN without), ``penetration`` (m, deepest overlap; a poor contact
-        when large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker became
-        ``unstable`` its numbers are NaN. Attributes say how frames were made (``readout``), their ``axes``
-        and, when clipping was asked for, how many components it changed in each stimulus (``clipped``).
-        The attribute ``config_hash`` names what was asked for and is equal on every machine;
-        ``content_hash`` names the numbers, whose last digits depend on the processor.
-        :meth:`brainbench.stimuli.explain.Explanation.of` reads from the set what was simulated, shared and
-        left out.
+        The data set of :func:`brainbench.core.contracts.check_stimulus_set`: ``wrench`` [stimulus, time, whisker,
+        channel] (float32; N, N·m; action of the whisker on its base, about the base point, axes as the frames say) with
+        ``contact`` [stimulus, time, whisker], ``contact_arc`` (m along the whisker, NaN without contact),
+        ``first_contact`` (s, when the first reading with contact was taken; NaN without), ``penetration`` (m, deepest
+        overlap; a poor contact when large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker
+        became ``unstable`` its numbers are NaN. Attributes say how frames were made (``readout``), their ``axes`` and
+        how many components were clipped in each stimulus (``clipped``). The attribute ``config_hash`` names what was
+        asked for and is equal on every machine; ``content_hash`` names the numbers, whose last digits depend on the
+        processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads what was simulated, shared and left out.
 
     Raises:
         UsageError: the scenes do not fit together, or a name is unknown.
@@ -102,8 +99,8 @@ def prepare(
 ) -> None:
     """Begin, in a thread, what simulating these scenes will wait for, unless the cache holds their simulation.
 
-    An engine that compiles at first use does so beside whatever the caller does before :func:`simulate`, which needs no
-    such call: it takes the same arguments, and waits for the rest.
+    An engine that compiles at first use does so beside whatever the caller does before :func:`simulate`, which takes
+    the same arguments and waits for the rest.
     """
     chosen = list(scenes)
     fidelity = Fidelity.of(fidelity)
@@ -154,9 +151,7 @@ def simulate_uncached(
 ) -> xr.Dataset:
     """Simulate every distinct job of scenes that fit together once, and return their stimulus set.
 
-    Args:
-        scenes, fidelity, engine, progress: as for :func:`simulate`.
-        workers: native threads; all usable processors when None.
+    Arguments are those of :func:`simulate`; ``workers`` are native threads, all usable processors when None.
     """
     clock = [time.perf_counter()]
     making = _begin(engine, scenes, fidelity, progress)

@@ -169,10 +169,8 @@ def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) ->
 def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> list[TradeoffPoint]:
     """Return the points of the bench tests that none beats in both error and cost, cheapest first.
 
-    Args:
-        points: a table; its points with a collision geometry are other experiments and are left out, and so are
-            those without inertia, for which some of the errors mean nothing.
-        backend: of this backend only; of all when None.
+    They are of one backend, or of all. Points with a collision geometry are other experiments and are left out, and so
+    are those without inertia, for which some of the errors mean nothing.
     """
     return pareto_front(
         TradeoffPoint(

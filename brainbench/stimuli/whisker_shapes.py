@@ -58,8 +58,8 @@ def record(
     Args:
         scene: what to simulate; its frames do not matter.
         times: instants [n] (s), increasing, not before t = 0.
-        fidelity, backend, progress: as for :func:`brainbench.stimuli.simulate`.
-        cache: read and keep shapes under ``brainbench.core.files.cache_dir("shapes")``.
+        fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.simulate`; shapes have a cache of their
+            own.
 
     Raises:
         UsageError: the times do not increase, or the backend reports no shapes.
@@ -89,12 +89,9 @@ def record(
 def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the elastic moment [n, N + 1] (N·m) at each joint of a chain; zero at the tip.
 
-    The moment is the hinge's stiffness times the angle by which the link after the joint is turned from
-    its rest direction (:mod:`brainbench.stimuli.whiskers.chain`); damping and twist carry none of it.
-
-    Args:
-        job: the whisker, with the times [n] of the shapes.
-        joints: [n, N + 1, 3] m, in the frame of the job.
+    The moment is the hinge's stiffness times the angle by which the link after the joint is turned from its rest
+    direction (:mod:`brainbench.stimuli.whiskers.chain`); damping and twist carry none of it. ``joints`` are [n, N + 1,
+    3] (m) in the frame of the job, at its times [n].
     """
     from brainbench.stimuli.engines.protocol import base_rotation
     from brainbench.stimuli.whiskers.chain import build_chain

@@ -25,11 +25,7 @@ from brainbench.stimuli.whiskers.chain import Chain
 def is_silent(job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64]) -> bool:
     """Return True for a whisker that can feel nothing: nothing in reach, a still base, no gravity and no loads.
 
-    Args:
-        job: the whisker.
-        reach: what it could ever touch.
-        position: base point [n, 3] over the whole job.
-        euler: angles of the base [n, 3].
+    ``position`` and ``euler`` are base points [n, 3] and angles [n, 3] over the whole job.
     """
     moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
     return not (reach or moves or job.loads or np.any(job.gravity))

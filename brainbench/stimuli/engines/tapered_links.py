@@ -15,12 +15,9 @@ _SIDES = 8
 
 
 def cone_vertices(core: float, length: float, *, narrows: bool) -> NDArray[np.float64]:
-    """Return the vertices [9, 3] (mm) of the cone inside a link along x.
+    """Return the vertices [9, 3] (mm) of the cone inside a link along x, ``core`` (mm) being the radius of its base.
 
-    Args:
-        core: radius of its base (mm).
-        length: of the link (mm).
-        narrows: True when the link is thinner at its end than at its start.
+    It ``narrows`` when the link is thinner at its end than at its start.
     """
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     wide, apex = (0.0, length) if narrows else (length, 0.0)

@@ -213,11 +213,10 @@ def render(
     """Draw a scene into a picture (``.png``) or a film (``.gif``, ``.mp4``).
 
     Args:
-        scene: what to draw; its whiskers are simulated up to the last instant shown.
-        out: file to write; it is replaced only by a finished one.
+        scene, out: what to draw, and the file to write; it is replaced only by a finished one.
         times: instants to draw [s], one for a picture; :func:`still_time` or :func:`film_times` when None.
-        camera: where from; an oblique perspective that frames whiskers and objects when None.
-        style: colours, size and quality; films are smaller than pictures when None.
+        camera, style: an oblique perspective that frames whiskers and objects when None; films are smaller than
+            pictures.
         fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.whisker_shapes.record`.
 
     Raises:

@@ -118,13 +118,7 @@ def corner_normals(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def tube(line: NDArray[np.float64], radii: NDArray[np.float64], colors: NDArray[np.float64]) -> Triangles:
-    """Return a closed tube around a curve.
-
-    Args:
-        line: [n, 3] points of the centre line (m, world).
-        radii: [n] m.
-        colors: [n, 3] from 0 to 1.
-    """
+    """Return a closed tube around points [n, 3] (m, world), with radii [n] (m) and colours [n, 3] from 0 to 1."""
     along = np.gradient(line, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
     across = transported_normals(along)

@@ -108,9 +108,8 @@ class Trajectory:
     def rotation(self, name: str, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far the base of ``name`` has turned since t = 0: rotation matrices [m, 3, 3].
 
-        The velocity between samples is a cubic spline, and Q′ = [ω]Q is integrated by the exponential map with
-        the fourth-order Magnus expansion, one step per sample. So Q is a rotation to rounding, however long the
-        recording, and continuous between the samples.
+        The velocity between samples is a cubic spline, and Q′ = [ω]Q is integrated by the exponential map with the
+        fourth-order Magnus expansion, one step per sample: Q is a rotation to rounding, however long the recording.
 
         Raises:
             UsageError: there is no such whisker, or a time lies outside the recording.

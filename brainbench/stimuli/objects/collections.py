@@ -63,10 +63,8 @@ def resolve_objects(
             2,000 to 20,000 triangles); ``shapenet:FOLDER`` or ``shapenet:FOLDER:100`` (the first 100 models of a
             ShapeNet tree); a mesh file, or a pattern of mesh files (``meshes/*.obj``). A file's class is its
             folder's name when its pattern spans several folders, otherwise its own name.
-        unit: length unit of mesh files.
-        collision: what whiskers touch, one of :data:`brainbench.stimuli.objects.mesh_solids.COLLISIONS`; None
-        takes what each
-            kind of object has by default.
+        unit, collision: as for :func:`brainbench.stimuli.objects.mesh_solids.mesh_solid`; each kind of object has a
+            collision geometry by default.
         surfaces: build shape families as their exact surface alone, without convex parts, which takes tens of
             milliseconds instead of a second; for engines that collide meshes. Not with ``collision``.
 

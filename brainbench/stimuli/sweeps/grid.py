@@ -182,11 +182,8 @@ class SweepGrid:
     ) -> Scene:
         """Return one sweep as a scene, ready for :func:`brainbench.stimuli.simulate`.
 
-        Args:
-            solid: the object, of any size; it is scaled about its origin to ``sweep.size``.
-            sweep: the conditions.
-            label: name of the scene; the object's name and the conditions when None.
-            array: the whiskers; the right side of the grid's species when None.
+        The solid is scaled about its origin to ``sweep.size``. The label is the object's name and the conditions when
+        None, the array the right side of the grid's species.
         """
         scaled = solid.to_diagonal(sweep.size)
         angles = (0.0, 0.0, sweep.rotation)

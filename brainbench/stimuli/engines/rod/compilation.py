@@ -24,11 +24,9 @@ def load_kernels(
     On a processor one kernel serves whatever there is to touch: what a scene does not use costs it nothing there, while
     every further kernel would cost its compilation. Threads may ask at once; each kernel is compiled once.
 
-    Args:
-        device: a Warp device.
-        real, capacity, needs: as for :func:`brainbench.stimuli.engines.rod.kernels.build_kernels`.
-        compiling: called with True before compiling and with False after it; not at all for kernels that Warp has kept.
-        **options: further arguments of ``build_kernels``; of them a processor knows ``sliced``.
+    ``compiling`` is called with True before compiling and with False after it, not at all for kernels that Warp has
+    kept. Everything else is as for :func:`brainbench.stimuli.engines.rod.kernels.build_kernels`; of ``options`` a
+    processor knows ``sliced`` alone.
     """
     from brainbench.stimuli.engines.rod.kernels import BUILDING, build_kernels
 

@@ -79,10 +79,8 @@ class PackedShapes:
     def add_placed(self, surface: PackedSurface, **columns: Any) -> None:
         """Append scenes of one shape each, all of the same surface.
 
-        Args:
-            surface: the surface.
-            columns: what the kernel's ``ShapeArrays`` hold that differs, [shape, …]; of all ``track``, ``turn``,
-                ``scale``, ``radius`` and ``speed``.
+        ``columns`` are what the kernel's ``ShapeArrays`` hold that differs, [shape, …]; of all ``track``, ``turn``,
+        ``scale``, ``radius`` and ``speed``.
         """
         count = len(columns["track"])
         still = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
