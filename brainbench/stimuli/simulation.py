@@ -185,9 +185,15 @@ def _assemble(
         wrench = turn(wrench, np.swapaxes(orientation, -1, -2))
     wrench, clipped = (wrench, None) if frames.clip is None else clip_wrenches(wrench, frames.clip)
 
+    def of(name: str, dtype: Any = object) -> NDArray[Any]:
+        """[stimulus, whisker]."""
+        return np.array([[getattr(trace, name) for trace in row] for row in traces], dtype=dtype)
+
     def readings(name: str) -> NDArray[Any]:
         """[stimulus, frame, reading, whisker]."""
         return np.stack([frames.split(np.stack([getattr(trace, name) for trace in row], axis=1)) for row in traces])
+
+    touched = [[frames.readings[trace.contact] for trace in row] for row in traces]
 
     dataset = xr.Dataset(
         {
@@ -200,16 +206,16 @@ def _assemble(
             ),
             "first_contact": (
                 grid,
-                np.array([[_first(trace.contact, frames.readings) for trace in row] for row in traces]),
+                np.array([[times[0] if len(times) else math.nan for times in row] for row in touched]),
                 {"units": "s", "long_name": "time of the first reading with contact"},
             ),
             "penetration": (
                 grid,
-                np.array([[trace.penetration for trace in row] for row in traces], dtype=np.float32),
+                of("penetration", np.float32),
                 {"units": "m", "long_name": "deepest overlap of whisker and object"},
             ),
-            "status": (grid, np.array([[trace.status for trace in row] for row in traces], dtype=object)),
-            "reason": (grid, np.array([[trace.reason for trace in row] for row in traces], dtype=object)),
+            "status": (grid, of("status")),
+            "reason": (grid, of("reason")),
         },
         coords={
             "stimulus": np.array([scene.label for scene in scenes], dtype=object),
@@ -221,7 +227,17 @@ def _assemble(
             "channel": np.array(CHANNELS, dtype=object),
         },
         attrs={
-            "array": to_json(_array_summary(scenes), indent=None),
+            "array": to_json(
+                {
+                    "species": scenes[0].array.species,
+                    "side": scenes[0].array.side,
+                    "whiskers": list(names),
+                    "citation": scenes[0].array.citation,
+                    # Scenes may differ in material; the hash covers every number of every scene's array.
+                    "hash": content_hash([scene.mounts for scene in scenes]),
+                },
+                indent=None,
+            ),
             "scene": to_json([scene.config() for scene in scenes], indent=None),
             "fidelity": to_json(fidelity, indent=None),
             # The simulation draws no random number; the contract asks for the field.
@@ -253,11 +269,6 @@ def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
     return turned.reshape(frames.count, len(traces), 6).astype(np.float32)
 
 
-def _first(contact: NDArray[np.bool_], times: NDArray[np.float64]) -> float:
-    """Time (s) of the first reading [n] with contact; NaN without."""
-    return float(times[np.argmax(contact)]) if contact.any() else math.nan
-
-
 def _count_clipped(dataset: xr.Dataset, clipped: NDArray[np.bool_], limit: float | None) -> str:
     """JSON of how many force and moment components were clipped in each stimulus."""
     counts = {
@@ -283,18 +294,6 @@ def _warn_unstable(dataset: xr.Dataset) -> None:
             dataset["stimulus"].values[i],
             dataset["reason"].values[i, j],
         )
-
-
-def _array_summary(scenes: Sequence[Scene]) -> dict[str, Any]:
-    array = scenes[0].array
-    return {
-        "species": array.species,
-        "side": array.side,
-        "whiskers": list(scenes[0].names),
-        "citation": array.citation,
-        # Scenes may differ in material; the hash covers every number of every scene's array.
-        "hash": content_hash([scene.mounts for scene in scenes]),
-    }
 
 
 def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:

@@ -148,7 +148,7 @@ Result = TypeVar("Result", bound=Judged)
 
 
 def run_with_retries(simulate: Callable[[NDArray[np.bool_] | None, int], Result], retry: int) -> Result:
-    """Simulate whiskers, and those that finer steps may mend again: with steps divided by ``retry``, then by twice that.
+    """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
     ``simulate`` is called with which whiskers (all when None) and the divisor. A ``retry`` of 1 leaves all as they are.
     """
