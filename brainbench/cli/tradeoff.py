@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -57,25 +57,21 @@ def whisker(
         plot_tradeoff(points, plot)
     best = tradeoff.front(points)
     setting = {">links": "{0[links]}", ">step ms": lambda point: f"{point['time_step'] * 1e3:g}"}
+    cost = {">processor s / whisker-s": lambda point: _known(point["cost"], ".3g")}
     text = table_of(
         f"{len(points)} settings measured; bench tests that no other beats in both error and cost:",
         [point.settings | {"error": point.error, "cost": point.cost} for point in best],
-        {">error": "{0[error]:.2%}", ">processor s / whisker-s": "{0[cost]:.3g}", **setting, "backend": "{0[backend]}"},
+        {">error": "{0[error]:.2%}", **cost, **setting, "backend": "{0[backend]}"},
     )
     still = [point for point in points if point.get("solver") == "quasistatic" and point["error"] is not None]
     if still:
-        columns = {
-            ">pegs": "{0[static_error]:.2%}",
-            ">whisking": "{0[dynamic_error]:.2%}",
-            ">with friction": "{0[sliding_error]:.2%}",
-            ">flicks": "{0[flick_error]:.2%}",
-            ">processor s / whisker-s": "{0[cost]:.3g}",
-        }
-        text += "\n\n" + table_of("without inertia (rod, quasistatic), error by test:", still, columns | setting)
+        tests = {"pegs": "static", "whisking": "dynamic", "with friction": "sliding", "flicks": "flick"}
+        columns = {f">{name}": f"{{0[{test}_error]:.2%}}" for name, test in tests.items()}
+        text += "\n\n" + table_of("without inertia (rod, quasistatic), error by test:", still, columns | cost | setting)
     if hollow := tradeoff.collision_points(points):
         columns = {
-            ">error": lambda point: "—" if point["error"] is None else f"{point['error']:.2%}",
-            ">processor s / whisker-s": lambda point: "—" if point["cost"] is None else f"{point['cost']:.3g}",
+            ">error": lambda point: _known(point["error"], ".2%"),
+            **cost,
             "collision": "{0[collision]}",
             ">pieces": lambda point: point.get("pieces", ""),
             **setting,
@@ -141,7 +137,11 @@ def model(
 
                 found["score"] = brainbench.score(reduced, normalize=False).value
             if data is not None:
-                found |= _accuracy(reduced, data)
+                from brainbench.datasets import WhiskingDataset
+                from brainbench.models.training.evaluation import evaluate
+
+                accuracy = evaluate(reduced, WhiskingDataset(data, split="test", shuffle=False))
+                found |= {"top1": accuracy.top1, "top5": accuracy.top5}
             results.append(found)
             progress(done + 1, len(chosen), "settings")
     columns = {
@@ -152,8 +152,8 @@ def model(
         ">ms / sweep": "{0[ms]:.2f}",
         ">p99 ms": "{0[p99_ms]:.2f}",
         ">MB": lambda item: f"{item['stored_bytes'] / 1e6:.2f}",
-        ">score": lambda item: f"{item['score']:.3f}" if "score" in item else "–",
-        ">top-1": lambda item: f"{item['top1']:.3f}" if "top1" in item else "–",
+        ">score": lambda item: _known(item.get("score"), ".3f"),
+        ">top-1": lambda item: _known(item.get("top1"), ".3f"),
     }
     emit(results, table_of(f"{name}, batch 1:", results, columns), as_json=as_json)
 
@@ -185,9 +185,5 @@ def tactile(
     emit({"points": points, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)
 
 
-def _accuracy(reduced: Any, data: Path) -> dict[str, float]:
-    from brainbench.datasets import WhiskingDataset
-    from brainbench.models.training.evaluation import evaluate
-
-    found = evaluate(reduced, WhiskingDataset(data, split="test", shuffle=False))
-    return {"top1": found.top1, "top5": found.top5}
+def _known(value: float | None, form: str) -> str:
+    return "—" if value is None else format(value, form)

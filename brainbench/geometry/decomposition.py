@@ -8,11 +8,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,9 +21,6 @@ from brainbench.core.errors import DataError, UsageError, missing_dependency, un
 from brainbench.core.files import atomic_path, cache_dir, content_hash
 from brainbench.geometry.distance import Deviation, deviation, hausdorff
 from brainbench.geometry.mesh import Mesh, convex_hull
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 _LOG = logging.getLogger(__name__)
 
@@ -105,16 +103,11 @@ class Decomposition:
 
 
 def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cache: bool = True) -> Decomposition:
-    """Cut a mesh into convex pieces.
+    """Cut a mesh into convex pieces; holes of the surface are closed by CoACD's remeshing.
 
-    The pieces are computed for the mesh at a diagonal of 1 and kept under
+    The pieces are computed for the mesh at a diagonal of 1 and kept (with ``cache``) under
     ``brainbench.core.files.cache_dir("collision")`` by the hash of that mesh, the settings and the versions
     of the packages, so that one decomposition serves every size.
-
-    Args:
-        mesh: any surface; holes are closed by CoACD's remeshing.
-        settings: how; the defaults when None.
-        cache: read and keep results.
 
     Raises:
         MissingDependencyError: the package of the method is not installed.

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.geometry.mesh import Mesh
+from brainbench.geometry.mesh import Mesh
 
 _NEIGHBOURS = 24
 _BLOCK = 4_000_000
@@ -47,10 +44,8 @@ def deviation(
     for the pieces, on chords through their inside as well.
 
     Args:
-        solid: the mesh; inside is where its winding number exceeds one half.
-        pieces: convex meshes.
-        samples: points in each direction, on top of the vertices of the pieces.
-        seed: of the sampling; equal seeds give equal numbers.
+        solid, pieces: the mesh, inside where its winding number exceeds one half; convex meshes.
+        samples, seed: points in each direction, on top of the vertices of the pieces; equal seeds give equal numbers.
         inside: a coarser mesh of the same solid that decides what is inside, to save time.
     """
     rng = np.random.default_rng(seed)

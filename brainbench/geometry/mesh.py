@@ -148,11 +148,7 @@ class Mesh:
         return Mesh(self.vertices @ np.asarray(rotation).T + np.asarray(translation), self.faces, self.name)
 
     def hull(self) -> Mesh:
-        """Return the convex hull.
-
-        Raises:
-            DataError: the mesh is flat and has no volume.
-        """
+        """Return the convex hull; a flat mesh, which has none, is a :class:`DataError`."""
         return convex_hull(self.vertices, self.name)
 
     def pieces(self) -> tuple[Mesh, ...]:
@@ -177,20 +173,25 @@ def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
     Raises:
         DataError: the points lie in a plane.
     """
-    from scipy.spatial import ConvexHull
-
     # The third singular value of centred points is their extent across the plane that fits them best.
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < 1e-9 * spread[0]:
         raise DataError(f"The mesh {name!r} has no volume: its points lie in a plane.")
+    used, renumbered = np.unique(hull_faces(points), return_inverse=True)
+    return Mesh(points[used], renumbered.reshape(-1, 3), name)
+
+
+def hull_faces(points: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Return the outward faces [F, 3] of the convex hull of points [n, 3], as indices of these."""
+    from scipy.spatial import ConvexHull
+
     hull = ConvexHull(points)
     faces = np.array(hull.simplices)
     # Qhull orders the corners of a facet as it likes; its equations know the way out.
     first, second, third = (points[faces[:, corner]] for corner in range(3))
     inward = np.einsum("fi,fi->f", np.cross(second - first, third - first), hull.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(points[used], renumbered.reshape(-1, 3), name)
+    return faces
 
 
 def face_owners(mesh: Mesh) -> NDArray[np.int64]:
@@ -205,9 +206,8 @@ def face_owners(mesh: Mesh) -> NDArray[np.int64]:
 def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
     """Read a mesh file (OBJ, STL, PLY, GLB, OFF, …); equal vertices are merged, nothing else is repaired.
 
-    Args:
-        path: the file; a scene with several meshes is joined into one.
-        unit: length unit of the file's numbers, one of :data:`UNITS` (most formats carry none).
+    A scene with several meshes is joined into one. ``unit`` is that of the file's numbers, one of :data:`UNITS` (most
+    formats carry none).
 
     Raises:
         UsageError: the unit is unknown.

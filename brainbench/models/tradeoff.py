@@ -52,11 +52,6 @@ class ModelSetting:
 class Reduced(nn.Module):
     """A network run in one setting; it can be scored and extracted from like the network itself.
 
-    Args:
-        name: Of the registry.
-        setting: Way to run it.
-        seed: Of untrained weights.
-
     Raises:
         UsageError: the network is no encoder-attender-decoder, or cannot be unrolled that way.
     """
@@ -117,10 +112,8 @@ def settings(
 def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0, repeats: int = 5) -> TradeoffPoint:
     """Measure one setting on sweeps [K, T, C, H, W] in SI.
 
-    Returns:
-        A point whose ``error`` is the relative difference of the answers from those of the reference setting on all
-        steps, and whose ``cost`` is the median time of one sweep at batch 1 in ms, with the settings, the stored size
-        and the p99 time beside them.
+    ``error`` is the relative difference of the answers from those of the reference setting on all steps, ``cost`` the
+    median time of one sweep at batch 1 (ms); settings, stored size and p99 time stand beside them.
 
     Raises:
         UsageError: the setting does not fit the network or the sweeps.

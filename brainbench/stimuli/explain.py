@@ -7,11 +7,12 @@ an object, or against one triangle where the engine touches surfaces: what it ha
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from brainbench.core.errors import DataError, UsageError
 
@@ -29,8 +30,7 @@ ATTRIBUTE = "explanation"
 SECONDS = "seconds"
 """Key of a stimulus set's ``encoding`` under which this process keeps what took how long."""
 _PASSING = ("seconds", "source")
-_LATER = ("bodies",)
-"""Fields that sets made by earlier versions lack."""
+"""Fields that are not kept."""
 
 
 @dataclass(frozen=True)
@@ -87,16 +87,11 @@ class Explanation:
         if text is None:
             raise UsageError("This stimulus set does not say how it was made; simulate it again to have it explained.")
         try:
-            data = json.loads(text)
-            later = {name: data[name] for name in _LATER if name in data}
-            data = {item.name: data[item.name] for item in fields(cls) if item.name not in (*_PASSING, *_LATER)}
-        except (TypeError, KeyError, json.JSONDecodeError) as error:
+            found = msgspec.json.decode(text, type=cls)
+        except (TypeError, msgspec.MsgspecError) as error:
             raise DataError(f"The explanation in this stimulus set is damaged ({error!r}).") from error
-        data["links"] = tuple(data["links"])
-        data["out_of_reach"] = {label: tuple(names) for label, names in data["out_of_reach"].items()}
         source = dataset.encoding.get("source")
-        seconds = dataset.encoding.get(SECONDS, {})
-        return cls(**data, **later, seconds=seconds, source=None if source is None else str(source))
+        return replace(found, seconds=dataset.encoding.get(SECONDS, {}), source=None if source is None else str(source))
 
     def to_attribute(self) -> str:
         """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""
@@ -109,7 +104,7 @@ class Explanation:
         low, high = self.links
         links = f"{low}" if low == high else f"{low}–{high}"
         elapsed = ", ".join(f"{name} {value:.2f} s" for name, value in self.seconds.items())
-        rows = [
+        return [
             ("asked for", f"{self.stimuli} stimuli × {self.whiskers} whiskers = {self.runs} runs of {links} links"),
             ("simulated", f"{self.simulated} runs, {self.steps:,} of {self.steps_in_full:,} time steps"),
             ("shared", f"{self.shared} runs equal to another stimulus's"),
@@ -119,7 +114,6 @@ class Explanation:
             ("time", elapsed or "not known: made by another process"),
             ("made", "now" if self.source is None else f"earlier, read from {self.source}"),
         ]  # fmt: skip
-        return rows
 
     def _saved_steps(self) -> str:
         if self.steps <= self.steps_in_full:
@@ -128,29 +122,14 @@ class Explanation:
         return f"none of the steps ({100 * more:.0f} % more: some contacts needed shorter ones)"
 
     def __str__(self) -> str:
-        width = max(len(name) for name, _ in self.lines())
-        text = [f"{name:<{width}}  {value}" for name, value in self.lines()]
-        text += [
-            f"{'out of reach' if index == 0 else '':<{width}}  {label}: {', '.join(names) or 'none'}"
-            for index, (label, names) in enumerate(self.out_of_reach.items())
-        ]
-        return "\n".join(text)
+        far = [f"{label}: {', '.join(names) or 'none'}" for label, names in self.out_of_reach.items()]
+        rows = [*self.lines(), *zip(["out of reach", *[""] * len(far)], far, strict=False)]
+        width = max(len(name) for name, _ in rows)
+        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
 
-def explain(
-    scenes: Sequence[Scene],
-    plan: JobSchedule,
-    traces: Sequence[Trace],
-    fidelity: Fidelity,
-) -> Explanation:
-    """Sum up a finished simulation.
-
-    Args:
-        scenes: what was asked for.
-        plan: its distinct jobs.
-        traces: one per job of the plan.
-        fidelity: links and time step.
-    """
+def explain(scenes: Sequence[Scene], plan: JobSchedule, traces: Sequence[Trace], fidelity: Fidelity) -> Explanation:
+    """Sum up a finished simulation of ``scenes``, with one trace per job of their ``plan``."""
     chains = {whisker: fidelity.chain(whisker) for whisker in {job.whisker for job in plan.jobs}}
     pairs = pairs_in_full = steps_in_full = 0
     kinds: set[str] = set()

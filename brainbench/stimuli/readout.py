@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.contracts import GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.stimuli.scenes.frames import Axes
 from brainbench.stimuli.stimulus_set import hash_stimulus_set
 
 if TYPE_CHECKING:
-    import pandas as pd
     import xarray as xr
     from numpy.typing import NDArray
 
@@ -98,20 +97,6 @@ def turn(wrench: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray
     """Turn forces and moments [..., 6] by the matrices ``rotation`` [..., 3, 3]; keeps the number type."""
     vectors = wrench.reshape(*wrench.shape[:-1], 2, 3)
     return np.einsum("...ij,...kj->...ki", rotation, vectors).reshape(wrench.shape).astype(wrench.dtype)
-
-
-def to_frame(dataset: xr.Dataset) -> pd.DataFrame:
-    """Return a tidy table: one row per stimulus, frame and whisker.
-
-    Columns: ``stimulus``, ``time`` (s), ``whisker``, ``row``, ``col``, the six channels (N, N·m), and
-    ``contact``, ``contact_arc`` (m) and ``status`` where the set has them.
-    """
-    check_stimulus_set(dataset)
-    channels = dataset["wrench"].assign_coords(channel=list(CHANNELS)).to_dataset(dim="channel")
-    extra = [name for name in ("contact", "contact_arc", "status") if name in dataset]
-    joined = channels.merge(dataset[extra]) if extra else channels
-    table = joined.to_dataframe(dim_order=["stimulus", "time", "whisker"]).reset_index()
-    return table.loc[:, ["stimulus", "time", "whisker", "row", "col", *CHANNELS, *extra]]
 
 
 def _describe_gaps(dataset: xr.Dataset) -> str:

@@ -55,18 +55,15 @@ def simulate(
         cache: read and keep results under ``brainbench.core.files.cache_dir("stimuli")``.
 
     Returns:
-        The data set of :func:`brainbench.core.contracts.check_stimulus_set`: ``wrench`` [stimulus, time,
-        whisker, channel] (float32; N, N·m; action of the whisker on its base, about the base point,
-        world axes or the follicle's, as the frames say) with ``contact`` [stimulus, time, whisker],
-        ``contact_arc`` (m along the whisker, NaN without contact), ``first_contact`` (s, when the first
-        reading with contact was taken; NaN without), ``penetration`` (m, deepest overlap; a poor contact
-        when large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker became
-        ``unstable`` its numbers are NaN. Attributes say how frames were made (``readout``), their ``axes``
-        and, when clipping was asked for, how many components it changed in each stimulus (``clipped``).
-        The attribute ``config_hash`` names what was asked for and is equal on every machine;
-        ``content_hash`` names the numbers, whose last digits depend on the processor.
-        :meth:`brainbench.stimuli.explain.Explanation.of` reads from the set what was simulated, shared and
-        left out.
+        The data set of :func:`brainbench.core.contracts.check_stimulus_set`: ``wrench`` [stimulus, time, whisker,
+        channel] (float32; N, N·m; action of the whisker on its base, about the base point, axes as the frames say) with
+        ``contact`` [stimulus, time, whisker], ``contact_arc`` (m along the whisker, NaN without contact),
+        ``first_contact`` (s, when the first reading with contact was taken; NaN without), ``penetration`` (m, deepest
+        overlap; a poor contact when large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker
+        became ``unstable`` its numbers are NaN. Attributes say how frames were made (``readout``), their ``axes`` and
+        how many components were clipped in each stimulus (``clipped``). The attribute ``config_hash`` names what was
+        asked for and is equal on every machine; ``content_hash`` names the numbers, whose last digits depend on the
+        processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads what was simulated, shared and left out.
 
     Raises:
         UsageError: the scenes do not fit together, or a name is unknown.
@@ -102,8 +99,8 @@ def prepare(
 ) -> None:
     """Begin, in a thread, what simulating these scenes will wait for, unless the cache holds their simulation.
 
-    An engine that compiles at first use does so beside whatever the caller does before :func:`simulate`, which needs no
-    such call: it takes the same arguments, and waits for the rest.
+    An engine that compiles at first use does so beside whatever the caller does before :func:`simulate`, which takes
+    the same arguments and waits for the rest.
     """
     chosen = list(scenes)
     fidelity = Fidelity.of(fidelity)
@@ -154,9 +151,7 @@ def simulate_uncached(
 ) -> xr.Dataset:
     """Simulate every distinct job of scenes that fit together once, and return their stimulus set.
 
-    Args:
-        scenes, fidelity, engine, progress: as for :func:`simulate`.
-        workers: native threads; all usable processors when None.
+    Arguments are those of :func:`simulate`; ``workers`` are native threads, all usable processors when None.
     """
     clock = [time.perf_counter()]
     making = _begin(engine, scenes, fidelity, progress)
@@ -190,9 +185,15 @@ def _assemble(
         wrench = turn(wrench, np.swapaxes(orientation, -1, -2))
     wrench, clipped = (wrench, None) if frames.clip is None else clip_wrenches(wrench, frames.clip)
 
+    def of(name: str, dtype: Any = object) -> NDArray[Any]:
+        """[stimulus, whisker]."""
+        return np.array([[getattr(trace, name) for trace in row] for row in traces], dtype=dtype)
+
     def readings(name: str) -> NDArray[Any]:
         """[stimulus, frame, reading, whisker]."""
         return np.stack([frames.split(np.stack([getattr(trace, name) for trace in row], axis=1)) for row in traces])
+
+    touched = [[frames.readings[trace.contact] for trace in row] for row in traces]
 
     dataset = xr.Dataset(
         {
@@ -205,16 +206,16 @@ def _assemble(
             ),
             "first_contact": (
                 grid,
-                np.array([[_first(trace.contact, frames.readings) for trace in row] for row in traces]),
+                np.array([[times[0] if len(times) else math.nan for times in row] for row in touched]),
                 {"units": "s", "long_name": "time of the first reading with contact"},
             ),
             "penetration": (
                 grid,
-                np.array([[trace.penetration for trace in row] for row in traces], dtype=np.float32),
+                of("penetration", np.float32),
                 {"units": "m", "long_name": "deepest overlap of whisker and object"},
             ),
-            "status": (grid, np.array([[trace.status for trace in row] for row in traces], dtype=object)),
-            "reason": (grid, np.array([[trace.reason for trace in row] for row in traces], dtype=object)),
+            "status": (grid, of("status")),
+            "reason": (grid, of("reason")),
         },
         coords={
             "stimulus": np.array([scene.label for scene in scenes], dtype=object),
@@ -226,7 +227,17 @@ def _assemble(
             "channel": np.array(CHANNELS, dtype=object),
         },
         attrs={
-            "array": to_json(_array_summary(scenes), indent=None),
+            "array": to_json(
+                {
+                    "species": scenes[0].array.species,
+                    "side": scenes[0].array.side,
+                    "whiskers": list(names),
+                    "citation": scenes[0].array.citation,
+                    # Scenes may differ in material; the hash covers every number of every scene's array.
+                    "hash": content_hash([scene.mounts for scene in scenes]),
+                },
+                indent=None,
+            ),
             "scene": to_json([scene.config() for scene in scenes], indent=None),
             "fidelity": to_json(fidelity, indent=None),
             # The simulation draws no random number; the contract asks for the field.
@@ -258,11 +269,6 @@ def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
     return turned.reshape(frames.count, len(traces), 6).astype(np.float32)
 
 
-def _first(contact: NDArray[np.bool_], times: NDArray[np.float64]) -> float:
-    """Time (s) of the first reading [n] with contact; NaN without."""
-    return float(times[np.argmax(contact)]) if contact.any() else math.nan
-
-
 def _count_clipped(dataset: xr.Dataset, clipped: NDArray[np.bool_], limit: float | None) -> str:
     """JSON of how many force and moment components were clipped in each stimulus."""
     counts = {
@@ -288,18 +294,6 @@ def _warn_unstable(dataset: xr.Dataset) -> None:
             dataset["stimulus"].values[i],
             dataset["reason"].values[i, j],
         )
-
-
-def _array_summary(scenes: Sequence[Scene]) -> dict[str, Any]:
-    array = scenes[0].array
-    return {
-        "species": array.species,
-        "side": array.side,
-        "whiskers": list(scenes[0].names),
-        "citation": array.citation,
-        # Scenes may differ in material; the hash covers every number of every scene's array.
-        "hash": content_hash([scene.mounts for scene in scenes]),
-    }
 
 
 def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:

@@ -77,7 +77,9 @@ def load_stimuli(
         DataError: a file cannot be used; the message says what it holds and what is needed.
     """
     if isinstance(source, Stimuli):
-        return source if whiskers == "all" else load_stimuli(_dataset_of(source), whiskers=whiskers)
+        if whiskers != "all" and source.dataset is None:
+            raise UsageError("These stimuli are arrays, in which whiskers have no names; leave the selection at 'all'.")
+        return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
     if (recipe := _recipe(source, whiskers)) is not None:
@@ -182,9 +184,3 @@ def _from_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
         raise DataError(f"'stimuli' in {name!r} has values that are not finite, in {listing(bad)}.")
     numbers = content_hash(list(texts), values)
     return Stimuli(texts, values, None, numbers, f"arrays {list(values.shape)} from {name}", numbers)
-
-
-def _dataset_of(stimuli: Stimuli) -> xr.Dataset:
-    if stimuli.dataset is None:
-        raise UsageError("These stimuli are arrays, in which whiskers have no names; leave the selection at 'all'.")
-    return stimuli.dataset

@@ -30,17 +30,19 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError, unknown_name
 from brainbench.core.files import read_json, write_json, write_text
+from brainbench.core.progress import Progress
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
-from brainbench.stimuli.engines.fidelity import SOLVERS, Fidelity, list_presets
-from brainbench.stimuli.engines.protocol import Job
+from brainbench.stimuli.engines.fidelity import RESOLUTION, Fidelity, list_presets
+from brainbench.stimuli.engines.protocol import Job, Trace
 from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.mesh_solids import touchable
@@ -49,13 +51,7 @@ from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import rodgers_solid
 from brainbench.stimuli.validation.bench_tests import peg, ringdown, run_stable
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.engines.protocol import Trace
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 PROTOCOL = 3
 """Counts up when the experiments change, so that points of different experiments never share a table."""
@@ -100,29 +96,27 @@ def settings(
     """Return every combination (``time_steps`` pairs a step [s] with steps per period), after the presets.
 
     Args:
-        links, time_steps, backends: axes of the bench tests.
+        links, time_steps, backends, solvers: axes of the bench tests; the solver ``quasistatic``, of ``rod`` alone, has
+            no presets and no steps per period.
         collisions: geometries of a concave object to measure as well, at each preset, as in :data:`COLLISIONS`.
-        solvers: of the backends that know more than one; ``quasistatic`` has no presets and no steps per period.
 
     Raises:
         UsageError: a value lies outside the range of :class:`Fidelity`, or a collision geometry is unknown.
     """
-    grid = [
-        Fidelity(links=count, time_step=step, steps_per_period=periods)
-        for count, (step, periods) in itertools.product(links, time_steps)
-    ]
-    presets = [Fidelity.preset(name) for name in list_presets()]
-    still = [
-        Fidelity(links=count, time_step=step, solver="quasistatic")
-        for count, (step, _) in itertools.product(links, time_steps)
-    ]
+    presets, steps = [Fidelity.preset(name) for name in list_presets()], list(itertools.product(links, time_steps))
+    grid = [Fidelity(links=n, time_step=step, steps_per_period=periods) for n, (step, periods) in steps]
+    still = [Fidelity(links=n, time_step=step, solver="quasistatic") for n, (step, _) in steps]
+    fidelities = {"dynamic": dict.fromkeys([*presets, *grid]), "quasistatic": still}
     for solver in solvers:
-        if solver not in SOLVERS:
-            raise unknown_name("solver", solver, SOLVERS)
-    dynamic = dict.fromkeys([*presets, *grid] if "dynamic" in solvers else [])
-    chosen = [SimulationSetting(fidelity, name) for name in backends for fidelity in dynamic]
-    if "quasistatic" in solvers:
-        chosen += [SimulationSetting(fidelity, name) for name in backends if name == "rod" for fidelity in still]
+        if solver not in fidelities:
+            raise unknown_name("solver", solver, fidelities)
+    chosen = [
+        SimulationSetting(fidelity, name)
+        for solver in fidelities
+        for name in backends
+        if solver in solvers and (solver == "dynamic" or name == "rod")
+        for fidelity in fidelities[solver]
+    ]
     return chosen + [SimulationSetting(*point) for point in itertools.product(presets, backends, collisions)]
 
 
@@ -154,15 +148,13 @@ def measure_tradeoff(
     known = {_key(point) for point in points}
     missing = [setting for setting in wanted if _key(_fields(setting)) not in known]
     # The references cost more than most points, so they are run only when something is missing.
-    reference = _whisking(REFERENCE) if any(item.collision is None for item in missing) else ()
+    reference = _whisking(REFERENCE) if any(item.collision is None for item in missing) else []
     hollow = [_into_hollow(replace(REFERENCE, collision="exact"))[0]] if any(item.collision for item in missing) else []
-    for done, setting in enumerate(missing):
+    for done, setting in enumerate(missing, start=1):
+        points.append(_measure(setting, hollow if setting.collision else reference))
+        write_json(path, {**head, "points": points})
         if progress is not None:
             progress(done, len(missing), "measuring settings")
-        points.append(_measure_collision(setting, *hollow) if setting.collision else _measure(setting, reference))
-        write_json(path, {**head, "points": points})
-    if progress is not None and missing:
-        progress(len(missing), len(missing), "measuring settings")
     return points
 
 
@@ -177,14 +169,12 @@ def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) ->
 def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> list[TradeoffPoint]:
     """Return the points of the bench tests that none beats in both error and cost, cheapest first.
 
-    Args:
-        points: a table; its points with a collision geometry are other experiments and are left out, and so are
-            those without inertia, for which some of the errors mean nothing.
-        backend: of this backend only; of all when None.
+    They are of one backend, or of all. Points with a collision geometry are other experiments and are left out, and so
+    are those without inertia, for which some of the errors mean nothing.
     """
     return pareto_front(
         TradeoffPoint(
-            math.inf if p["error"] is None else p["error"], p["cost"], {n: p[n] for n in (*_NAMES, "backend")}
+            math.inf if p["error"] is None else p["error"], p["cost"], {n: p[n] for n in (*RESOLUTION, "backend")}
         )
         for p in points
         if p["cost"] is not None and not p.get("collision") and backend in (None, p["backend"]) and _moves(p)
@@ -198,11 +188,8 @@ def collision_points(points: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def preset_of(point: dict[str, Any]) -> str:
     """Return the name of the preset with the resolution of a point; empty when there is none."""
-    presets = {_key(_fields(SimulationSetting(Fidelity.preset(name))))[: len(_NAMES)]: name for name in list_presets()}
-    return presets.get(_key(point)[: len(_NAMES)], "")
-
-
-_NAMES = ("links", "links_per_mm", "time_step", "steps_per_period")
+    presets = {tuple(vars(Fidelity.preset(name))[item] for item in RESOLUTION): name for name in list_presets()}
+    return presets.get(tuple(point.get(item) for item in RESOLUTION), "")
 
 
 def _fields(setting: SimulationSetting) -> dict[str, Any]:
@@ -211,7 +198,7 @@ def _fields(setting: SimulationSetting) -> dict[str, Any]:
 
 
 def _key(point: dict[str, Any]) -> tuple[Any, ...]:
-    return (*(point.get(name) for name in (*_NAMES, "backend", "collision")), _moves(point))
+    return (*(point.get(name) for name in (*RESOLUTION, "backend", "collision")), _moves(point))
 
 
 def _moves(point: dict[str, Any]) -> bool:
@@ -234,36 +221,32 @@ def _header() -> dict[str, Any]:
 
 
 def _measure(setting: SimulationSetting, reference: Sequence[Trace]) -> dict[str, Any]:
-    fidelity, backend = setting.fidelity, setting.backend
-    values: dict[str, Any] = {**_fields(setting), **dict.fromkeys((*PARTS, "error", "cost")), "note": ""}
-    whisker = _straight("C2")
+    errors = ("concave_error",) if setting.collision else PARTS
+    values: dict[str, Any] = {**_fields(setting), **dict.fromkeys((*errors, "error", "cost")), "note": ""}
     try:
-        pegs = [
-            peg(whisker, at * whisker.arc_length, offset * whisker.arc_length, backend=backend, fidelity=fidelity)
-            for at, offset in PEGS
-        ]
-        values["static_error"] = max(max(test.moment_error, test.force_error) for test in pegs)
-        if _moves(values):
-            values["ring_error"] = max(_ring_error(_straight(name), setting) for name in ("C2", "E5"))
-        traces = _whisking(setting)
+        if setting.collision:
+            trace, values["pieces"] = _into_hollow(setting)
+            traces = [trace]
+        else:
+            _test_bench(setting, values)
+            traces = _whisking(setting)
         values["cost"] = float(sum(trace.seconds for trace in traces) / (len(traces) * _FRAMES[-1]))
-        for name, trace, other in zip(PARTS[2:], traces, reference, strict=True):
+        for name, trace, other in zip(errors[-len(traces) :], traces, reference, strict=True):
             values[name] = _difference(trace, other)
-        values["error"] = max(values[name] for name in PARTS if values[name] is not None)
+        values["error"] = max(values[name] for name in errors if values[name] is not None)
     except BrainbenchError as error:
         values["note"] = str(error)
     return values
 
 
-def _measure_collision(setting: SimulationSetting, reference: Trace) -> dict[str, Any]:
-    values: dict[str, Any] = {**_fields(setting), **dict.fromkeys(("concave_error", "error", "cost")), "note": ""}
-    try:
-        trace, values["pieces"] = _into_hollow(setting)
-        values["cost"] = trace.seconds / float(_FRAMES[-1])
-        values["concave_error"] = values["error"] = _difference(trace, reference)
-    except BrainbenchError as error:
-        values["note"] = str(error)
-    return values
+def _test_bench(setting: SimulationSetting, values: dict[str, Any]) -> None:
+    """Measure pegs and ring-downs."""
+    whisker = _straight("C2")
+    length, how = whisker.arc_length, {"backend": setting.backend, "fidelity": setting.fidelity}
+    pegs = [peg(whisker, at * length, offset * length, **how) for at, offset in PEGS]
+    values["static_error"] = max(max(test.moment_error, test.force_error) for test in pegs)
+    if _moves(values):
+        values["ring_error"] = max(_ring_error(_straight(name), setting) for name in ("C2", "E5"))
 
 
 def _collision(text: str) -> tuple[str, DecompositionSettings | None]:

@@ -7,24 +7,20 @@ instant it shows, and kept in the cache.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
-    from brainbench.stimuli.scenes.scene import Scene
+from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
+from brainbench.stimuli.scenes.scene import Scene
 
 _LOG = logging.getLogger(__name__)
 
@@ -62,8 +58,8 @@ def record(
     Args:
         scene: what to simulate; its frames do not matter.
         times: instants [n] (s), increasing, not before t = 0.
-        fidelity, backend, progress: as for :func:`brainbench.stimuli.simulate`.
-        cache: read and keep shapes under ``brainbench.core.files.cache_dir("shapes")``.
+        fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.simulate`; shapes have a cache of their
+            own.
 
     Raises:
         UsageError: the times do not increase, or the backend reports no shapes.
@@ -93,12 +89,9 @@ def record(
 def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the elastic moment [n, N + 1] (N·m) at each joint of a chain; zero at the tip.
 
-    The moment is the hinge's stiffness times the angle by which the link after the joint is turned from
-    its rest direction (:mod:`brainbench.stimuli.whiskers.chain`); damping and twist carry none of it.
-
-    Args:
-        job: the whisker, with the times [n] of the shapes.
-        joints: [n, N + 1, 3] m, in the frame of the job.
+    The moment is the hinge's stiffness times the angle by which the link after the joint is turned from its rest
+    direction (:mod:`brainbench.stimuli.whiskers.chain`); damping and twist carry none of it. ``joints`` are [n, N + 1,
+    3] (m) in the frame of the job, at its times [n].
     """
     from brainbench.stimuli.engines.protocol import base_rotation
     from brainbench.stimuli.whiskers.chain import build_chain

@@ -47,10 +47,7 @@ def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit")
 
     Diameters, taper, density, stiffness, damping and friction follow the published rules that the mouse and
     rat arrays use. ``param_angles`` is not needed: the whole curvature is kept by any number of links.
-
-    Args:
-        folder: holds ``param_name.csv`` and the other tables.
-        species: name given to the array.
+    ``species`` is the name given to the array.
 
     Raises:
         DataError: a file is missing, or the tables do not fit together.
@@ -86,11 +83,7 @@ def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit")
 
 
 def load_bends(folder: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Read ``param_angles``: the bend [whisker, link] (rad) of each link against the one before.
-
-    Raises:
-        DataError: the file is missing or does not fit the names.
-    """
+    """Read ``param_angles``: the bend [whisker, link] (rad) of each link against the one before; errors as above."""
     return _table(Path(folder), "param_angles", len(_names(Path(folder))), None)
 
 
@@ -113,12 +106,8 @@ def save_parameters(
 ) -> Path:
     """Write an array as a parameter folder that WHISKiT reads; existing tables are replaced.
 
-    Diameters and material have no place there and are not written.
-
-    Args:
-        array: one side or both.
-        folder: created when missing.
-        bends_table: [whisker, link] (rad), such as :func:`load_bends` read; :func:`bends` of the array when None.
+    Diameters and material have no place there and are not written. ``bends_table`` is [whisker, link] (rad), such as
+    :func:`load_bends` read; :func:`bends` of the array when None.
 
     Raises:
         UsageError: the bends do not fit the array.

@@ -78,13 +78,10 @@ def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[
     corners = mesh.vertices[mesh.faces]
     # All triangles by brute force in double precision: an own reference that shares no code with the kernels.
     sign = np.where(winding_number(mesh, points) > 0.5, -1.0, 1.0)
-    away = np.array([_shortest(x - closest_point(corners, np.tile(x, (len(corners), 1)))) for x in points])
+    every = (x - closest_point(corners, np.tile(x, (len(corners), 1))) for x in points)
+    away = np.array([vectors[np.linalg.norm(vectors, axis=1).argmin()] for vectors in every])
     length = np.linalg.norm(away, axis=1)
     return sign * length, (sign / np.maximum(length, 1e-15))[:, None] * away
-
-
-def _shortest(vectors: NDArray) -> NDArray:
-    return vectors[np.linalg.norm(vectors, axis=1).argmin()]
 
 
 def _run(solid: Geometry, sensor: Sensor, places: NDArray, resolution: int = 64) -> tuple[NDArray, float]:
@@ -239,6 +236,3 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
         if not number:
             axes.set_ylabel("relative error")
     figure.savefig(path)
-
-
-__all__ = ["measure_tradeoff", "plot_tradeoff", "triangle_distance"]

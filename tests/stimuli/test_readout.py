@@ -3,7 +3,7 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.readout import to_frame, to_grid
+from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
@@ -66,14 +66,3 @@ def test_an_unstable_whisker_is_refused_unless_zero_is_asked_for():
     grid = to_grid(dataset, unstable="zero")
     assert np.isfinite(grid).all()
     assert (grid[0, -1, :, 2, 1] == 0).all()
-
-
-def test_the_tidy_table_holds_every_number_once():
-    dataset = _dataset("C1,C2", count=10)
-    table = to_frame(dataset)
-    assert len(table) == 2 * 10 * 2
-    assert list(table.columns[:5]) == ["stimulus", "time", "whisker", "row", "col"]
-    row = table[(table.stimulus == "b") & (table.whisker == "C2")].sort_values("time").iloc[3]
-    assert row["Mz"] == dataset["wrench"].sel(stimulus="b", whisker="C2", channel="Mz").values[3]
-    assert row["time"] == pytest.approx(0.028)
-    assert {"contact", "contact_arc", "status"} <= set(table.columns)

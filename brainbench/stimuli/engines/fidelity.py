@@ -10,15 +10,13 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.whiskers.chain import Chain
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 @dataclass(frozen=True)
@@ -64,11 +62,7 @@ class Fidelity:
 
     @classmethod
     def preset(cls, name: str) -> Fidelity:
-        """Return the preset called ``fast``, ``balanced`` or ``accurate``.
-
-        Raises:
-            UsageError: there is no such preset.
-        """
+        """Return the preset called ``fast``, ``balanced`` or ``accurate``; any other is a :class:`UsageError`."""
         if name not in _PRESETS:
             raise unknown_name("fidelity preset", name, _PRESETS)
         return cls(**_PRESETS[name])
@@ -112,11 +106,7 @@ class Fidelity:
         return cls(**cheapest(measured(backend), error).settings)
 
     def chain(self, whisker: Whisker) -> Chain:
-        """Return the chain of links that stands for a whisker.
-
-        Raises:
-            UsageError: it would take more links than can be simulated sensibly.
-        """
+        """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""
         from brainbench.stimuli.whiskers.chain import build_chain
 
         return build_chain(whisker, self.link_count(whisker.arc_length))
@@ -162,6 +152,8 @@ def _value(name: str, text: str) -> Any:
 
 PRECISIONS = ("single", "double")
 SOLVERS = ("dynamic", "quasistatic")
+RESOLUTION = ("links", "links_per_mm", "time_step", "steps_per_period")
+"""Fields that the measured settings differ in."""
 MOST_LINKS = 100
 """Links per whisker that are allowed; cost grows with the cube, and error is far below 0.1 % before."""
 
@@ -187,20 +179,12 @@ def measured(backend: str = DEFAULT_ENGINE) -> tuple[TradeoffPoint, ...]:
     import json
 
     text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
-    points = [
-        point
-        for point in json.loads(text)["points"]
-        if not point.get("collision") and point.get("solver", "dynamic") == "dynamic"
-    ]
-    backends = {point.get("backend", "mujoco") for point in points}
-    if backend not in backends:
-        raise unknown_name("measured backend", backend, backends)
-    return tuple(
-        TradeoffPoint(
-            point["error"] if point["error"] is not None else math.inf,
-            point["cost"] if point["cost"] is not None else math.inf,
-            {name: point.get(name) for name in ("links", "links_per_mm", "time_step", "steps_per_period")},
-        )
-        for point in points
-        if point.get("backend", "mujoco") == backend
-    )
+    found: dict[str, list[TradeoffPoint]] = {}
+    for point in json.loads(text)["points"]:
+        if not point.get("collision") and point.get("solver", "dynamic") == "dynamic":
+            error, cost = (math.inf if point[name] is None else point[name] for name in ("error", "cost"))
+            settings = {name: point.get(name) for name in RESOLUTION}
+            found.setdefault(point.get("backend", "mujoco"), []).append(TradeoffPoint(error, cost, settings))
+    if backend not in found:
+        raise unknown_name("measured backend", backend, found)
+    return tuple(found[backend])

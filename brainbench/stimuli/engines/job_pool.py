@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from brainbench.stimuli.engines.protocol import Progress, Trace
+from brainbench.stimuli.engines.protocol import Progress, Trace
 
 
 def run_groups(
@@ -17,13 +15,9 @@ def run_groups(
     threads: int,
     progress: Progress | None = None,
 ) -> list[Trace]:
-    """Run groups of jobs side by side and return all traces in the order of the jobs.
+    """Run groups of jobs, ``threads`` at a time, and return all traces in the order of the jobs.
 
-    Args:
-        groups: numbers of the jobs that are run together; each job stands in one group.
-        run: simulates one group and returns the trace of each of its jobs.
-        threads: how many groups run at a time.
-        progress: called as ``progress(done, total)`` when a job is finished.
+    Each job stands in one group; ``progress`` is called as ``progress(done, total)`` when one is finished.
     """
     traces: dict[int, Trace] = {}
     total = sum(map(len, groups))

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.core.files import content_hash
+from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.motion.trajectories import Still
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.engines.protocol import Job
-    from brainbench.stimuli.scenes.scene import Scene
+from brainbench.stimuli.scenes.scene import Scene
 
 SAMPLING = 1000.0
 """Instants per second at which reach is judged; what moves in between counts as an error bound."""

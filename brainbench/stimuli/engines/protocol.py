@@ -163,10 +163,7 @@ class WhiskerEngine(ABC):
     ) -> None:
         """Do, in a thread before :meth:`run`, what the first run would wait for, such as compiling; most need nothing.
 
-        Args:
-            lengths: arc lengths of the whiskers [m].
-            fidelity: as for :meth:`run`.
-            progress: called as ``progress(done, total, what)``.
+        ``lengths`` are the arc lengths of the whiskers [m]; ``progress`` is called as ``progress(done, total, what)``.
         """
 
     @abstractmethod
@@ -185,8 +182,7 @@ class WhiskerEngine(ABC):
         simulated: its wrench is exactly zero. Obstacles out of reach are left out.
 
         Args:
-            jobs: whiskers to simulate, independent of one another.
-            fidelity: links, time step and the other knobs of accuracy.
+            jobs, fidelity: whiskers to simulate, independent of one another, and the knobs of accuracy.
             progress: called as ``progress(done, total)`` when a job is finished.
             workers: native threads; all usable processors when None.
             record_shape: fill :attr:`Trace.link_positions`.
@@ -200,13 +196,8 @@ class WhiskerEngine(ABC):
     ) -> SweepBatch:
         """Simulate sweeps whose object moves; of engines that take :attr:`batches` alone.
 
-        Results do not depend on which sweeps come together, nor on their order.
-
-        Args:
-            scenes: a grid of sweeps over some objects.
-            indices: which of its scenes; neighbours share their object, so order by object is fastest.
-            fidelity: how finely.
-            workers: threads on the CPU; one when None.
+        Results do not depend on which sweeps come together, nor on their order; ordered by object they are fastest.
+        ``workers`` are threads on the CPU, one when None.
         """
         raise NotImplementedError(f"The engine {self.name!r} takes sweeps as single scenes.")
 

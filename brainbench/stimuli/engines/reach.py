@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.objects.obstacle import Obstacle
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.whiskers.chain import Chain
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 @dataclass(frozen=True)
@@ -60,19 +56,14 @@ def reachable(
     part whose bounding box stays outside that ball at every time cannot be touched, however it bends.
     What base and obstacle travel against one another between two times is added to the ball.
 
-    Args:
-        whisker: what reaches out.
-        base: base points at ``times``.
-        obstacles: what may be in reach.
-        times: when to look.
-        surfaces: take the surface of every obstacle that has one, as engines do that collide meshes; otherwise
-            its parts, and the surface only where there are none.
+    With ``surfaces`` the surface of every obstacle that has one is taken, as by engines that collide meshes; otherwise
+    its parts, and the surface only where there are none.
     """
     limit = whisker.arc_length + max(whisker.base_radius, whisker.tip_radius)
     kept, nearest = [], math.inf
     for obstacle in obstacles:
         points = _in_obstacle_frame(obstacle, base, times)
-        between = _largest_step(points) / 2
+        between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2
         obstacle = touched(obstacle, surfaces=surfaces)
         boxes = [part.bounds() for part in obstacle.parts] if obstacle.surface is None else obstacle.surface.boxes
         distances = [max(0.0, float(_box_distance(box, points).min()) - between) for box in boxes]
@@ -93,8 +84,7 @@ def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:
 
 def distances(obstacle: Obstacle, bounds: NDArray, points: NDArray, times: NDArray) -> NDArray[np.float64]:
     """Distances [n] (m) of points [n, 3] (world) at ``times`` [n] from a box [2, 3] that the obstacle carries."""
-    away = _box_distance(bounds, _in_obstacle_frame(obstacle, points, times))
-    return np.broadcast_to(away, len(times))
+    return np.broadcast_to(_box_distance(bounds, _in_obstacle_frame(obstacle, points, times)), len(times))
 
 
 def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
@@ -102,11 +92,6 @@ def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> N
         return points[:1] if np.ptp(points, axis=0).max() == 0 else points
     position, quaternion = obstacle.motion(times)
     return np.einsum("nji,nj->ni", to_matrices(quaternion), points - position)
-
-
-def _largest_step(points: NDArray) -> float:
-    """Longest way (m) from one of the points [n, 3] to the next."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0))
 
 
 def _box_distance(bounds: NDArray, points: NDArray) -> NDArray[np.float64]:

@@ -1,34 +1,31 @@
-"""Jobs that need no simulation, and jobs in equal time steps. Letters: n frame, s step."""
+"""Jobs that need no simulation, jobs in equal time steps, and engines that take these. Letters: n frame, s step."""
 
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.core.devices import usable_processors
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.job_pool import run_groups
+from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine, base_rotation
 from brainbench.stimuli.engines.reach import Reach, reachable
-from brainbench.stimuli.engines.trust import passed_unseen
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.engines.trust import check_jobs, passed_unseen
+from brainbench.stimuli.whiskers.chain import Chain
 
 
 def is_silent(job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64]) -> bool:
     """Return True for a whisker that can feel nothing: nothing in reach, a still base, no gravity and no loads.
 
-    Args:
-        job: the whisker.
-        reach: what it could ever touch.
-        position: base point [n, 3] over the whole job.
-        euler: angles of the base [n, 3].
+    ``position`` and ``euler`` are base points [n, 3] and angles [n, 3] over the whole job.
     """
     moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
     return not (reach or moves or job.loads or np.any(job.gravity))
@@ -159,3 +156,38 @@ class SteppedJob:
             seconds=time.thread_time() - self.started,
             link_positions=np.where(good[:, None, None], shape, np.nan) if self.record_shape else None,
         )
+
+
+class SteppedEngine(WhiskerEngine):
+    """An engine that takes every job by itself, in equal time steps."""
+
+    threads: ClassVar[int | None] = None
+    """Jobs at a time; as many as there are ``workers`` when None."""
+
+    @abstractmethod
+    def session(self) -> AbstractContextManager[None]:
+        """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
+
+    @abstractmethod
+    def simulate(self, stepped: SteppedJob) -> Trace:
+        """Simulate one job that is not silent."""
+
+    def run(
+        self,
+        jobs: Sequence[Job],
+        fidelity: Fidelity,
+        *,
+        progress: Progress | None = None,
+        workers: int | None = None,
+        record_shape: bool = False,
+    ) -> list[Trace]:
+        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`."""
+
+        def run(group: Sequence[int]) -> dict[int, Trace]:
+            stepped = [(index, SteppedJob(jobs[index], fidelity, record_shape)) for index in group]
+            return {index: one.silent_trace() if one.is_silent else self.simulate(one) for index, one in stepped}
+
+        with self.session():
+            check_jobs(self, jobs, fidelity, workers)
+            threads = self.threads or workers or usable_processors()
+            return run_groups([[index] for index in range(len(jobs))], run, threads=threads, progress=progress)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +50,7 @@ def describe_unstable(
 ) -> tuple[str, ...]:
     """Return the reason of each sweep: that of its first unstable whisker, and how many more there are.
 
-    Args:
-        names: of the whiskers.
-        unstable: [sweep, whisker].
-        reasons: [sweep, whisker] in words.
+    ``names`` are those of the whiskers; ``unstable`` and ``reasons`` (in words) have shape [sweep, whisker].
     """
     found = []
     for bad, words in zip(unstable, reasons, strict=True):
@@ -70,12 +64,8 @@ def join_batches(parts: Sequence[SweepBatch]) -> SweepBatch:
     """Return several batches as one."""
     if len(parts) == 1:
         return parts[0]
-    return SweepBatch(
-        wrench=np.concatenate([part.wrench for part in parts]),
-        contact=np.concatenate([part.contact for part in parts]),
-        unstable=np.concatenate([part.unstable for part in parts]),
-        reasons=tuple(reason for part in parts for reason in part.reasons),
-        steps=sum(part.steps for part in parts),
-        steps_in_full=sum(part.steps_in_full for part in parts),
-        retried=sum(part.retried for part in parts),
-    )
+    arrays = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("wrench", "contact", "unstable")
+    }
+    counts = {name: sum(getattr(part, name) for part in parts) for name in ("steps", "steps_in_full", "retried")}
+    return SweepBatch(**arrays, reasons=tuple(reason for part in parts for reason in part.reasons), **counts)

@@ -6,12 +6,8 @@ its surface and the margin rounds it, so its facets are smaller than dr and do n
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 LEAST_TAPER = 1e-6
 """Difference of the radii of a link's ends (mm) below which it is a capsule."""
@@ -19,12 +15,9 @@ _SIDES = 8
 
 
 def cone_vertices(core: float, length: float, *, narrows: bool) -> NDArray[np.float64]:
-    """Return the vertices [9, 3] (mm) of the cone inside a link along x.
+    """Return the vertices [9, 3] (mm) of the cone inside a link along x, ``core`` (mm) being the radius of its base.
 
-    Args:
-        core: radius of its base (mm).
-        length: of the link (mm).
-        narrows: True when the link is thinner at its end than at its start.
+    It ``narrows`` when the link is thinner at its end than at its start.
     """
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     wide, apex = (0.0, length) if narrows else (length, 0.0)

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, Self, TypeVar
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, listing
-from brainbench.stimuli.engines.reach import distances
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
+from brainbench.stimuli.engines.reach import Reach, distances
 from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import build_chain
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
-    from brainbench.stimuli.engines.reach import Reach
-    from brainbench.stimuli.objects.obstacle import Obstacle
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 logger = logging.getLogger(__name__)
 
@@ -85,9 +79,8 @@ class Verdict:
 def residual(miss: NDArray[np.floating], load: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return what the last iterations still changed in the contact forces, as a share of the forces (root mean square).
 
-    Args:
-        miss: sum over the steps of the squared change of the forces in the last iteration (mN²).
-        load: sum over the steps of the squared forces (mN²).
+    ``miss`` and ``load`` are sums over the steps: of the squared change in the last iteration, and of the squared
+    forces.
     """
     return np.sqrt(miss / np.maximum(load, 1e-30))
 
@@ -155,11 +148,9 @@ Result = TypeVar("Result", bound=Judged)
 
 
 def run_with_retries(simulate: Callable[[NDArray[np.bool_] | None, int], Result], retry: int) -> Result:
-    """Simulate whiskers, and those that finer steps may mend again, at most twice.
+    """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
-    Args:
-        simulate: called with which whiskers (all when None) and by what their steps are divided.
-        retry: divisor of the steps the second time; twice that is the divisor the third time. 1 leaves all as they are.
+    ``simulate`` is called with which whiskers (all when None) and the divisor. A ``retry`` of 1 leaves all as they are.
     """
     result = simulate(None, 1)
     for finer in (retry, 2 * retry) if retry > 1 else ():
@@ -186,15 +177,23 @@ def too_strong(force: float, strongest: float) -> str:
     )
 
 
+def state_fault(hinges: NDArray[np.float64], wrench: NDArray[np.float64], whisker: Whisker) -> str:
+    """Return in words what is impossible in hinge angles [2N] (rad) or base wrench [6] (N first); empty for nothing."""
+    bend, strength, strongest = np.abs(hinges).max(), np.abs(wrench[:3]).max(), strongest_force(whisker)
+    if not (np.isfinite(bend) and np.isfinite(wrench).all()):
+        return "the state stopped being finite; choose a smaller time step"
+    if bend >= LARGEST_BEND:
+        joint = int(np.abs(hinges).argmax()) // 2
+        return f"joint {joint} bent by {bend:.2f} rad, more than a chain of links can represent"
+    return too_strong(strength, strongest) if strength > strongest else ""
+
+
 def step_travel(
     whisker: Whisker, position: NDArray, euler: NDArray, obstacle: Obstacle, times: NDArray
 ) -> NDArray[np.float64]:
     """Return how far [n] (m) a point of the unbent whisker can at most move against an obstacle in each step.
 
-    Args:
-        whisker: carried by its base at ``position`` [n + 1, 3] (m) with angles ``euler`` [n + 1, 3] (rad).
-        obstacle: may move too.
-        times: [n + 1] (s).
+    ``position`` and ``euler`` [n + 1, 3] (m, rad) are those of the base that carries it, at ``times`` [n + 1] (s).
     """
     turn = np.abs(np.diff(euler, axis=0)).sum(axis=1) * whisker.arc_length
     own = np.linalg.norm(np.diff(position, axis=0), axis=1) + turn
@@ -207,10 +206,10 @@ def step_travel(
 
 
 def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, times: NDArray) -> tuple[int, str]:
-    """Find the first step in which whisker and obstacle can pass through one another without ever overlapping.
+    """Return the first step in which whisker and obstacle can pass through one another unseen, and what is wrong.
 
-    Contact is looked for at the end of each step only. Returns the step (the number of steps when there is none)
-    and what is wrong in words. Arguments as for :func:`step_travel`.
+    Contact is looked for at the end of each step only. Without such a step it is their number. Arguments as for
+    :func:`step_travel`.
     """
     first, reason = len(times) - 1, ""
     for obstacle in reach.obstacles:
@@ -258,11 +257,7 @@ def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, w
 
 
 def require_parts(jobs: Sequence[Job], backend: str) -> None:
-    """Refuse obstacles that only engines which collide surfaces can touch.
-
-    Raises:
-        UsageError: an obstacle has a surface and no convex parts.
-    """
+    """Refuse obstacles with a surface and no convex parts, which only engines that collide surfaces can touch."""
     for obstacle in {id(item): item for job in jobs for item in job.obstacles}.values():
         if obstacle.surface is not None and not obstacle.parts:
             raise UsageError(

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 Vector = tuple[float, float, float]
 
@@ -83,11 +81,9 @@ class Camera:
         return np.stack([right, np.cross(towards, right), towards])
 
     def lens(self, points: ArrayLike, size: tuple[int, int]) -> Lens:
-        """Fit the camera to what it shall show.
+        """Fit the camera to points [n, 3] (m, world) that must be in the picture where target or width are None.
 
-        Args:
-            points: [n, 3] points (m, world) that must be in the picture where target or width are None.
-            size: width and height of the picture in pixels.
+        ``size`` is the width and height of the picture in pixels.
         """
         axes = self.axes
         points = np.asarray(points, dtype=float).reshape(-1, 3)

@@ -32,15 +32,13 @@ def write_film(
     palette_from: Sequence[NDArray[np.uint8]] = (),
     progress: Progress | None = None,
 ) -> Path:
-    """Write frames [H, W, 3] to a ``.gif`` that repeats for ever, or to an ``.mp4`` (H.264).
+    """Write frames [H, W, 3] to a ``.gif`` that repeats for ever, or to an ``.mp4`` (H.264); the suffix chooses.
 
     Args:
-        path: file to write; the suffix, one of the two, chooses the format.
-        frames: pictures of one size.
-        count: number of frames, for ``progress``.
+        path, frames: file to write, and pictures of one size.
+        count, progress: ``progress(done, count, what)`` is called after each frame.
         style: size and frames per second.
         palette_from: frames whose colours the 255 colours of a GIF are chosen from.
-        progress: called as ``progress(done, total, what)`` after each frame.
 
     Raises:
         DataError: the encoder failed.

@@ -10,14 +10,11 @@ pixels of their bounding boxes, all triangles of one size at once. Letters: F tr
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.figures.camera import Lens
+from brainbench.stimuli.figures.camera import Lens
 
 LARGEST = 32
 """Triangles that extend over more pixels are split first."""

@@ -9,30 +9,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.figures.annotation import Annotation
-from brainbench.stimuli.figures.camera import Camera
+from brainbench.stimuli.figures.camera import Camera, Lens
 from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, check_format, round_up
 from brainbench.stimuli.figures.films import require_writer, write_film
 from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
 from brainbench.stimuli.figures.shading import floor, lamp, paint, shade
 from brainbench.stimuli.figures.surfaces import DrawnSurface, ball, object_surface, smoothed, tube
 from brainbench.stimuli.motion.trajectories import Whisking
+from brainbench.stimuli.scenes.scene import Scene
 from brainbench.stimuli.whisker_shapes import Recording, record
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import WhiskerEngine
-    from brainbench.stimuli.figures.camera import Lens
-    from brainbench.stimuli.scenes.scene import Scene
 
 _LOG = logging.getLogger(__name__)
 
@@ -217,11 +213,10 @@ def render(
     """Draw a scene into a picture (``.png``) or a film (``.gif``, ``.mp4``).
 
     Args:
-        scene: what to draw; its whiskers are simulated up to the last instant shown.
-        out: file to write; it is replaced only by a finished one.
+        scene, out: what to draw, and the file to write; it is replaced only by a finished one.
         times: instants to draw [s], one for a picture; :func:`still_time` or :func:`film_times` when None.
-        camera: where from; an oblique perspective that frames whiskers and objects when None.
-        style: colours, size and quality; films are smaller than pictures when None.
+        camera, style: an oblique perspective that frames whiskers and objects when None; films are smaller than
+            pictures.
         fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.whisker_shapes.record`.
 
     Raises:

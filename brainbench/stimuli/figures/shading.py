@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.stimuli.figures.camera import Camera
+from brainbench.stimuli.figures.camera import Camera, Lens
 from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.figures.camera import Lens
 
 AMBIENT, KEY = 0.58, 0.50
 FLOOR_SHADE = 0.22
@@ -53,14 +49,10 @@ class Light:
 
 
 def lamp(lens: Lens, samples: int, points: NDArray[np.float64], triangles: Triangles, strength: float = 1.0) -> Light:
-    """Return a lamp over the camera's left shoulder.
+    """Return a lamp over the camera's left shoulder, fitted to the ``points`` [n, 3] (m) that can throw shadows.
 
-    Args:
-        lens: the camera.
-        samples: samples per pixel and direction; shadows take about one.
-        points: [n, 3] m, what can throw shadows; the lamp's picture is fitted to it.
-        triangles: what throws shadows now.
-        strength: of the shadows, from 0 to 1.
+    ``samples`` are those per pixel and direction, of which shadows take about one; ``triangles`` throw shadows now,
+    whose ``strength`` lies between 0 and 1.
     """
     right, up, towards = lens.axes
     # High in the world as well, so that shadows fall on the floor.

@@ -7,22 +7,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.rotations import euler_matrix, to_matrices
 from brainbench.geometry import Mesh
 from brainbench.stimuli.figures.raster import Triangles
 from brainbench.stimuli.motion.trajectories import Path, Spin
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, Sphere
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, RigidMotion, Sphere
+from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.procedural.bodies import transported_normals
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.stimuli.objects.obstacle import RigidMotion
-    from brainbench.stimuli.objects.placed_object import PlacedObject
 
 CREASE = math.cos(math.radians(35))
 """Neighbouring triangles at a smaller angle are shaded as one smooth surface."""
@@ -123,13 +118,7 @@ def corner_normals(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def tube(line: NDArray[np.float64], radii: NDArray[np.float64], colors: NDArray[np.float64]) -> Triangles:
-    """Return a closed tube around a curve.
-
-    Args:
-        line: [n, 3] points of the centre line (m, world).
-        radii: [n] m.
-        colors: [n, 3] from 0 to 1.
-    """
+    """Return a closed tube around points [n, 3] (m, world), with radii [n] (m) and colours [n, 3] from 0 to 1."""
     along = np.gradient(line, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
     across = transported_normals(along)

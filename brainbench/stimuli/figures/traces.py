@@ -45,7 +45,7 @@ def plot(
     window: tuple[float, float] | None = None,
     size: tuple[int, int] = (1600, 960),
 ) -> tuple[Path, ...]:
-    """Draw the traces of every whisker.
+    """Draw the traces of every whisker and return the files written.
 
     All panels of all pictures share one scale, so that stimuli can be compared; where a whisker touches,
     the panel is shaded. Whiskers that became unstable say so.
@@ -56,11 +56,7 @@ def plot(
             with the stimulus's label after a hyphen.
         channel: one of :data:`QUANTITIES`.
         stimulus: draw only this one.
-        window: first and last time to show [s].
-        size: width and height in pixels.
-
-    Returns:
-        The files written.
+        window, size: first and last time to show [s]; width and height in pixels.
 
     Raises:
         UsageError: a name or format is unknown, two whiskers share a cell, or the window is empty.

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 STEEPEST = math.radians(87)
 """Elevation up to which a follicle is driven by its Euler angles."""
@@ -36,16 +33,13 @@ def follow_angles(
     first: ArrayLike,
     name: str,
 ) -> NDArray[np.float64]:
-    """Return continuous (θ, φ, ζ) [n, 3] (rad) of a moving base frame, without jumps by whole turns.
+    """Return the angles (θ, φ, ζ) [n, 3] (rad) of a moving base frame at ``times`` [n] (s), without jumps by turns.
 
-    Args:
-        rotation: times [m] (s) → base frames [m, 3, 3].
-        times: when [n] (s), in any order; the angles do not depend on which other times are asked for.
-        first: angles at t = 0, which tell the turn to start in.
-        name: whisker to name in the error.
+    ``rotation`` gives base frames [m, 3, 3] at times [m]; ``first`` are the angles at t = 0, which tell the turn to
+    start in. Times may have any order: the angles do not depend on which others are asked for.
 
     Raises:
-        UsageError: the whisker points nearly along the z axis of its frame, where θ and ζ turn about the
+        UsageError: the whisker ``name`` points nearly along the z axis of its frame, where θ and ζ turn about the
             same axis (gimbal lock) and no hinge angles follow its motion.
     """
     times = np.asarray(times, dtype=float)

@@ -25,19 +25,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.whiskers.array import MountedWhisker
+from brainbench.stimuli.whiskers.array import MountedWhisker
 
 _LOG = logging.getLogger(__name__)
 
@@ -111,9 +108,8 @@ class Trajectory:
     def rotation(self, name: str, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far the base of ``name`` has turned since t = 0: rotation matrices [m, 3, 3].
 
-        The velocity between samples is a cubic spline, and Q′ = [ω]Q is integrated by the exponential map with
-        the fourth-order Magnus expansion, one step per sample. So Q is a rotation to rounding, however long the
-        recording, and continuous between the samples.
+        The velocity between samples is a cubic spline, and Q′ = [ω]Q is integrated by the exponential map with the
+        fourth-order Magnus expansion, one step per sample: Q is a rotation to rounding, however long the recording.
 
         Raises:
             UsageError: there is no such whisker, or a time lies outside the recording.

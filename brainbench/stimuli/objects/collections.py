@@ -26,10 +26,7 @@ PROCEDURAL_24 = (
 )  # fmt: skip
 """The 24 families of the collection ``procedural-24``: everyday and elementary shapes that differ at first touch."""
 
-COLLECTIONS: dict[str, Callable[[], tuple[str, ...]]] = {
-    "procedural-24": lambda: PROCEDURAL_24,
-    "procedural": list_families,
-}
+COLLECTIONS = {"procedural-24": PROCEDURAL_24, "procedural": list_families()}
 """Named collections of shape families; ``procedural-24:40`` is 40 members of each of its 24 families."""
 
 DIAGONAL = 0.04
@@ -63,10 +60,8 @@ def resolve_objects(
             2,000 to 20,000 triangles); ``shapenet:FOLDER`` or ``shapenet:FOLDER:100`` (the first 100 models of a
             ShapeNet tree); a mesh file, or a pattern of mesh files (``meshes/*.obj``). A file's class is its
             folder's name when its pattern spans several folders, otherwise its own name.
-        unit: length unit of mesh files.
-        collision: what whiskers touch, one of :data:`brainbench.stimuli.objects.mesh_solids.COLLISIONS`; None
-        takes what each
-            kind of object has by default.
+        unit, collision: as for :func:`brainbench.stimuli.objects.mesh_solids.mesh_solid`; each kind of object has a
+            collision geometry by default.
         surfaces: build shape families as their exact surface alone, without convex parts, which takes tens of
             milliseconds instead of a second; for engines that collide meshes. Not with ``collision``.
 
@@ -99,7 +94,7 @@ def _resolve(text: str, unit: str | None, collision: str | None) -> Iterator[Nam
         raise UsageError(f"The number of members in {text!r} is a whole number above zero, as in {name}:20.")
     count = int(number or 1)
     if name in COLLECTIONS:
-        for family in COLLECTIONS[name]():
+        for family in COLLECTIONS[name]:
             yield from (_member(family, seed, _detail(family, seed), collision) for seed in range(count))
         return
     family, seed = (hit[1], int(hit[2])) if (hit := re.fullmatch(r"(.+)-(\d+)", name)) else (name, None)
@@ -136,7 +131,10 @@ def _detail(family: str, seed: int) -> int:
 
 
 def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObject]:
-    paths = [path for path in _match(Path(pattern)) if path.is_file()]
+    given = Path(pattern)
+    # In alphabetical order; ``**`` stands for any number of folders.
+    found = [given] if given.is_file() else sorted(Path(given.anchor or ".").glob(str(given.relative_to(given.anchor))))
+    paths = [path for path in found if path.is_file()]
     if not paths:
         raise DataFileNotFoundError(f"No mesh file matches {pattern!r}.")
     if unit is None:
@@ -147,13 +145,6 @@ def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObje
         source = f"mesh {file_hash(path)} in {unit}, {collision}"
         load = functools.partial(mesh_solid, path.absolute(), unit=unit, collision=collision)
         yield NamedObject(f"{label}/{path.stem}" if several else path.stem, label, source, load)
-
-
-def _match(pattern: Path) -> list[Path]:
-    """Return what a pattern matches, in alphabetical order; ``**`` stands for any number of folders."""
-    if pattern.is_file():
-        return [pattern]
-    return sorted(Path(pattern.anchor or ".").glob(str(pattern.relative_to(pattern.anchor))))
 
 
 def _shapenet(text: str, collision: str) -> Iterator[NamedObject]:

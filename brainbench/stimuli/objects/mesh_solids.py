@@ -5,19 +5,15 @@ from __future__ import annotations
 import functools
 import logging
 import os
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.objects.obstacle import ConvexPart
+from brainbench.stimuli.objects.procedural import Shape
 from brainbench.stimuli.objects.solid import Solid, to_surface
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from brainbench.stimuli.objects.procedural import Shape
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,17 +66,9 @@ def shape_solid(
 ) -> Solid:
     """Return a procedural shape (:func:`brainbench.stimuli.objects.procedural.make`) as a solid.
 
-    Args:
-        shape: any member of a family.
-        diagonal: bounding-box diagonal [m]; the thesis used 40 mm.
-        collision: one of :data:`COLLISIONS`; None takes the convex parts that the family knows (``exact``), or
-            the ``hull`` where it knows none, and a note says which.
-        decomposition: how ``decomposition`` cuts; its defaults when None.
-
-    Raises:
-        UsageError: ``collision`` is unknown.
-        DataError: the decomposition passed its limits.
-        MissingDependencyError: the decomposition needs a package that is not installed.
+    Args and errors are those of :func:`mesh_solid`; the thesis used a diagonal of 40 mm. Without ``collision`` the
+    convex parts that the family knows are taken (``exact``), or the ``hull`` where it knows none, and a note says
+    which.
     """
     if collision is None:
         collision = "exact" if shape.part_points else "hull"
@@ -114,8 +102,7 @@ def shape_solids(
     Args:
         families: names from :func:`brainbench.stimuli.objects.procedural.list_families`; all of them when None.
         members: shapes of each family, with the seeds 0, 1, ….
-        diagonal, collision: as for :func:`shape_solid`.
-        detail: as for :func:`brainbench.stimuli.objects.procedural.make`.
+        diagonal, collision, detail: as for :func:`shape_solid` and :func:`brainbench.stimuli.objects.procedural.make`.
 
     Raises:
         UsageError: a family is unknown, or there is less than one member.

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import from_matrices, to_matrices
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 
-    RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-    """Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
+"""Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
 
 Vector = tuple[float, float, float]
 
@@ -91,57 +90,74 @@ class TriangleMesh(_Polyhedron):
         middle = (low + high) / 2
         patches = [np.arange(len(corners))]
         while len(patches) < 64 and len(patches[0]) > 1:
-            patches = [half for patch in patches for half in _halves(patch, middle[patch]) if len(half)]
+            # Each is split where its longest side is halved by number.
+            axes = [np.ptp(middle[patch], axis=0).argmax() for patch in patches]
+            ordered = [p[np.argsort(middle[p, axis], kind="stable")] for p, axis in zip(patches, axes, strict=True)]
+            patches = [half for p in ordered for half in (p[: len(p) // 2], p[len(p) // 2 :]) if len(half)]
         return np.array([[low[patch].min(axis=0), high[patch].max(axis=0)] for patch in patches])
 
 
 @dataclass(frozen=True)
-class Sphere:
+class _Primitive:
+    """Base of the bodies that some points and lengths describe."""
+
+    _points: ClassVar[tuple[str, ...]]
+    """Names of the fields that move with the body."""
+    _sizes: ClassVar[tuple[str, ...]] = ("radius",)
+    """Names of the fields that only grow with it."""
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__.lower()
+        for field in (*self._points, *self._sizes):
+            value = getattr(self, field)
+            if isinstance(value, Sequence) and (len(value) != 3 or not all(map(math.isfinite, value))):
+                raise UsageError(f"{field} of a {name} must be three finite numbers (m); received {value!r}.")
+        for field in self._sizes:
+            for size in np.atleast_1d(getattr(self, field)).tolist():
+                if not (math.isfinite(size) and size > 0):
+                    raise UsageError(f"{field} of a {name} must be positive (m); received {size!r}.")
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
+        """Return the body rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        points = {name: rotation @ np.asarray(getattr(self, name)) + translation for name in self._points}
+        return replace(self, **{name: tuple(point.tolist()) for name, point in points.items()})
+
+    def scaled(self, factor: float) -> Self:
+        """Return the body scaled about the origin."""
+        values = {name: getattr(self, name) for name in (*self._points, *self._sizes)}
+        grown = {name: np.multiply(value, factor).tolist() for name, value in values.items()}
+        return replace(self, **{name: tuple(v) if isinstance(v, list) else v for name, v in grown.items()})
+
+
+@dataclass(frozen=True)
+class Sphere(_Primitive):
     """A ball."""
 
     centre: Vector
     radius: float
 
-    def __post_init__(self) -> None:
-        _check_size("sphere", radius=self.radius)
-        _check_vector("sphere", centre=self.centre)
+    _points = ("centre",)
 
     def bounds(self) -> NDArray[np.float64]:
         """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         return np.add(self.centre, [[-self.radius] * 3, [self.radius] * 3])
 
-    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Sphere:
-        """Return the ball rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
-        return Sphere(_placed(self.centre, rotation, translation), self.radius)
-
-    def scaled(self, factor: float) -> Sphere:
-        """Return the ball scaled about the origin."""
-        return Sphere(_scaled(self.centre, factor), self.radius * factor)
-
 
 @dataclass(frozen=True)
-class _Segment:
+class _Segment(_Primitive):
     """Base of capsules and cylinders: a radius around the segment from ``start`` to ``end``."""
 
     start: Vector
     end: Vector
     radius: float
 
+    _points = ("start", "end")
+
     def __post_init__(self) -> None:
-        name = type(self).__name__.lower()
-        _check_size(name, radius=self.radius)
-        _check_vector(name, start=self.start, end=self.end)
+        super().__post_init__()
         if tuple(self.start) == tuple(self.end):
+            name = type(self).__name__.lower()
             raise UsageError(f"start and end of a {name} are the same point {tuple(self.start)}; use a Sphere.")
-
-    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
-        """Return the part rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
-        start, end = (_placed(point, rotation, translation) for point in (self.start, self.end))
-        return type(self)(start, end, self.radius)
-
-    def scaled(self, factor: float) -> Self:
-        """Return the part scaled about the origin."""
-        return type(self)(_scaled(self.start, factor), _scaled(self.end, factor), self.radius * factor)
 
 
 class Capsule(_Segment):
@@ -165,17 +181,18 @@ class Cylinder(_Segment):
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(_Primitive):
     """A box of half edge lengths ``half_sizes`` turned by ``quaternion`` about its centre."""
 
     centre: Vector
     half_sizes: Vector
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
+    _points = ("centre",)
+    _sizes = ("half_sizes",)
+
     def __post_init__(self) -> None:
-        _check_vector("box", centre=self.centre, half_sizes=self.half_sizes)
-        for size in self.half_sizes:
-            _check_size("box", half_sizes=size)
+        super().__post_init__()
         length = math.sqrt(sum(value**2 for value in self.quaternion))
         if len(self.quaternion) != 4 or not math.isclose(length, 1, abs_tol=1e-6):
             raise UsageError(f"The quaternion of a box must have length 1; {self.quaternion} has length {length:g}.")
@@ -185,14 +202,10 @@ class Box:
         reach = np.abs(to_matrices(self.quaternion)) @ np.array(self.half_sizes)
         return np.stack([np.array(self.centre) - reach, np.array(self.centre) + reach])
 
-    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Box:
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
         """Return the box rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
         turned = tuple(from_matrices(rotation @ to_matrices(self.quaternion)).tolist())
-        return Box(_placed(self.centre, rotation, translation), self.half_sizes, turned)
-
-    def scaled(self, factor: float) -> Box:
-        """Return the box scaled about the origin."""
-        return replace(self, centre=_scaled(self.centre, factor), half_sizes=_scaled(self.half_sizes, factor))
+        return replace(super().moved(rotation, translation), quaternion=turned)
 
 
 Part = ConvexPart | Sphere | Capsule | Cylinder | Box
@@ -227,29 +240,3 @@ class Obstacle:
             raise UsageError("An obstacle needs at least one part or a surface.")
         if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
             raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
-
-
-def _halves(patch: NDArray[np.int64], middle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split a patch of triangles where its longest side is halved by number."""
-    order = np.argsort(middle[:, np.ptp(middle, axis=0).argmax()], kind="stable")
-    return patch[order[: len(order) // 2]], patch[order[len(order) // 2 :]]
-
-
-def _check_size(shape: str, **sizes: float) -> None:
-    for name, value in sizes.items():
-        if not (math.isfinite(value) and value > 0):
-            raise UsageError(f"{name} of a {shape} must be positive (m); received {value!r}.")
-
-
-def _check_vector(shape: str, **vectors: Vector) -> None:
-    for name, value in vectors.items():
-        if len(value) != 3 or not all(math.isfinite(item) for item in value):
-            raise UsageError(f"{name} of a {shape} must be three finite numbers (m); received {value!r}.")
-
-
-def _placed(point: Vector, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Any:
-    return tuple((rotation @ np.asarray(point) + translation).tolist())
-
-
-def _scaled(vector: Vector, factor: float) -> Any:
-    return tuple(float(value) * factor for value in vector)

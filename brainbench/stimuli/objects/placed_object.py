@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
-from brainbench.stimuli.objects.obstacle import Obstacle, Vector
+from brainbench.stimuli.objects.obstacle import Obstacle, RigidMotion, Vector
 from brainbench.stimuli.objects.solid import Solid
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.stimuli.objects.obstacle import RigidMotion
 
 
 @dataclass(frozen=True, eq=False)

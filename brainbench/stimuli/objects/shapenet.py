@@ -18,15 +18,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import read_json
 from brainbench.stimuli.objects.mesh_solids import mesh_solid
 from brainbench.stimuli.objects.solid import Solid
-
-if TYPE_CHECKING:
-    from brainbench.geometry import DecompositionSettings
 
 _LOG = logging.getLogger(__name__)
 
@@ -49,22 +46,14 @@ class ShapeNetModel:
     """Class label from the category map."""
     path: Path
 
-    def solid(
-        self,
-        *,
-        diagonal: float = 0.04,
-        collision: str = "hull",
-        decomposition: DecompositionSettings | None = None,
-    ) -> Solid:
-        """Load and repair the mesh; the arguments are those of
-        :func:`brainbench.stimuli.objects.mesh_solids.mesh_solid`.
+    def solid(self, *, diagonal: float = 0.04, **options: Any) -> Solid:
+        """Load and repair the mesh; ``options`` are those of :func:`brainbench.stimuli.objects.mesh_solids.mesh_solid`.
 
         Raises:
             DataError: the mesh cannot be used, for the reason in the message.
         """
         # The unit cannot matter: the diagonal is set.
-        loaded = mesh_solid(self.path, unit="m", diagonal=diagonal, collision=collision, decomposition=decomposition)
-        return replace(loaded, name=self.name)
+        return replace(mesh_solid(self.path, unit="m", diagonal=diagonal, **options), name=self.name)
 
 
 @dataclass(frozen=True)
@@ -93,18 +82,13 @@ class ShapeNet:
     @property
     def counts(self) -> dict[str, int]:
         """Number of models of each label."""
-        found = Counter(model.label for model in self.models)
-        return {label: found[label] for label in self.labels}
+        return dict(sorted(Counter(model.label for model in self.models).items()))
 
-    def solids(
-        self,
-        *,
-        diagonal: float = 0.04,
-        collision: str = "hull",
-        decomposition: DecompositionSettings | None = None,
-    ) -> dict[str, Callable[[], Solid]]:
-        """Return, by name, functions that load each model when it is needed, as sweeps take them."""
-        options = {"diagonal": diagonal, "collision": collision, "decomposition": decomposition}
+    def solids(self, **options: Any) -> dict[str, Callable[[], Solid]]:
+        """Return, by name, functions that load each model when it is needed, as sweeps take them.
+
+        ``options`` are those of :meth:`ShapeNetModel.solid`.
+        """
         return {model.name: functools.partial(model.solid, **options) for model in self.models}
 
 

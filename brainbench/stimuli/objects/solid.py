@@ -6,18 +6,15 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_plain
+from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.geometry import Mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Axes = Literal["world", "follicle"]
 """``world``: axes of the world. ``follicle``: the whisker's base frame, which turns with it: x along the whisker

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.motion import trajectories
-from brainbench.stimuli.motion.trajectories import ROTATIONS, Spin, Still, Translation, Whisking
+from brainbench.stimuli.motion.recorded import Recorded
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Spin, Still, Translation, Whisking
 from brainbench.stimuli.scenes.toml_tables import DEGREE, MILLI, Keys, TomlTable, choice, listed, number, text, vector
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.motion.recorded import Recorded
-    from brainbench.stimuli.motion.trajectories import Rotations
 
 Moving = TypeVar("Moving")
 

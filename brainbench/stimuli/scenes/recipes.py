@@ -8,7 +8,7 @@ import dataclasses
 import math
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, unknown_name
 
@@ -129,10 +129,12 @@ def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, wh
     whisking = Recorded(trajectory, start=_RECORDED_START)
 
     def enlarged(scene: Scene) -> Scene:
-        head = Head(_times(scale, scene.head.position), scene.head.rotation)
+        def far(place: tuple[float, ...]) -> Any:
+            return tuple(scale * value for value in place)
+
+        head = Head(far(scene.head.position), scene.head.rotation)
         objects = tuple(
-            PlacedObject(item.solid.scaled(scale), _times(scale, item.position), item.rotation)
-            for item in scene.objects
+            PlacedObject(item.solid.scaled(scale), far(item.position), item.rotation) for item in scene.objects
         )
         return dataclasses.replace(scene, array=array, objects=objects, whisking=whisking, head=head)
 
@@ -140,20 +142,13 @@ def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, wh
     return Recipe(RECORDED, describe_recipe(RECORDED), scenes)
 
 
-def _times(factor: float, vector: tuple[float, float, float]) -> tuple[float, float, float]:
-    x, y, z = vector
-    return factor * x, factor * y, factor * z
-
-
-def _scene_files() -> list[str]:
-    return [item.name.removesuffix(".toml") for item in _folder().iterdir() if item.name.endswith(".toml")]
-
-
-def _folder() -> Traversable:
-    return resources.files("brainbench.stimuli").joinpath("data", "recipes")
+def _scene_files() -> dict[str, Traversable]:
+    folder = resources.files("brainbench.stimuli").joinpath("data", "recipes")
+    return {item.name.removesuffix(".toml"): item for item in folder.iterdir() if item.name.endswith(".toml")}
 
 
 def _file(name: str) -> Traversable:
-    if name not in _scene_files():
+    files = _scene_files()
+    if name not in files:
         raise unknown_name("stimulus recipe", name, list_recipes())
-    return _folder().joinpath(f"{name}.toml")
+    return files[name]

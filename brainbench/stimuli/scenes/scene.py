@@ -7,23 +7,20 @@ the mean base point, x right, y rostral, z dorsal), placed in the world by :clas
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.protocol import Job, base_rotation
+from brainbench.stimuli.motion.recorded import Recorded
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Vector, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray
 from brainbench.stimuli.whiskers.selection import match_whiskers
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.motion.recorded import Recorded
-    from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray
 
 
 @dataclass(frozen=True)

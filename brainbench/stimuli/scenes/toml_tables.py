@@ -55,12 +55,7 @@ class TomlTable:
         return {name: value for name, value in values.items() if value is not missing}
 
     def build(self, make: Callable[..., Built], keys: Keys, **others: Any) -> Built:
-        """Call ``make`` with the values of some keys; a parameter whose key is missing keeps its default.
-
-        Args:
-            make: a dataclass or a function.
-            keys: parameters that the table may set.
-            others: parameters that it does not set.
+        """Call ``make`` with the values of some keys, and ``others``; a parameter without its key keeps its default.
 
         Raises:
             UsageError: the key of a parameter without default is missing, or a value is of another kind.
@@ -77,11 +72,7 @@ class TomlTable:
         return TomlTable(f"[{key}]", self.take(key, mapping, {}))
 
     def finish(self) -> None:
-        """Refuse keys that nobody took.
-
-        Raises:
-            UsageError: there is one; the message has the nearest known key.
-        """
+        """Refuse keys that nobody took, with a :class:`UsageError` that has the nearest known key."""
         for key in self._rest:
             raise unknown_name(f"key of {self.name}", key, sorted(self._known))
 

@@ -9,19 +9,18 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, to_plain, write_json
+from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
-
-if TYPE_CHECKING:
-    from brainbench.core.progress import Progress
-    from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
+from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
 
 _LOG = logging.getLogger(__name__)
 
@@ -73,7 +72,7 @@ def generate(
         _clean(folder)
         missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
         _check_space(missing, folder)
-        report = _Report(missing, progress)
+        report = _reporter(sum(map(len, missing)), progress)
         if len(missing) < len(plan.shards):
             _LOG.info("%d of %d shards are there already", len(plan.shards) - len(missing), len(plan.shards))
         if scheduler is not None:
@@ -86,30 +85,24 @@ def generate(
     return manifest
 
 
-class _Report:
-    """Tells how far the run is: to a progress bar, and to the log every half minute with the time that remains."""
+def _reporter(total: int, progress: Progress | None) -> Callable[[int], None]:
+    """Return what tells how far the run is: a progress bar, and the log every half minute with the time left."""
+    done, started = 0, time.monotonic()
+    told = started
 
-    def __init__(self, missing: Sequence[ShardTask], progress: Progress | None) -> None:
-        self.total = sum(map(len, missing))
-        self.done = 0
-        self._progress = progress
-        self._started = self._told = time.monotonic()
-
-    def __call__(self, sweeps: int) -> None:
-        self.done += sweeps
-        if self._progress is not None:
-            self._progress(self.done, self.total, "simulating sweeps")
+    def report(sweeps: int) -> None:
+        nonlocal done, told
+        done += sweeps
+        if progress is not None:
+            progress(done, total, "simulating sweeps")
         now = time.monotonic()
-        if now - self._told >= 30 or self.done == self.total:
-            self._told = now
-            rate = self.done / max(now - self._started, 1e-9)
-            rest = (self.total - self.done) / rate
-            _LOG.info("%d of %d sweeps, %.3g sweeps/s, about %s left", self.done, self.total, rate, _duration(rest))
+        if now - told >= 30 or done == total:
+            told = now
+            rate = done / max(now - started, 1e-9)
+            rest = timedelta(seconds=round((total - done) / rate))
+            _LOG.info("%d of %d sweeps, %.3g sweeps/s, about %s left", done, total, rate, rest)
 
-
-def _duration(seconds: float) -> str:
-    hours, minutes = divmod(round(seconds / 60), 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min" if seconds >= 60 else f"{seconds:.0f} s"
+    return report
 
 
 @contextlib.contextmanager
@@ -169,10 +162,6 @@ def _check_space(missing: Sequence[ShardTask], folder: Path) -> None:
     free = shutil.disk_usage(folder).free
     if needed + _SPARE > free:
         raise DataError(
-            f"The {sum(map(len, missing)):,} sweeps still to be made take {_size(needed)} and {str(folder)!r} has "
-            f"{_size(free)} free; choose another folder, fewer sweeps (--sample, --limit) or fewer whiskers."
+            f"The {sum(map(len, missing)):,} sweeps still to be made take {needed / 1e6:,.0f} MB and {str(folder)!r} "
+            f"has {free / 1e6:,.0f} MB free; choose another folder, fewer sweeps (--sample, --limit) or fewer whiskers."
         )
-
-
-def _size(count: float) -> str:
-    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"

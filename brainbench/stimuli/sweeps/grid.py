@@ -10,9 +10,10 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash
@@ -23,9 +24,6 @@ from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MOVERS = ("object", "head")
 PLACINGS = ("clear", "released")
@@ -184,11 +182,8 @@ class SweepGrid:
     ) -> Scene:
         """Return one sweep as a scene, ready for :func:`brainbench.stimuli.simulate`.
 
-        Args:
-            solid: the object, of any size; it is scaled about its origin to ``sweep.size``.
-            sweep: the conditions.
-            label: name of the scene; the object's name and the conditions when None.
-            array: the whiskers; the right side of the grid's species when None.
+        The solid is scaled about its origin to ``sweep.size``. The label is the object's name and the conditions when
+        None, the array the right side of the grid's species.
         """
         scaled = solid.to_diagonal(sweep.size)
         angles = (0.0, 0.0, sweep.rotation)

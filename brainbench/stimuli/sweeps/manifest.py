@@ -5,18 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash, provenance
+from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
 from brainbench.stimuli.sweeps.shards import UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
 
 MANIFEST = "manifest.json"
 
@@ -54,7 +52,10 @@ def make_manifest(plan: GenerationPlan, folder: str | os.PathLike[str]) -> dict[
     Raises:
         DataError: a shard is missing or damaged, or an object differs between shards.
     """
-    objects = _Objects(plan)
+    objects: dict[str, dict[str, Any]] = {
+        name: {"label": item.label, "source": item.source, "hash": None, "sweeps": {}}
+        for name, item in plan.objects.items()
+    }
     shards = [_read(Path(folder) / task.name, task, objects) for task in plan.shards]
     totals = {name: sum(shard[name] for shard in shards) for name in _COUNTS}
     about = provenance()
@@ -71,33 +72,12 @@ def make_manifest(plan: GenerationPlan, folder: str | os.PathLike[str]) -> dict[
         **totals,
         "splits": {split: _summary(item for item in shards if item["split"] == split) for split in SPLITS},
         "shards": shards,
-        "objects": objects.found,
+        "objects": objects,
     }
 
 
-class _Objects:
-    """Collects what the shards say of every object."""
-
-    def __init__(self, plan: GenerationPlan) -> None:
-        self.found: dict[str, dict[str, Any]] = {
-            name: {"label": item.label, "source": item.source, "hash": None, "sweeps": {}}
-            for name, item in plan.objects.items()
-        }
-
-    def add(self, name: str, digest: str, split: str, sweeps: int, reason: str) -> None:
-        entry = self.found[name]
-        if entry["hash"] not in (None, digest):
-            raise DataError(
-                f"The object {name!r} was not built alike in all shards (hashes {entry['hash']} and {digest}): its file"
-                " changed meanwhile, or machines differ; generate the data set again in an empty folder."
-            )
-        entry["hash"] = digest
-        entry["sweeps"][split] = entry["sweeps"].get(split, 0) + sweeps
-        if reason:
-            entry["unusable"] = reason
-
-
-def _read(path: Path, task: ShardTask, objects: _Objects) -> dict[str, Any]:
+def _read(path: Path, task: ShardTask, objects: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return what the manifest says of a shard, and add what the shard says to its ``objects``."""
     import h5py
 
     try:
@@ -112,18 +92,20 @@ def _read(path: Path, task: ShardTask, objects: _Objects) -> dict[str, Any]:
             f"The shard {str(path)!r} is missing or damaged ({error}); run the same command again."
         ) from error
     for index, item in enumerate(task.objects):
-        mine = np.flatnonzero(owner == index)
+        mine, entry = np.flatnonzero(owner == index), objects[item.name]
+        if entry["hash"] not in (None, hashes[index]):
+            raise DataError(
+                f"The object {item.name!r} was not built alike in all shards (hashes {entry['hash']} and "
+                f"{hashes[index]}): its file changed meanwhile, or machines differ; generate the data set again in an "
+                "empty folder."
+            )
+        entry["hash"] = hashes[index]
+        entry["sweeps"][task.split] = entry["sweeps"].get(task.split, 0) + len(mine)
         broken = mine[(status[mine] == UNUSABLE).any(axis=1)]
-        reason = reasons[broken[0]].decode() if len(broken) else ""
-        objects.add(item.name, hashes[index], task.split, len(mine), reason)
-    return {
-        "name": task.name,
-        "split": task.split,
-        "sweeps": len(task),
-        "bytes": path.stat().st_size,
-        "content_hash": digest,
-        **counts,
-    }
+        if len(broken) and (reason := reasons[broken[0]].decode()):
+            entry["unusable"] = reason
+    about = {"name": task.name, "split": task.split, "sweeps": len(task), "bytes": path.stat().st_size}
+    return {**about, "content_hash": digest, **counts}
 
 
 def _summary(shards: Iterable[dict[str, Any]]) -> dict[str, int]:

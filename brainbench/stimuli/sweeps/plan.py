@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
@@ -16,15 +17,10 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash, to_plain
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.objects.collections import NamedObject
+from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.split import SPLITS, SplitBy, split_objects, split_sweeps
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.objects.collections import NamedObject
-    from brainbench.stimuli.sweeps.grid import SweepGrid
-    from brainbench.stimuli.whiskers.array import WhiskerArray
 
 SHARD_SIZES = {"mujoco": 32, "bullet": 8}
 """Sweeps per shard of slow backends, so that a kill costs minutes at most."""

@@ -11,15 +11,14 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.devices import usable_processors
 from brainbench.core.errors import DataError, UsageError, missing_dependency
+from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.shards import PreparedShard, make_shard, prepare_shard, simulate_shard, write_shard
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.plan import ShardTask
 
 Done = Callable[[int], None]
 """Called with the number of sweeps of a shard that is written."""
@@ -151,15 +150,11 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
 def _built_ahead(
     tasks: Sequence[ShardTask], builders: ProcessPoolExecutor, ahead: int
 ) -> Iterator[tuple[ShardTask, PreparedShard]]:
-    coming: deque[tuple[ShardTask, Future[PreparedShard]]] = deque()
+    coming: deque[Future[PreparedShard]] = deque()
+    waiting = iter(tasks)
     for task in tasks:
-        coming.append((task, builders.submit(prepare_shard, task)))
-        if len(coming) > ahead:
-            first, future = coming.popleft()
-            yield first, future.result()
-    while coming:
-        first, future = coming.popleft()
-        yield first, future.result()
+        coming.extend(builders.submit(prepare_shard, later) for later in islice(waiting, ahead + 1 - len(coming)))
+        yield task, coming.popleft().result()
 
 
 def _pool(processes: int) -> ProcessPoolExecutor:

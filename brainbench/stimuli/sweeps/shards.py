@@ -9,23 +9,20 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.grid import Sweep
+from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.sweeps.plan import ShardTask
 
 OK, UNSTABLE, UNUSABLE = 0, 1, 2
 """Values of ``status``: fine; the simulation failed; the object could not be built."""
@@ -159,7 +156,6 @@ def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
 def _tables(task: ShardTask, hashes: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Return the names behind the numbers: times, whiskers, channels, classes and objects."""
     mounts = list(WhiskerArray.of(task.grid.species).select(task.whiskers))
-    number = {label: index for index, label in enumerate(task.classes)}
     return {
         "time": task.grid.frames.times,
         "whisker": _texts([mount.name for mount in mounts]),
@@ -168,9 +164,14 @@ def _tables(task: ShardTask, hashes: Sequence[str]) -> dict[str, NDArray[Any]]:
         "channel": _texts(CHANNELS),
         "class": _texts(task.classes),
         "object": _texts([item.name for item in task.objects]),
-        "object_class": np.array([number[item.label] for item in task.objects], dtype=np.int32),
+        "object_class": _labels(task),
         "object_hash": _texts(hashes),
     }
+
+
+def _labels(task: ShardTask) -> NDArray[np.int32]:
+    """Return the number [object] of each object's class."""
+    return np.array([task.classes.index(item.label) for item in task.objects], dtype=np.int32)
 
 
 def _hash_solid(solid: Solid) -> str:
@@ -188,8 +189,7 @@ def _conditions(task: ShardTask) -> dict[str, NDArray[Any]]:
     for owner, item in enumerate(task.objects):
         every = task.grid.sweeps(item.name)
         sweeps += [every[within] for within in task.within[task.owner == owner].tolist()]
-    number = {label: index for index, label in enumerate(task.classes)}
-    labels = np.array([number[item.label] for item in task.objects], dtype=np.int32)
+    labels = _labels(task)
     kinds = {name: np.int32 if name == "draw" else np.float64 for name in _CONDITIONS}
     return {
         "sweep": task.index.astype(np.int64),

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.simulation import simulate_uncached
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import WhiskerEngine
-    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 _TOGETHER = 16
 """Sweeps whose scenes exist at the same time: bounds the memory of a batch."""
@@ -34,14 +31,9 @@ def simulate_sweeps(
     """Simulate some sweeps, many at once where the engine can (:attr:`WhiskerEngine.batches`).
 
     Args:
-        scenes: a grid of sweeps over some objects.
-        indices: which of its scenes; neighbours share their object, so order by object is fastest.
-        fidelity: how finely.
-        backend: name of the physics engine.
-        device: ``cpu`` or ``cuda``.
-        workers: threads on the CPU; when None the engine chooses.
-        retry: divides the time step for whiskers that cannot be trusted, which are then simulated again, and twice as
-            much for those that cannot be trusted even then; 1 leaves them. Only ``rod`` does this.
+        scenes, indices: a grid of sweeps over some objects, and which of them; ordered by object they are fastest.
+        fidelity, workers: as for :meth:`WhiskerEngine.run_sweeps`.
+        backend, device, retry: as for :func:`brainbench.stimuli.engines.get_engine`.
 
     Raises:
         UsageError: the backend is unknown or does not run on the device.

@@ -7,8 +7,9 @@ scene is asked for: 9981 objects × 208 sweeps are a few numbers and a list of n
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, cast, overload
+from typing import Any, overload
 
 import numpy as np
 
@@ -36,28 +37,17 @@ class SweepScenes(Sequence[Scene]):
         whiskers: str = "all",
     ) -> None:
         """Take ``objects`` as solids, or as a mapping from names to solids or to functions that load them."""
-        named: dict[str, Solid | Callable[[], Solid]]
-        if isinstance(objects, Mapping):
-            named = dict(cast("Mapping[str, Solid | Callable[[], Solid]]", objects))
-        else:
-            solids = list(objects)
-            names = [solid.name for solid in solids]
-            if len(set(names)) < len(names):
-                twice = sorted({name for name in names if names.count(name) > 1})
-                raise UsageError(f"Several objects are called {listing(twice)}; give a mapping from names to objects.")
-            named = {solid.name: solid for solid in solids}
-        if not named:
+        pairs: list[Any] = list(objects.items()) if isinstance(objects, Mapping) else [(o.name, o) for o in objects]
+        self._objects: dict[str, Solid | Callable[[], Solid]] = dict(pairs)
+        if twice := [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]:
+            raise UsageError(f"Several objects are called {listing(twice)}; give a mapping from names to objects.")
+        if not pairs:
             raise UsageError("Sweeps need at least one object to move past the whiskers.")
         self.grid = grid
         self.array = WhiskerArray.of(grid.species).select(whiskers)
-        self._objects = named
-        self._names = tuple(self._objects)
-        self._last: tuple[str, Solid] | None = None
-
-    @property
-    def objects(self) -> tuple[str, ...]:
+        self.objects = tuple(self._objects)
         """Names of the objects."""
-        return self._names
+        self._last: tuple[str, Solid] | None = None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -66,12 +56,12 @@ class SweepScenes(Sequence[Scene]):
 
     def enumerate(self) -> Iterator[tuple[str, Sweep]]:
         """Yield (object name, sweep) in the order of the scenes, without loading or building anything."""
-        for name in self._names:
+        for name in self.objects:
             for sweep in self.grid.sweeps(name):
                 yield name, sweep
 
     def __len__(self) -> int:
-        return len(self._names) * self.grid.count
+        return len(self.objects) * self.grid.count
 
     @overload
     def __getitem__(self, index: int) -> Scene: ...
@@ -82,12 +72,12 @@ class SweepScenes(Sequence[Scene]):
         if isinstance(index, slice):
             return tuple(self[i] for i in range(*index.indices(len(self))))
         which, within = divmod(range(len(self))[index], self.grid.count)
-        name = self._names[which]
+        name = self.objects[which]
         sweep = self.grid.sweeps(name)[within]
         return self.grid.scene(self.solid(name), sweep, label=f"{name}/{sweep.label}", array=self.array)
 
     def __repr__(self) -> str:
-        return f"SweepScenes({len(self._names)} objects × {self.grid.count} sweeps = {len(self)} scenes)"
+        return f"SweepScenes({len(self.objects)} objects × {self.grid.count} sweeps = {len(self)} scenes)"
 
     def solid(self, name: str) -> Solid:
         """Return one of the objects; neighbouring calls for the same object load it once."""
@@ -105,15 +95,14 @@ def counts(scenes: SweepScenes) -> dict[str, Any]:
 
     ``bytes`` is the size of all forces as float32 [scene, frame, whisker, channel].
     """
-    grid = scenes.grid
-    per_scene = grid.frames.count * len(scenes.array) * 6 * 4
+    grid, whiskers = scenes.grid, len(scenes.array)
     return {
         "objects": len(scenes.objects),
         "sweeps_per_object": grid.count,
         "scenes": len(scenes),
-        "whiskers": len(scenes.array),
+        "whiskers": whiskers,
         "draws": grid.draws,
-        "bytes": per_scene * len(scenes),
+        "bytes": len(scenes) * grid.frames.count * whiskers * 6 * 4,
         "published": grid.published,
     }
 

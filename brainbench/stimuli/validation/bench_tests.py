@@ -10,26 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace, WhiskerEngine
 from brainbench.stimuli.motion.trajectories import smooth_step
-from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle
+from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, RigidMotion
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
-    from brainbench.stimuli.objects.obstacle import RigidMotion
-    from brainbench.stimuli.whiskers.whisker import Whisker
-
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 _CLEARANCE = 1.2
 """Half width of a pulley's groove in base radii of the whisker."""

@@ -78,7 +78,18 @@ class WhiskerArray:
     def of(
         cls, species: str = "mouse", *, side: Side = "right", whiskers: str = "all", source: Source = "average"
     ) -> WhiskerArray:
-        """Return the array of one of :data:`SPECIES`; the arguments are those of :meth:`mouse` and :meth:`rat`."""
+        """Return the array of one of :data:`SPECIES`.
+
+        Args:
+            species: ``mouse`` or ``rat``.
+            side: ``right`` (published), ``left`` (its exact mirror image) or ``both``.
+            whiskers: a selection as :meth:`select` takes it.
+            source: ``average``, the measured means; or ``model``, the equations fitted to them, which give
+                arc length, curvature, base point and angles from row and column alone.
+
+        Raises:
+            UsageError: a name is unknown, or the model equations of the mouse are asked for.
+        """
         if species not in SPECIES:
             raise unknown_name("species", species, SPECIES)
         if source not in SOURCES:
@@ -96,29 +107,13 @@ class WhiskerArray:
     def mouse(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
         """Return the average mouse (Bresee et al. 2023): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E0–E5.
 
-        Args:
-            side: ``right`` (published), ``left`` (its exact mirror image) or ``both``.
-            whiskers: a selection as :meth:`select` takes it.
-            source: ``average``; there is no ``model`` of the mouse here.
-
-        Raises:
-            UsageError: a name is unknown, or the model equations of the mouse are asked for.
+        Arguments are those of :meth:`of`; there is no ``model`` of the mouse here.
         """
         return cls.of("mouse", side=side, whiskers=whiskers, source=source)
 
     @classmethod
     def rat(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:
-        """Return the rat (Belli et al. 2018): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E1–E6.
-
-        Args:
-            side: ``right`` (published), ``left`` (its exact mirror image) or ``both``.
-            whiskers: a selection as :meth:`select` takes it.
-            source: ``average``, the measured means; or ``model``, the equations fitted to them, which give
-                arc length, curvature, base point and angles from row and column alone.
-
-        Raises:
-            UsageError: a name is unknown.
-        """
+        """Return the rat (Belli et al. 2018): 30 whiskers a side, A0–A4, B0–B4, C0–C6, D0–D6, E1–E6; see :meth:`of`."""
         return cls.of("rat", side=side, whiskers=whiskers, source=source)
 
     def __iter__(self) -> Iterator[MountedWhisker]:
@@ -157,28 +152,19 @@ class WhiskerArray:
         return dataclasses.replace(self, mounts=mounts)
 
     def select(self, pattern: str = "all") -> WhiskerArray:
-        """Return the named whiskers, in the order of the array.
+        """Return the named whiskers, in the order of the array: ``all``, ``C2,D1``, ``C0-C3``, ``C*`` ….
 
-        Args:
-            pattern: ``all``, ``C2,D1``, ``C0-C3``, ``C*`` …; see
-            :func:`brainbench.stimuli.whiskers.selection.match_whiskers`.
-
-        Raises:
-            UsageError: a term names no whisker; the message has the nearest name.
+        Names and errors are those of :func:`brainbench.stimuli.whiskers.selection.match_whiskers`.
         """
         rows, cols = [mount.row for mount in self.mounts], [mount.col for mount in self.mounts]
         chosen = match_whiskers(pattern, self.names, rows, cols)
         return dataclasses.replace(self, mounts=tuple(self.mounts[index] for index in chosen))
 
     def replace(self, pattern: str = "all", **changes: Any) -> WhiskerArray:
-        """Return a copy in which the selected whiskers have other properties.
+        """Return a copy in which the whiskers that :meth:`select` names have other properties.
 
-        Args:
-            pattern: a selection as :meth:`select` takes it.
-            changes: fields of :class:`Whisker` (SI units), or ``position`` and ``angles``.
-
-        Raises:
-            UsageError: there is no such whisker or no such field.
+        ``changes`` are fields of :class:`Whisker` (SI units), or ``position`` and ``angles``; others are a
+        :class:`UsageError`.
         """
         own = {"position", "angles"}
         allowed = own | {field.name for field in dataclasses.fields(Whisker)}
@@ -204,14 +190,10 @@ class WhiskerArray:
 
 
 def published_whisker(arc_length: float, curvature: float, row: int, col: int, *, species: str = "rat") -> Whisker:
-    """Return a whisker with the published rules for its diameters and its material.
+    """Return a whisker with the published rules for its diameters and its material, those of one species.
 
-    Args:
-        arc_length: mm, as the published tables give it.
-        curvature: A of y = A x² in 1/mm, positive as published.
-        row: 0 for row A.
-        col: column number.
-        species: whose rules; those of ``mouse`` and ``rat`` have the same numbers.
+    ``arc_length`` (mm) and ``curvature`` (A of y = A x², 1/mm, positive) are as in the published tables, ``row`` is 0
+    for A.
     """
     table = _read(species)
     base, tip = _radii(arc_length, row, col, table["diameter"])

@@ -11,16 +11,12 @@ rest curve, so the whole intrinsic curvature survives any number of links. Lette
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 _STEEPEST = 1.4
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)

@@ -21,8 +21,7 @@ def match_whiskers(pattern: str, names: Sequence[str], rows: Sequence[int], cols
             (``*2``), or a range within a row or a column (``C0-C3``, ``A1-E1``; gaps are skipped).
             Case does not matter. In an array with both sides ``C2`` names both and ``RC2`` one.
         names: unique names, ``C2`` or with a side ``RC2``.
-        rows: grid row of each whisker, 0 for A.
-        cols: grid column of each whisker.
+        rows, cols: grid row (0 for A) and column of each whisker.
 
     Raises:
         UsageError: a term names no whisker (the message has the nearest name) or a range is no line.

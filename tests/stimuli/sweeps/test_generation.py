@@ -143,7 +143,7 @@ def test_the_remaining_time_is_logged(tmp_path, caplog):
     with caplog.at_level(logging.INFO, logger="brainbench.stimuli.sweeps.generation"):
         generate(small_plan(("brick:1",), limit=1), tmp_path / "set")
     assert "1 of 1 sweeps" in caplog.text
-    assert "sweeps/s, about 0 s left" in caplog.text
+    assert "sweeps/s, about 0:00:00 left" in caplog.text
 
 
 def test_no_workers_are_refused(tmp_path):

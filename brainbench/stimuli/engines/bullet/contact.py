@@ -43,14 +43,9 @@ def solve_contacts(
 ) -> tuple[NDArray[np.float64], bool]:
     """Find the forces [3m] that keep gaps open and obey Coulomb's law, and whether they were found.
 
-    At the end of the step row r has moved to ``free[r] + yielding[r] · f``. A normal row is a gap: it stays
-    ≥ 0, its force is ≥ 0 and acts only at 0. Tangent rows are slips: they are 0 while the tangential force
-    is at most μ times the normal one, which otherwise opposes the slip.
-
-    Args:
-        yielding: symmetric displacement per force [3m, 3m].
-        free: gaps and slips [3m] without contact forces.
-        friction: Coulomb coefficient of each contact [m].
+    At the end of the step row r has moved to ``free[r] + yielding[r] · f``, with the symmetric ``yielding`` [3m, 3m]. A
+    normal row is a gap: it stays ≥ 0, its force is ≥ 0 and acts only at 0. Tangent rows are slips: they are 0 while the
+    tangential force is at most ``friction`` [m] times the normal one, which otherwise opposes the slip.
     """
     force = np.zeros(len(free))
     for _ in range(MOST_SWEEPS // SWEEPS):

@@ -24,95 +24,64 @@ from __future__ import annotations
 
 import functools
 import math
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld, engine
 from brainbench.stimuli.engines.mujoco.drive import drive_scalars
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
-from brainbench.stimuli.engines.stepping import SteppedJob
-from brainbench.stimuli.engines.trust import (
-    LARGEST_BEND,
-    check_jobs,
-    strongest_force,
-    too_strong,
-)
+from brainbench.stimuli.engines.protocol import Trace, base_rotation
+from brainbench.stimuli.engines.reach import Reach
+from brainbench.stimuli.engines.stepping import SteppedEngine, SteppedJob
+from brainbench.stimuli.engines.trust import state_fault
 from brainbench.stimuli.engines.units import MICRO, MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, Progress
-    from brainbench.stimuli.engines.reach import Reach
 
 SEARCH = 0.02
 """Distance (mm), beside the way that the whisker may move in the step, within which contacts are sought."""
 
 
 @dataclass(frozen=True)
-class BulletEngine(WhiskerEngine):
-    """Runs whisker jobs in PyBullet, one after the other: PyBullet holds Python's interpreter lock."""
+class BulletEngine(SteppedEngine):
+    """Runs whisker jobs in PyBullet, one after the other: PyBullet holds Python's interpreter lock.
+
+    Raises:
+        UsageError: a whisker has more links than PyBullet can move.
+    """
 
     name = "bullet"
     package = "pybullet"
+    threads = 1
 
-    def run(
-        self,
-        jobs: Sequence[Job],
-        fidelity: Fidelity,
-        *,
-        progress: Progress | None = None,
-        workers: int | None = None,
-        record_shape: bool = False,
-    ) -> list[Trace]:
-        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`.
+    def session(self) -> AbstractContextManager[None]:
+        """See :meth:`SteppedEngine.session`."""
+        return nullcontext(engine())
 
-        ``workers`` changes nothing.
-
-        Raises:
-            MissingDependencyError: PyBullet is not installed.
-            UsageError: a whisker has more links than PyBullet can move, or as stated there.
-        """
-        engine()
-        check_jobs(self, jobs, fidelity, workers)
-        traces = []
-        for job in jobs:
-            traces.append(_simulate(SteppedJob(job, fidelity, record_shape)))
-            if progress is not None:
-                progress(len(traces), len(jobs))
-        return traces
-
-
-def _simulate(stepped: SteppedJob) -> Trace:
-    job = stepped.job
-    world = BulletWorld(stepped.chain, stepped.reach.obstacles, stepped.reach.nearest, np.asarray(job.gravity, float))
-    if stepped.is_silent:
-        return stepped.silent_trace()
-    shown = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []
-    with world:
-        run = _Run(stepped, world, frozenset(shown))
-        run.integrate()
-    failed, reason = stepped.end(run.failed, run.reason)
-    frames = stepped.frames(failed)
-    wrench = (1 - frames.share) * run.wrench[frames.before] + frames.share * run.wrench[frames.after]
-    nearest = frames.nearest
-    return stepped.trace(
-        frames,
-        wrench,
-        np.isfinite(run.arc[nearest]),
-        run.arc[nearest],
-        np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI if stepped.record_shape else np.zeros(0),
-        penetration=run.penetration / MILLI,
-        reason=reason,
-        steps=min(failed, run.steps),
-    )
+    def simulate(self, stepped: SteppedJob) -> Trace:
+        """See :meth:`SteppedEngine.simulate`."""
+        gravity = np.asarray(stepped.job.gravity, float)
+        shown = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []
+        with BulletWorld(stepped.chain, stepped.reach.obstacles, stepped.reach.nearest, gravity) as world:
+            run = _Run(stepped, world, frozenset(shown))
+            run.integrate()
+        failed, reason = stepped.end(run.failed, run.reason)
+        frames = stepped.frames(failed)
+        wrench = (1 - frames.share) * run.wrench[frames.before] + frames.share * run.wrench[frames.after]
+        nearest = frames.nearest
+        return stepped.trace(
+            frames,
+            wrench,
+            np.isfinite(run.arc[nearest]),
+            run.arc[nearest],
+            np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI if stepped.record_shape else np.zeros(0),
+            penetration=run.penetration / MILLI,
+            reason=reason,
+            steps=min(failed, run.steps),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +143,7 @@ class _Run:
                 self.shapes[n] = self.world.shape()
             problem = self._advance(n)
             if problem:
-                self.failed, self.reason = n, f"{problem} at {self.times[n]:.6g} s"
+                self.failed, self.reason = n, f"at {self.times[n]:.6g} s {problem}"
                 return
 
     def _advance(self, n: int) -> str:
@@ -190,11 +159,8 @@ class _Run:
         system = hinged + np.diag(h * self.damping + h * h * self.stiffness)
         forces = forces - self._loads(n, q)
         impulse = hinged @ self.rates - h * (forces[FOLLICLE:] + self.stiffness * self.hinges)
-        rows = None
         solved = True
-        if world.parts:
-            free = _solve(system, impulse)
-            rows = self._rows(n, h * free)
+        rows = self._rows(n, h * _solve(system, impulse)) if world.parts else None
         if rows is None:
             after = _solve(system, impulse)
         else:
@@ -215,16 +181,7 @@ class _Run:
         self.hinges, self.rates = self.hinges + h * after, after
         if not solved:
             return "the contact forces could not be solved; choose a smaller time step"
-        if not (np.isfinite(self.hinges).all() and np.isfinite(self.wrench[n]).all()):
-            return "the state stopped being finite; choose a smaller time step"
-        bend = np.abs(self.hinges)
-        if bend.max() >= LARGEST_BEND:
-            return (
-                f"joint {int(bend.argmax()) // 2} bent by {bend.max():.2f} rad, more than a chain of links can "
-                "represent,"
-            )
-        strength, strongest = float(np.abs(self.wrench[n, :3]).max()), strongest_force(self.chain.whisker)
-        return too_strong(strength, strongest) if strength > strongest else ""
+        return state_fault(self.hinges, self.wrench[n], self.chain.whisker)
 
     def _loads(self, n: int, q: list[float]) -> NDArray[np.float64]:
         """Return the joint forces [6 + 2N] of the loads of the job at step n."""

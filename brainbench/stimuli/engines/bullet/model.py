@@ -8,24 +8,19 @@ prescribed; their reactions are the base wrench. Letters: n time step, N link.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import MissingDependencyError, UsageError, missing_dependency
 from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
 from brainbench.stimuli.engines.units import MICRO, MILLI
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.objects.obstacle import Obstacle, Part
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere
+from brainbench.stimuli.whiskers.chain import Chain
 
 FOLLICLE = 6
 """Joints of the follicle, which come first."""

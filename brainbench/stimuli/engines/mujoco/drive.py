@@ -9,12 +9,9 @@ the right velocity, to rounding. Units here are MuJoCo's (mm, ms). Letters: n ti
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 ARMATURE = 1e9
 """Inertia of a prescribed coordinate. Larger would cost the solver digits, smaller would let the whisker's

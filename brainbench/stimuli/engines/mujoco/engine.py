@@ -9,34 +9,20 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.core.devices import usable_processors
-from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE
 from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
-from brainbench.stimuli.engines.stepping import SteppedJob
-from brainbench.stimuli.engines.trust import (
-    LARGEST_BEND,
-    check_jobs,
-    strongest_force,
-    too_strong,
-)
+from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.engines.stepping import SteppedEngine, SteppedJob
+from brainbench.stimuli.engines.trust import LARGEST_BEND, state_fault, strongest_force
 from brainbench.stimuli.engines.units import MICRO, MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, Progress
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.chain import Chain
 
 logger = logging.getLogger(__name__)
 
@@ -45,70 +31,48 @@ CHUNK = 250
 
 
 @dataclass(frozen=True)
-class MujocoWhiskerEngine(WhiskerEngine):
+class MujocoWhiskerEngine(SteppedEngine):
     """Runs whisker jobs in MuJoCo."""
 
     name = "mujoco"
     package = "mujoco-core"
 
-    def run(
-        self,
-        jobs: Sequence[Job],
-        fidelity: Fidelity,
-        *,
-        progress: Progress | None = None,
-        workers: int | None = None,
-        record_shape: bool = False,
-    ) -> list[Trace]:
-        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`."""
-        check_jobs(self, jobs, fidelity, workers)
+    @contextlib.contextmanager
+    def session(self) -> Iterator[None]:
+        """Send MuJoCo's warnings to our log; by itself it prints them and writes MUJOCO_LOG.TXT."""
+        mujoco = engine()
+        before = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda message: logger.debug("MuJoCo: %s", message))
+        try:
+            yield
+        finally:
+            mujoco.set_mju_user_warning(before)
 
-        def run(group: Sequence[int]) -> dict[int, Trace]:
-            return {index: _simulate(SteppedJob(jobs[index], fidelity, record_shape)) for index in group}
-
-        groups = [[index] for index in range(len(jobs))]
-        with _quiet():
-            return run_groups(groups, run, threads=workers or usable_processors(), progress=progress)
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Send MuJoCo's warnings to our log; by itself it prints them and writes MUJOCO_LOG.TXT where the user works."""
-    mujoco = engine()
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: logger.debug("MuJoCo: %s", message))
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
-
-
-def _simulate(run: SteppedJob) -> Trace:
-    if run.is_silent:
-        return run.silent_trace()
-    job, chain = run.job, run.chain
-    built = build_model(job, chain, run.reach, run.step, run.times)
-    sensors, hinges, failed, reason = _integrate(built, job, chain.links, run.times)
-    failed, reason = run.end(failed, reason)
-    frames = run.frames(failed)
-    share, nearest = frames.share, frames.nearest
-    wrench = (1 - share) * _wrench(built, sensors, frames.before) + share * _wrench(built, sensors, frames.after)
-    shape = _shape(built, chain, hinges[nearest], nearest)
-    contact, arc = _contacts(sensors[nearest, 6:], shape, chain)
-    if run.record_shape:
-        # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
-        first, second = (_shape(built, chain, hinges[steps], steps) for steps in (frames.before, frames.after))
-        shape = (1 - share)[..., None] * first + share[..., None] * second
-    return run.trace(
-        frames,
-        wrench,
-        contact,
-        arc,
-        shape / MILLI,
-        penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
-        reason=reason,
-        steps=min(failed, len(sensors)),
-    )
+    def simulate(self, stepped: SteppedJob) -> Trace:
+        """See :meth:`SteppedEngine.simulate`."""
+        job, chain = stepped.job, stepped.chain
+        built = build_model(job, chain, stepped.reach, stepped.step, stepped.times)
+        sensors, hinges, failed, reason = _integrate(built, job, chain.links, stepped.times)
+        failed, reason = stepped.end(failed, reason)
+        frames = stepped.frames(failed)
+        share, nearest = frames.share, frames.nearest
+        wrench = (1 - share) * _wrench(built, sensors, frames.before) + share * _wrench(built, sensors, frames.after)
+        shape = _shape(built, chain, hinges[nearest], nearest)
+        contact, arc = _contacts(sensors[nearest, 6:], shape, chain)
+        if stepped.record_shape:
+            # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
+            first, second = (_shape(built, chain, hinges[steps], steps) for steps in (frames.before, frames.after))
+            shape = (1 - share)[..., None] * first + share[..., None] * second
+        return stepped.trace(
+            frames,
+            wrench,
+            contact,
+            arc,
+            shape / MILLI,
+            penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
+            reason=reason,
+            steps=min(failed, len(sensors)),
+        )
 
 
 def _wrench(built: WhiskerModel, sensors: NDArray, steps: NDArray) -> NDArray[np.float64]:
@@ -170,7 +134,9 @@ def _integrate(
             bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window]) < LARGEST_BEND).all(axis=1)
             bad |= np.abs(read[0, :, :3]).max(axis=1) > strongest
             failed = first + (int(np.argmax(bad)) if bad.any() else 0)
-            return sensors, hinges, failed, _reason(job, hinges[failed], sensors[failed, :3], warned, times[failed])
+            fault = state_fault(hinges[failed], sensors[failed, :6] / MILLI, job.whisker)
+            fault = fault or f"MuJoCo warned of {', '.join(warned) or 'a non-finite sensor'}"
+            return sensors, hinges, failed, f"at {times[failed]:.6g} s {fault}"
         state = states[0, -1].copy()
     return sensors, hinges, steps, ""
 
@@ -259,17 +225,3 @@ def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Ch
         overlap = np.where(found[..., 0] > 0, built.margins[link] - found[..., 4], 0.0)
         deepest = max(deepest, float(overlap.max(initial=0.0)))
     return deepest / MILLI
-
-
-def _reason(job: Job, hinges: NDArray, force: NDArray, warned: list[str], moment: float) -> str:
-    where = f"at {moment:.6g} s"
-    if not np.isfinite(hinges).all():
-        return f"the state stopped being finite {where}; choose a smaller time step"
-    bend = float(np.abs(hinges).max())
-    if bend >= LARGEST_BEND:
-        joint = int(np.abs(hinges).argmax()) // 2
-        return f"joint {joint} bent by {bend:.2f} rad {where}, more than a chain of links can represent"
-    strength, strongest = float(np.abs(force).max()) / MILLI, strongest_force(job.whisker)
-    if strength > strongest:
-        return f"{where} {too_strong(strength, strongest)}"
-    return f"MuJoCo warned of {', '.join(warned) or 'a non-finite sensor'} {where}"

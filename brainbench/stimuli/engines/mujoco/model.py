@@ -7,33 +7,26 @@ world → only the follicle joints that move → base, which carries the force a
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import MissingDependencyError
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE, PrescribedMotion, drive_free, drive_scalars
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.engines.protocol import Job, base_rotation
+from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
 from brainbench.stimuli.engines.trust import step_travel
 from brainbench.stimuli.engines.units import MICRO, MILLI
-from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Sphere
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from xml.etree.ElementTree import Element
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.protocol import Job
-    from brainbench.stimuli.engines.reach import Reach
-    from brainbench.stimuli.objects.obstacle import Obstacle, Part
-    from brainbench.stimuli.whiskers.chain import Chain
-
+from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Obstacle, Part, Sphere
+from brainbench.stimuli.whiskers.chain import Chain
 
 SLOTS = 6
 """Contacts reported per step, strongest first; any further ones act but are not reported."""

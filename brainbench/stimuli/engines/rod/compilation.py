@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.devices import warp
 from brainbench.stimuli.engines.rod.limits import MESHES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def load_kernels(
@@ -26,13 +24,9 @@ def load_kernels(
     On a processor one kernel serves whatever there is to touch: what a scene does not use costs it nothing there, while
     every further kernel would cost its compilation. Threads may ask at once; each kernel is compiled once.
 
-    Args:
-        device: a Warp device.
-        real: ``warp.float32`` or ``warp.float64``.
-        capacity: links that fit.
-        needs: what there is to touch (:func:`brainbench.stimuli.engines.rod.kernels.build_kernels`); for a GPU only.
-        compiling: called with True before compiling and with False after it; not at all for kernels that Warp has kept.
-        **options: further arguments of ``build_kernels``; of them a processor knows ``sliced``.
+    ``compiling`` is called with True before compiling and with False after it, not at all for kernels that Warp has
+    kept. Everything else is as for :func:`brainbench.stimuli.engines.rod.kernels.build_kernels`; of ``options`` a
+    processor knows ``sliced`` alone.
     """
     from brainbench.stimuli.engines.rod.kernels import BUILDING, build_kernels
 
@@ -46,13 +40,9 @@ def load_kernels(
     block = 1 if device.is_cpu else None
     with kernels.loading:
         module = kernels.run.module
-        tell = compiling if compiling is not None and not _kept(module, block) else lambda begins: None
+        kept = Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()
+        tell = (lambda begins: None) if kept or compiling is None else compiling
         tell(True)
         module.load(device, block_dim=block)
         tell(False)
     return kernels
-
-
-def _kept(module: Any, block: int | None) -> bool:
-    """Return True when Warp has compiled a module before."""
-    return Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()

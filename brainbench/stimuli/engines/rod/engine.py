@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device, usable_processors
+from brainbench.core.progress import Progress as NamedProgress
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
+from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
@@ -20,20 +24,11 @@ from brainbench.stimuli.engines.rod.limits import WIDEST
 from brainbench.stimuli.engines.rod.packing import KNOT, PackedJobs, PackedMotions, capacity_for, follicle_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.stepping import is_silent, silent_trace
+from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
 from brainbench.stimuli.engines.units import MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress as NamedProgress
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.protocol import Job, Progress
-    from brainbench.stimuli.engines.sweep_batch import SweepBatch
-    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.whiskers.chain import Chain
 
 SLICE = 65_536
 """Whiskers of one launch on a GPU: bounds the memory of a run."""
@@ -61,26 +56,15 @@ class RodEngine(WhiskerEngine):
     batches = True
 
     def prepare(self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None) -> None:
-        """Load the kernels for whiskers of these arc lengths [m]; all that this machine has not compiled yet at once.
-
-        :meth:`run` does so itself. Called in a thread some time before, the compiler works beside everything else.
-
-        Args:
-            lengths: arc lengths of the whiskers [m].
-            fidelity: as for :meth:`run`.
-            progress: called as ``progress(done, total, what)`` when something must be compiled.
-        """
+        """Load the kernels for these arc lengths [m]; all that this machine has not compiled yet at once."""
         device = pick_device(self.device)
         if device.is_cuda:  # which kernels are needed depends on what there is to touch
             return
         sizes = sorted({capacity_for(fidelity.link_count(length)) for length in lengths})
 
         def load(capacity: int) -> None:
-            def tell(begins: bool) -> None:
-                if progress is not None:
-                    what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
-                    progress(0 if begins else 1, 1, what)
-
+            what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
+            tell = None if progress is None else lambda begins: progress(0 if begins else 1, 1, what)
             load_kernels(device, real_type(fidelity), capacity, compiling=tell)
 
         with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:
@@ -118,7 +102,7 @@ class RodEngine(WhiskerEngine):
     def run_sweeps(
         self, scenes: SweepScenes, indices: Sequence[int], fidelity: Fidelity, *, workers: int | None = None
     ) -> SweepBatch:
-        """Simulate sweeps; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`."""
+        """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`."""
         from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
         return SweepLauncher(scenes, fidelity, self.device).run(indices, self.retry, workers or 1)
@@ -128,16 +112,12 @@ class RodEngine(WhiskerEngine):
 class _Task:
     """A job that must be simulated."""
 
-    index: int
-    """Place among the jobs of the run."""
     job: Job
     reach: Reach
     times: NDArray[np.float64]
     """[n] s at which base and obstacles were looked at."""
-    position: NDArray[np.float64]
-    """[n, 3] base point at these times (m)."""
-    euler: NDArray[np.float64]
-    """[n, 3] angles of the base (rad)."""
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Base point [n, 3] (m) and angles [n, 3] (rad) at these times."""
 
 
 def _simulate(
@@ -148,7 +128,7 @@ def _simulate(
     stop = first.times[-1]
     # Base and obstacles are looked at about once per knot of their motion to find what is in reach.
     seen = np.linspace(first.start, stop, max(2, math.ceil((stop - first.start) / KNOT)))
-    tasks: list[_Task] = []
+    tasks: dict[int, _Task] = {}
     traces: dict[int, Trace] = {}
     for index, job in jobs.items():
         started = time.thread_time()
@@ -157,21 +137,20 @@ def _simulate(
         if is_silent(job, reach, position, euler):
             traces[index] = silent_trace(job, fidelity, record_shape, time.thread_time() - started)
         else:
-            tasks.append(_Task(index, job, reach, seen, position, euler))
+            tasks[index] = _Task(job, reach, seen, (position, euler))
     if not tasks:
         return traces
-    seconds = np.zeros(len(tasks))
+    given, seconds = list(tasks.values()), np.zeros(len(tasks))
 
     def launch(which: NDArray[np.bool_] | None, finer: int) -> LaunchResult:
-        rows = np.arange(len(tasks)) if which is None else np.flatnonzero(which[:, 0])
-        result, spent = _launch([tasks[row] for row in rows], fidelity, device, record_shape, finer)
+        rows = np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0])
+        result, spent = _launch([given[row] for row in rows], fidelity, device, record_shape, finer)
         seconds[rows] += spent / len(rows)
         return result
 
     result = run_with_retries(launch, retry)
-    for row, task in enumerate(tasks):
-        traces[task.index] = _trace(result, row, task.job, fidelity, seconds[row])
-    return traces
+    found = (_trace(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
+    return traces | dict(zip(tasks, found, strict=True))
 
 
 def _launch(
@@ -203,9 +182,7 @@ def _launch(
     paused = time.thread_time()
     solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs)
     started += time.thread_time() - paused
-    fast = np.array(
-        [_too_fast(task, float(solver.shortest[which])) for task, which in zip(tasks, whisker, strict=True)]
-    )
+    fast = np.array([_too_fast(task, solver.shortest[which]) for task, which in zip(tasks, whisker, strict=True)])
     result = solver.launch(
         packed,
         motions,
@@ -230,7 +207,7 @@ def _too_fast(task: _Task, shortest: float) -> tuple[float, float]:
     share = np.divide(shortest, spans, out=np.zeros_like(spans), where=spans > 0)
     for obstacle in task.reach.obstacles:
         # Ways between knots, scaled to the shortest step that a retry may take.
-        travel = step_travel(task.job.whisker, task.position, task.euler, obstacle, task.times) * share
+        travel = step_travel(task.job.whisker, *task.pose, obstacle, task.times) * share
         if (travel > WIDEST / MILLI).any():
             first = int(np.argmax(travel > WIDEST / MILLI))
             return float(task.times[first]), float(travel[first])

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct, warp
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
-from brainbench.stimuli.engines.rod.packing import PackedChains, capacity_for
+from brainbench.stimuli.engines.rod.packing import PackedChains, PackedJobs, PackedMotions, capacity_for
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
+from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.trust import RunFacts, Verdict, judge, residual, strongest_force
 from brainbench.stimuli.engines.units import MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions
-    from brainbench.stimuli.engines.rod.shapes import PackedShapes
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.chain import Chain
 
 _NUMBERS = ("depth", "failed", "miss", "load")
 _COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
@@ -101,13 +96,10 @@ class WhiskerSolver:
         """Load kernels.
 
         Args:
-            chains: of the whiskers.
-            fidelity: time step, precision and solver.
-            device: a Warp device.
-            needs: what there is to touch; see :mod:`brainbench.stimuli.engines.rod.limits`.
+            chains, fidelity: whiskers, with their time step, precision and solver.
+            device, needs, options: as for :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
             block: threads of a block on a GPU; Warp's choice when None.
             sliced: True when whiskers pause for distances and contact forces (:class:`.scheduling.Slices`).
-            options: further ones of :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
         """
         self.chains, self.device, self.sliced = list(chains), device, sliced
         self.real = real_type(fidelity)
@@ -148,13 +140,10 @@ class WhiskerSolver:
         """Simulate jobs.
 
         Args:
-            jobs: what to simulate.
-            motions: of bases and objects.
-            shapes: of all scenes.
+            jobs, motions, shapes: what to simulate; motions are those of bases and objects, shapes those of all scenes.
             readings: times (s) at which results are read.
             size: rows and columns of the results; jobs that stand in none of them are as if at rest.
-            start: beginning of the simulation (s).
-            gravity: acceleration [3] (m/s²).
+            start, gravity: beginning of the simulation (s), acceleration [3] (m/s²).
             axes: rotation [3, 3] of the results; none when None.
             finer: divides the time steps.
             travel, fast_at: [row, column] as in :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.

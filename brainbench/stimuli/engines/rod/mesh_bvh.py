@@ -7,12 +7,8 @@ children of a node together.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 WIDE = 8
 """Children of a node, and triangles of a leaf."""

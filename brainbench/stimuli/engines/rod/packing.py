@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core import rotations
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.engines.protocol import Follicle, Load, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.units import MICRO, MILLI
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.protocol import Follicle, Load
-    from brainbench.stimuli.objects.obstacle import Obstacle
-    from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.objects.obstacle import Obstacle
+from brainbench.stimuli.whiskers.chain import Chain
 
 KNOT = 1e-3
 """Spacing of the knots of a motion (s); cubic pieces between them follow whisking at 20 Hz to 1e-7 of its way."""
 CAPACITIES = (12, 24, 48, 100)
 """Links for which kernels are compiled; a chain takes the smallest that holds it."""
+Pose = Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]]
+"""Times [n] (s) → places [n, 3] (m) and rotations [n, …] of a base or a body."""
 _SIDE = 1e-5
 """Distance (s) of the instants whose difference is a velocity."""
 
@@ -91,30 +87,19 @@ def still_knots(position: NDArray, quaternion: NDArray) -> NDArray[np.float64]:
 
 def follicle_knots(follicle: Follicle, start: float, stop: float) -> tuple[NDArray[np.float64], float]:
     """Return the knots [n, 16] of a follicle between two times (s), and their spacing (ms)."""
-
     times, spacing = _knot_times(start, stop)
     position, euler = (np.asarray(values, dtype=float) for values in follicle.pose(times))
     if np.ptp(position, axis=0).max() == 0 and np.ptp(euler, axis=0).max() == 0:
         return still_knots(position[0], rotations.from_matrices(base_rotation(euler[:1]))[0]), spacing
-    around = []
-    for side in (-_SIDE, 0.0, _SIDE):
-        place, angles = follicle.pose(np.maximum(times + side, 0.0) if start >= 0 else times + side)
-        around.append((np.asarray(place, dtype=float), base_rotation(np.asarray(angles, dtype=float))))
-    return _knots(around, times, start), spacing
+    return _knots(follicle.pose, base_rotation, times, start), spacing
 
 
 def body_knots(obstacle: Obstacle, start: float, stop: float) -> tuple[NDArray[np.float64], float]:
     """Return the knots [n, 16] of an obstacle between two times (s), and their spacing (ms)."""
-    from brainbench.core.rotations import to_matrices
-
     if obstacle.motion is None:
         return still_knots(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), KNOT * MILLI
     times, spacing = _knot_times(start, stop)
-    around = []
-    for side in (-_SIDE, 0.0, _SIDE):
-        place, turn = obstacle.motion(np.maximum(times + side, 0.0) if start >= 0 else times + side)
-        around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))))
-    knots = _knots(around, times, start)
+    knots = _knots(obstacle.motion, rotations.to_matrices, times, start)
     straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max(initial=0) < 1e-9 and not knots[:, 10:13].any()
     return (knots[:1], spacing) if straight else (knots, spacing)
 
@@ -125,8 +110,12 @@ def _knot_times(start: float, stop: float) -> tuple[NDArray[np.float64], float]:
     return np.asarray(start + KNOT * np.arange(count), dtype=np.float64), KNOT * MILLI
 
 
-def _knots(around: list[tuple[NDArray, NDArray]], times: NDArray[np.float64], start: float) -> NDArray[np.float64]:
-    """Return knots [n, 16] from places and rotations just before, at and just after the knot times."""
+def _knots(pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray, start: float) -> NDArray[np.float64]:
+    """Return knots [n, 16] of a pose from its places and rotations just before, at and just after the knot times."""
+    around = []
+    for side in (-_SIDE, 0.0, _SIDE):
+        place, turn = pose(np.maximum(times + side, 0.0) if start >= 0 else times + side)
+        around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))))
     (place0, turn0), (place, turn), (place1, turn1) = around
     # At the very start there may be no instant before: the difference is then one-sided.
     clipped = start >= 0

@@ -1,9 +1,8 @@
 """Whiskers in slices: on a GPU a whisker pauses where it needs distances from a mesh, which are found for all at once.
 
-Where one thread walks through a tree of triangles, or solves for the forces of eight contacts, 31 neighbours wait. Here
-every whisker takes steps until it needs to know what is near, or what its contacts do; further kernels answer all of
-these questions, one thread each and a group of threads each; then the whiskers go on, those with like answers side by
-side. Results do not depend on the slicing.
+Every whisker takes steps until it needs to know what is near, or what its contacts do; further kernels answer these
+questions (``kernels.scheduling`` says why); then the whiskers go on, those with like answers side by side. Results do
+not depend on the slicing.
 """
 
 from __future__ import annotations
@@ -73,9 +72,7 @@ class Slices:
     def run(self, inputs: list[Any], block: int) -> int:
         """Take all whiskers to their end; return the number of slices.
 
-        Args:
-            inputs: arguments of the kernel ``run`` but for the last.
-            block: threads of a block.
+        ``inputs`` are the arguments of the kernel ``run`` but for the last, ``block`` the threads of a block.
         """
         wp, slices, left = warp(), 0, self.lanes
         graph, fits = None, 0

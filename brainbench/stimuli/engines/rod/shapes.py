@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core import rotations
-from brainbench.stimuli.engines.rod.limits import (
-    BOX,
-    CAPSULE,
-    CYLINDER,
-    MESH,
-    MESHES,
-    NOTHING,
-    PRIMITIVES,
-    SPHERE,
-)
+from brainbench.geometry.mesh import hull_faces
+from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.mesh_bvh import spatial_order, tree_boxes
 from brainbench.stimuli.engines.rod.packing import PackedMotions, body_knots
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +79,12 @@ class PackedShapes:
     def add_placed(self, surface: PackedSurface, **columns: Any) -> None:
         """Append scenes of one shape each, all of the same surface.
 
-        Args:
-            surface: the surface.
-            columns: what the kernel's ``ShapeArrays`` hold that differs, [shape, …]; of all ``track``, ``turn``,
-                ``scale``, ``radius`` and ``speed``.
+        ``columns`` are what the kernel's ``ShapeArrays`` hold that differs, [shape, …]; of all ``track``, ``turn``,
+        ``scale``, ``radius`` and ``speed``.
         """
         count = len(columns["track"])
         still = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
-        alike = still | {"kind": MESH, "friction": -1.0} | self.add_mesh(surface)
+        alike = still | {"kind": limits.MESH, "friction": -1.0} | self.add_mesh(surface)
         self.columns.append({name: np.tile(value, (count, *[1] * np.ndim(value))) for name, value in alike.items()})
         self.columns[-1] |= columns
         self.first.extend(range(self.first[-1] + 1, self.first[-1] + count + 1))
@@ -107,25 +94,28 @@ class PackedShapes:
         row |= {"scale": 1.0, "face": 0, "faces": 0, "box": 0}
         match solid:
             case Sphere():
-                return row | {"kind": SPHERE, "size": np.full(3, solid.radius * MILLI), "place": _mm(solid.centre)}
+                return row | {
+                    "kind": limits.SPHERE,
+                    "size": np.full(3, solid.radius * MILLI),
+                    "place": _mm(solid.centre),
+                }
             case Box():
-                box = {"kind": BOX, "size": _mm(solid.half_sizes), "place": _mm(solid.centre)}
+                box = {"kind": limits.BOX, "size": _mm(solid.half_sizes), "place": _mm(solid.centre)}
                 return row | box | {"turn": np.array(solid.quaternion)}
             case Capsule() | Cylinder():
                 ends = _mm(solid.start), _mm(solid.end)
                 # Capsules and cylinders are kept by half length, middle and a turn from z, so that the kernel measures
                 # in their frame.
                 half = float(np.linalg.norm(ends[1] - ends[0])) / 2
-                kind = CAPSULE if isinstance(solid, Capsule) else CYLINDER
+                kind = limits.CAPSULE if isinstance(solid, Capsule) else limits.CYLINDER
                 size = np.array([solid.radius * MILLI, half, 0.0])
                 turn = rotations.from_z_axis((ends[1] - ends[0]) / (2 * half))
                 return row | {"kind": kind, "size": size, "place": (ends[0] + ends[1]) / 2, "turn": turn}
             case _:
                 if id(solid) not in self._known:
-                    mesh = isinstance(solid, TriangleMesh)
-                    vertices, faces = (solid.vertices, solid.faces) if mesh else hull_faces(solid)
-                    self._known[id(solid)] = self.add_mesh(PackedSurface.of(vertices * MILLI, faces))
-                return row | self._known[id(solid)] | {"kind": MESH}
+                    faces = solid.faces if isinstance(solid, TriangleMesh) else hull_faces(solid.vertices)
+                    self._known[id(solid)] = self.add_mesh(PackedSurface.of(solid.vertices * MILLI, faces))
+                return row | self._known[id(solid)] | {"kind": limits.MESH}
 
     def add_mesh(self, surface: PackedSurface) -> dict[str, int]:
         """Append a surface; return where its triangles and boxes are."""
@@ -138,7 +128,7 @@ class PackedShapes:
     @property
     def needs(self) -> int:
         """Kinds of shapes that the kernel must be able to touch."""
-        return MESHES if self.surfaces else PRIMITIVES if self.columns else NOTHING
+        return limits.MESHES if self.surfaces else limits.PRIMITIVES if self.columns else limits.NOTHING
 
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``ShapeArrays`` hold."""
@@ -150,36 +140,14 @@ class PackedShapes:
         boxes = np.concatenate([one.boxes for one in self.surfaces] or [np.zeros((1, 2, 3))])
         return {
             "first": np.array(self.first, dtype=np.int32),
-            "kind": column("kind", np.int32),
-            "size": column("size", float, (3,)),
-            "place": column("place", float, (3,)),
-            "turn": column("turn", float, (4,)),
-            "scale": column("scale", float),
-            "radius": column("radius", float),
-            "speed": column("speed", float),
-            "friction": column("friction", float),
-            "track": column("track", np.int32),
-            "face": column("face", np.int32),
-            "faces": column("faces", np.int32),
-            "box": column("box", np.int32),
+            **{name: column(name, np.int32) for name in ("kind", "track", "face", "faces", "box")},
+            **{name: column(name, float) for name in ("scale", "radius", "speed", "friction")},
+            **{name: column(name, float, (width,)) for name, width in (("size", 3), ("place", 3), ("turn", 4))},
             "low": boxes[:, 0],
             "high": boxes[:, 1],
             "corner": np.concatenate([one.corners for one in self.surfaces] or [np.zeros((1, 3, 3))]),
             "outward": np.concatenate([one.outward for one in self.surfaces] or [np.zeros((1, 7, 3))]),
         }
-
-
-def hull_faces(part: ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Return the vertices and outward faces of the convex hull of a part."""
-    from scipy.spatial import ConvexHull
-
-    hull = ConvexHull(part.vertices)
-    faces = hull.simplices.copy()
-    corners = part.vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return part.vertices, faces.astype(np.int32)
 
 
 def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:

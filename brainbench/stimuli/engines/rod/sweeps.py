@@ -9,15 +9,18 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix, from_matrices
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
@@ -26,13 +29,7 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.trust import run_with_retries
 from brainbench.stimuli.engines.units import MILLI
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.objects.obstacle import TriangleMesh
-    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 BLOCK = 64
 """Threads of one block on a GPU."""
@@ -73,7 +70,6 @@ class SweepLauncher:
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         self._objects: dict[str, tuple[float, PackedSurface]] = {}
-        self._turns: dict[float, NDArray[np.float64]] = {}
         angles = base_rotation([mount.angles for mount in mounts])
         turns = from_matrices(angles)
         self._bases = [still_knots(np.asarray(m.position), turn) for m, turn in zip(mounts, turns, strict=True)]
@@ -148,12 +144,7 @@ class SweepLauncher:
         return self._steps_in_full * sweeps
 
     def trusted(self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int) -> SweepBatch:
-        """Simulate sweeps, and whiskers that cannot be trusted again with finer steps.
-
-        Args:
-            objects: as for :meth:`launch`.
-            retry: as for :func:`brainbench.stimuli.engines.trust.run_with_retries`.
-        """
+        """Simulate sweeps as :meth:`launch` takes them, and whiskers that cannot be trusted again with finer steps."""
         flat = [(name, sweep) for name, sweeps in objects for sweep in sweeps]
 
         def launch(which: NDArray[np.bool_] | None, finer: int) -> LaunchResult:
@@ -166,13 +157,7 @@ class SweepLauncher:
         return self.batch(run_with_retries(launch, retry))
 
     def run(self, indices: Sequence[int], retry: int, workers: int) -> SweepBatch:
-        """Simulate sweeps of the grid; on a processor ``workers`` threads each take one object at a time.
-
-        Args:
-            indices: which; neighbours share their object.
-            retry: as for :meth:`trusted`.
-            workers: threads on a processor.
-        """
+        """Simulate sweeps of the grid; on a processor ``workers`` threads each take one object at a time."""
         limit = 4096 if self.device.is_cuda else 4
         groups: list[tuple[str, list[Any]]] = []
         for index in indices:
@@ -201,24 +186,15 @@ class SweepLauncher:
                         f"The object {solid.name!r} has no exact surface to sweep over; use the backend 'mujoco'."
                     )
                 new.append((name, solid.diagonal, solid.surface))
-
-        def order(surface: TriangleMesh) -> PackedSurface:
-            return PackedSurface.of(surface.vertices * MILLI, surface.faces)
-
         # Sorting leaves Python's lock alone. On a processor several launches are made side by side as it is.
         with ThreadPoolExecutor(min(8, os.cpu_count() or 1) if self.device.is_cuda else 1) as pool:
-            ordered = pool.map(order, [surface for *_, surface in new])
+            ordered = pool.map(lambda item: PackedSurface.of(item[2].vertices * MILLI, item[2].faces), new)
             made = {name: (diagonal, some) for (name, diagonal, _), some in zip(new, ordered, strict=True)}
         self._objects = {name: made[name] if name in made else known[name] for name in names}
         return {**known, **made}
 
     def _add(
-        self,
-        shapes: PackedShapes,
-        motions: PackedMotions,
-        diagonal: float,
-        surface: PackedSurface,
-        sweeps: Sequence[Any],
+        self, shapes: PackedShapes, motions: PackedMotions, diagonal: float, surface: PackedSurface, sweeps: Sequence
     ) -> None:
         """Append the scenes of one object's sweeps, expressed in the frame of the array.
 
@@ -226,7 +202,7 @@ class SweepLauncher:
         """
         grid, head = self.grid, self._head
         rotations = sorted({sweep.rotation for sweep in sweeps})
-        turns = np.array([self._turn(rotation) for rotation in rotations])
+        turns = np.array([_turn(rotation) for rotation in rotations])
         # Turned about z: how far it then reaches along x and y.
         x, y = surface.outline.T
         # The lowest corner of the outline's convex hull is that of the whole surface.
@@ -248,13 +224,11 @@ class SweepLauncher:
             knots[:, 3 + k] = -speed * head[1, k]
         knots[:, 6:10] = quaternion[which]
         still = np.tile([1.0, 0.0, 0.0, 0.0], (len(sweeps), 1))
-        radius = surface.radius * scale
-        shapes.add_placed(
-            surface, track=motions.add_straight(knots), turn=still, scale=scale, radius=radius, speed=speed
-        )
+        radius, track = surface.radius * scale, motions.add_straight(knots)
+        shapes.add_placed(surface, track=track, turn=still, scale=scale, radius=radius, speed=speed)
 
-    def _turn(self, rotation: float) -> NDArray[np.float64]:
-        """Return the matrix of a rotation about z; grids have few."""
-        if rotation not in self._turns:
-            self._turns[rotation] = euler_matrix((0.0, 0.0, rotation))
-        return self._turns[rotation]
+
+@cache
+def _turn(rotation: float) -> NDArray[np.float64]:
+    """Return the matrix of a rotation about z (rad); grids have few."""
+    return euler_matrix((0.0, 0.0, rotation))

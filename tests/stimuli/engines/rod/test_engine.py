@@ -12,7 +12,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
-from brainbench.stimuli.engines.rod import RodEngine
+from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, TriangleMesh
 from brainbench.stimuli.sweeps.grid import SweepGrid
@@ -125,7 +125,7 @@ def test_threads_that_start_side_by_side_on_a_fresh_machine_make_kernels_once(tm
     """A process of its own, with nothing compiled, whose threads take turns as often as they can."""
     code = (
         "import sys; sys.setswitchinterval(1e-6)\n"
-        "from brainbench.stimuli.engines.rod import RodEngine\n"
+        "from brainbench.stimuli.engines.rod.engine import RodEngine\n"
         "from tests.stimuli.engines.rod import test_engine as t\n"
         "job = t.Job(t.C2, t.StillFollicle(), (), t.np.array([2e-3]), gravity=(0.0, 0.0, -9.81))\n"
         "RodEngine().run([job] * 6, t.COARSE, workers=6)\n"
