@@ -61,18 +61,13 @@ class TemporalGraph(nn.Module):
 
     @classmethod
     def from_config(
-        cls,
-        source: Mapping[str, Any] | str | os.PathLike[str],
-        *,
-        input_shape: tuple[int, int, int] | None = None,
+        cls, source: Mapping[str, Any] | str | os.PathLike[str], *, input_shape: tuple[int, int, int] | None = None
     ) -> TemporalGraph:
         """Build a graph from PyTorchTNN's configuration: a mapping or the path of a JSON file.
 
-        Args:
-            source: The configuration.
-            input_shape: (C, H, W) that overrides the configuration's. PyTorchTNN's published files
-                declare shapes that its callers override, so without this argument the declared shape is
-                a default: :meth:`load_tnn_state` gives it up if the weights were made for another.
+        ``input_shape`` (C, H, W) overrides the configuration's. PyTorchTNN's published files declare shapes that its
+        callers override, so without this argument the declared shape is a default: :meth:`load_tnn_state` gives it up
+        if the weights were made for another.
 
         Raises:
             DataError: the file is missing or not JSON, or a key is missing or unsupported.
@@ -187,15 +182,8 @@ class TemporalGraph(nn.Module):
                 total += sum(m.weight.numel() for m in node.memory.modules() if isinstance(m, Conv2d)) * places
         return total
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> GraphState:
+    def init_state(self, batch: int) -> GraphState:
         """Return the state before the first step: silent nodes and empty memories, all zeros.
-
-        Args:
-            batch: B.
-            device: Of the state; by default that of the weights.
-            dtype: Of the state; by default that of the weights.
 
         Raises:
             UsageError: the shape of the stimulus is still open.
@@ -203,10 +191,9 @@ class TemporalGraph(nn.Module):
         if self._open_grid:
             raise UsageError("The stimulus shape is still open; pass input_shape to TemporalGraph.from_config.")
         like = next(self.parameters())
-        options = {"device": device or like.device, "dtype": dtype or like.dtype}
-        outputs = {name: torch.zeros(batch, *self.shapes[name], **options) for name in self.layers}
+        outputs = {name: like.new_zeros(batch, *self.shapes[name]) for name in self.layers}
         memories = {
-            name: node.memory.initial_state(batch, *self.memory_grid(name), **options)
+            name: node.memory.initial_state(batch, *self.memory_grid(name))
             for name, node in self.named_nodes()
             if node.memory is not None
         }

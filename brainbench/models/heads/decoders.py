@@ -66,12 +66,9 @@ class AllStepsDecoder(nn.Module):
         parts = torch.einsum("btf,otf->bto", features, weight.to(features.dtype))
         return self.rest(parts.cumsum(1) + self.first.bias)
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> tuple[torch.Tensor, int]:
+    def init_state(self, batch: int) -> tuple[torch.Tensor, int]:
         """Return the state before the first step: the first layer's sum [B, 1024] and the number of steps seen."""
-        like = self.first.weight
-        return torch.zeros(batch, 1024, device=device or like.device, dtype=dtype or like.dtype), 0
+        return self.first.weight.new_zeros(batch, 1024), 0
 
     def step(
         self, features: torch.Tensor, state: tuple[torch.Tensor, int]
