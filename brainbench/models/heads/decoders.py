@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear
+from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
 
 CLASSES = 117
 """Object categories of the whisking data set (Zhuang et al. 2017)."""
@@ -22,13 +22,7 @@ def linear_decoder(features: int, classes: int = CLASSES) -> nn.Module:
 
 def mlp_decoder(features: int, classes: int = CLASSES) -> nn.Module:
     """Return linear layers 1024, 512 and ``classes`` with ReLU between (1,110,133 parameters for 512 features)."""
-    return nn.Sequential(
-        Linear(features, 1024, gain=RECTIFIER_GAIN),
-        nn.ReLU(),
-        Linear(1024, 512, gain=RECTIFIER_GAIN),
-        nn.ReLU(),
-        Linear(512, classes),
-    )
+    return perceptron(features, 1024, 512, classes)
 
 
 class AllStepsDecoder(nn.Module):
@@ -38,11 +32,6 @@ class AllStepsDecoder(nn.Module):
     45 ms of touch (12,120,181 parameters for 512 features and 22 steps). Steps that have not come yet count
     as zeros, so the answer after every step is defined and a stream needs only the running sum of the first
     layer.
-
-    Args:
-        features: F.
-        classes: Number of outputs.
-        steps: Longest sweep.
     """
 
     def __init__(self, features: int, classes: int = CLASSES, *, steps: int = 22) -> None:
@@ -50,7 +39,7 @@ class AllStepsDecoder(nn.Module):
         self.steps = steps
         self.features = features
         self.first = Linear(steps * features, 1024, gain=RECTIFIER_GAIN)
-        self.rest = nn.Sequential(nn.ReLU(), Linear(1024, 512, gain=RECTIFIER_GAIN), nn.ReLU(), Linear(512, classes))
+        self.rest = nn.Sequential(nn.ReLU(), *perceptron(1024, 512, classes))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Return the answer [B, classes] after the last step of [B, T, F]."""

@@ -257,7 +257,7 @@ class _Run:
                 # The same views in every epoch, so that losses can be compared.
                 views = self._views(x, -1 - index)
                 if len(x) > 1:
-                    total, count = total + float(self.learner(views, labels)[0]), count + 1
+                    total, count = total + float(self.learner(views, labels)), count + 1
         mean = self.where.mean(total / max(count, 1))
         self.log.write("validation", self.at.step, loss=mean)
         return mean if math.isfinite(mean) else math.inf
