@@ -26,6 +26,7 @@ from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.graph.unrolling import UnrolledSweep, needed_steps
 from brainbench.models.ops.layers import Conv2d, Linear
 from brainbench.models.ops.parameters import check_named, copy_named
+from brainbench.models.parts import wanted
 
 _log = logging.getLogger(__name__)
 
@@ -256,21 +257,15 @@ class TemporalGraph(nn.Module):
         Only what the answer reads is computed and kept: steps whose effect comes too late are left out, and steps that
         the stimulus has not reached are computed for one stimulus and shared.
 
-        Args:
-            x: The sweep.
-            unroll: ``biological`` or ``full``.
-            return_activations: True for every node, or the names of the nodes wanted.
-            last: Return the output of the last step alone.
-
         Returns:
-            The outputs [B, T, ...] or, with ``last``, [B, ...]; with ``return_activations`` also
-            ``{node: [B, T, ...]}``.
+            The outputs [B, T, ...] or, with ``last``, those of the last step [B, ...]; with ``return_activations``
+            (True for every node, or names) also ``{node: [B, T, ...]}``.
 
         Raises:
             UsageError: the shape does not fit, or a node or unrolling does not exist.
         """
         check_unroll(unroll)
-        wanted = self._wanted(return_activations)
+        asked = self._wanted(return_activations)
         if x.ndim != 5 or x.shape[1] < 1:
             raise UsageError(
                 f"A temporal graph expects [batch, time, channels, rows, columns]; received {list(x.shape)}."
@@ -280,26 +275,24 @@ class TemporalGraph(nn.Module):
             # Tensor cores and norms over channels both want channels innermost.
             x = x.flatten(0, 1).to(memory_format=torch.channels_last).unflatten(0, x.shape[:2])
         output = self.spec.output
-        whole, final = (wanted, {output}) if last else (wanted | {output}, set())
+        whole, final = (asked, {output}) if last else (asked | {output}, set())
         steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
         kept = UnrolledSweep(self, x, unroll, steps).run(whole | final)
         y = kept[output][1]
         y = y[:, -1] if last else y
         if return_activations is False:
             return y
-        return y, {name: kept[name][1] for name in self.layers if name in wanted}
+        return y, {name: kept[name][1] for name in self.layers if name in asked}
 
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{node: [B, T, ...]}`` of the biological unrolling for the nodes asked for (all by default)."""
         return self(x, return_activations=True if layers is None else tuple(layers))[1]
 
-    def _wanted(self, return_activations: bool | Collection[str]) -> set[str]:
-        if isinstance(return_activations, bool):
-            return set(self.layers) if return_activations else set()
-        for name in return_activations:
-            if name not in self.layers:
-                raise unknown_name("node", name, self.layers)
-        return set(return_activations)
+    def _wanted(self, asked: bool | Collection[str]) -> set[str]:
+        names = set(wanted(self.layers, asked))
+        for name in names.difference(self.layers):
+            raise unknown_name("node", name, self.layers)
+        return names
 
     @property
     def draws_random(self) -> bool:

@@ -97,9 +97,9 @@ def test_validation_of_a_contrastive_run_mixes_the_classes(objective, mixed, tmp
     data, asked = tiny(), []
     batches = data.batches
 
-    def spy(split, **options):
-        asked.append((split, options["shuffle"]))
-        return batches(split, **options)
+    def spy(split, options):
+        asked.append((split, options.shuffle))
+        return batches(split, options)
 
     monkeypatch.setattr(data, "batches", spy)
     options = {"epochs": 1, "batch_size": 8, "probe_epochs": 0, "precision": "float32", "learning_rate": 1e-3}
