@@ -42,7 +42,7 @@ def first_gradient(name: str, objective: str, x: torch.Tensor, labels: torch.Ten
         if drawn:
             draw_silent_biases(model)
         learner = make_learner(objective, model.train())
-    loss, _ = learner((x, 1.1 * x)[: learner.views], labels)
+    loss = learner((x, 1.1 * x)[: learner.views], labels)
     loss.backward()
     return float(torch.stack([p.grad.norm() for p in model.parameters() if p.grad is not None]).norm())
 

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.models.recorded_optimizer import make_capturable
 from benchmarks.report import table, write_section
 from brainbench.core.cuda_graphs import record_step
 from brainbench.models.activations import evaluating
@@ -35,7 +36,6 @@ from brainbench.models.ops.packing import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
 from brainbench.models.training.gradients import compiled, fuse
-from brainbench.models.training.optimizers import make_capturable
 
 STEPS = 22
 

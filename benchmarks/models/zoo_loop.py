@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from recorded_optimizer import make_capturable, reset_optimizer
 from zoo_jobs import Job
 
 from brainbench.core.cuda_graphs import record_step
@@ -31,7 +32,7 @@ from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_c
 from brainbench.models.training.evaluation import evaluate, fit_probe
 from brainbench.models.training.gradients import copy_state, fuse
 from brainbench.models.training.objectives import make_learner
-from brainbench.models.training.optimizers import make_capturable, make_optimizer, rate_factor, reset_optimizer
+from brainbench.models.training.optimizers import make_optimizer, rate_factor
 from brainbench.models.training.run_folder import load_state, save_state
 from brainbench.models.training.trainer import draw_silent_biases
 
@@ -183,7 +184,7 @@ class Trainer:
         self.rate.copy_(self.rates.index_select(0, self.cursor)[0])
         self.optimizer.zero_grad(set_to_none=True)
         with self._autocast():
-            loss, _ = self.learner(self._views(x), labels)
+            loss = self.learner(self._views(x), labels)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip)
         self.bad.copy_(1 - torch.isfinite(norm).float())  # the optimiser leaves such a step out
@@ -201,7 +202,7 @@ class Trainer:
             if self.learner.supervised:
                 self.found.add_(((self.model(x).argmax(1) == labels).float() * weights).sum())
             else:
-                loss, _ = self.learner(self._views(x), labels)
+                loss = self.learner(self._views(x), labels)
                 self.found.add_(loss.float())
         self.checked.add_(1).remainder_(self.checks)
 

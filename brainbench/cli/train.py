@@ -12,10 +12,9 @@ from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 
 if TYPE_CHECKING:
-    import torch
-
     from brainbench.core.progress import Progress
     from brainbench.datasets import WhiskingDataset
+    from brainbench.models.training.batches import BatchOptions
     from brainbench.models.training.trainer import TrainingResult
 
 
@@ -51,36 +50,27 @@ def train(
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
     """
     from brainbench.core.errors import DataError, UsageError
-    from brainbench.models.training.config import TrainingConfig, read_options
-    from brainbench.models.training.search_space import SweepRun, best_run, sweep_runs
+    from brainbench.core.files import read_mapping
+    from brainbench.models.training.config import TrainingConfig
+    from brainbench.models.training.search_space import best_run, sweep_runs
     from brainbench.models.training.trainer import train as run
 
-    options = (read_options(config) if config is not None else {}) | options
+    options = (read_mapping(config) if config is not None else {}) | options
     if (named := options.pop("model", model)) != model:
         raise UsageError(f"The configuration is for the model {named!r} and the command names {model!r}.")
     wanted = options.pop("objective", "supervised")
     chosen = TrainingConfig.published(model, wanted, **options)
     where = out or Path("brainbench-training") / f"{model}.{wanted}"
-    runs = [SweepRun(chosen, where)]
+    runs = [(chosen, where)]
     if sweep is not None:
-        runs = sweep_runs(
-            chosen,
-            where,
-            job=(0, 1) if sweep == "all" else part_of(sweep, "--sweep takes 'all', or"),
-            warmup=wanted.endswith("-warmup"),
-        )
+        job = (0, 1) if sweep == "all" else part_of(sweep, "--sweep takes 'all', or")
+        runs = sweep_runs(chosen, where, job=job, warmup=wanted.endswith("-warmup"))
     source = SweepFolder(data)
     results: dict[str, TrainingResult] = {}
     with progress_bar() as progress:
-        for item in runs:
-            results[str(item.folder)] = run(
-                item.config,
-                source,
-                out=item.folder,
-                device=device,
-                stop_after=stop_after,
-                progress=_named(progress, item.folder.name) if sweep is not None else progress,
-            )
+        for item, folder in runs:
+            told = _named(progress, folder.name) if sweep is not None else progress
+            results[str(folder)] = run(item, source, out=folder, device=device, stop_after=stop_after, progress=told)
     if os.environ.get("RANK", "0") != "0":
         return
     columns = {
@@ -122,20 +112,12 @@ class SweepFolder:
 
         return WhiskingDataset(self.folder, split=split, **options)
 
-    def batches(
-        self,
-        split: str,
-        *,
-        batch_size: int,
-        shuffle: bool,
-        seed: int,
-        part: tuple[int, int],
-        device: torch.device,
-    ) -> Any:
+    def batches(self, split: str, options: BatchOptions) -> Any:
         """Return the batches of a split; None if it has no sweeps."""
         if not self.manifest["splits"].get(split, {}).get("sweeps"):
             return None
-        return self._open(split, batch_size=batch_size // part[1], shuffle=shuffle, seed=seed, part=part, device=device)
+        # The data set counts the sweeps of one process.
+        return self._open(split, **vars(options) | {"batch_size": options.batch_size // options.part[1]})
 
 
 def _named(progress: Progress, name: str) -> Progress:

@@ -14,7 +14,7 @@ import contextlib
 import gc
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
 from brainbench.core.devices import warp
@@ -188,8 +188,6 @@ def record_step(
     *,
     generators: Sequence[torch.Generator] = (),
     warm_up: int = WARM_UP,
-    together: Callable[[], AbstractContextManager[Any]] = nullcontext,
-    alone: Callable[[], AbstractContextManager[Any]] = nullcontext,
 ) -> Callable[[], Any]:
     """Run torch's work a few times and record it; return what repeats it. On the CPU that is ``work`` itself.
 
@@ -198,20 +196,14 @@ def record_step(
         device: Where it works.
         generators: Random numbers it draws, beside torch's own on the device.
         warm_up: Runs before the recording; what they change (weights, counters) stays changed.
-        together: Entered for these runs, and left before the recording.
-        alone: Entered for the recording, during which nothing else may use the device.
     """
-    cuda = device.type == "cuda"
-    with together():
-        with side_stream(device) if cuda else nullcontext() as side:
-            for _ in range(warm_up):
-                work()
-        if side is not None:
-            side.synchronize()
-    if not cuda:
+    with side_stream(device) if device.type == "cuda" else nullcontext() as side:
+        for _ in range(warm_up):
+            work()
+    if side is None:
         return work
-    with alone():
-        graph, _ = torch_recorder(generators)(work)
+    side.synchronize()
+    graph, _ = torch_recorder(generators)(work)
     return graph.replay
 
 

@@ -13,7 +13,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, DataFileNotFoundError
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
@@ -112,6 +112,30 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise DataError(f"There is no file {os.fspath(path)!r}.") from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DataError(f"{os.fspath(path)!r} is not valid JSON ({error}).") from error
+
+
+def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read names and values from a TOML or JSON file, which its ending tells apart.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it cannot be parsed or holds no mapping.
+    """
+    import tomllib
+
+    path = Path(path)
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
+    if path.suffix.lower() == ".json":
+        values = read_json(path)
+    else:
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise DataError(f"{str(path)!r} is not valid TOML ({error}).") from error
+    if not isinstance(values, dict):
+        raise DataError(f"{str(path)!r} holds a {type(values).__name__}, not names and values.")
+    return values
 
 
 def content_hash(*values: Any, length: int = 16) -> str:

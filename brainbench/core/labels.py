@@ -57,23 +57,18 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
 
     Raises:
         UsageError: the file is missing, of another kind, or holds something else.
+        DataError: it is no valid JSON or TOML.
     """
     import csv
-    import tomllib
 
-    from brainbench.core.files import read_json
+    from brainbench.core.files import read_mapping
 
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"There is no match file {str(path)!r}.")
     kind = path.suffix.lower()
-    if kind == ".json":
-        pairs = read_json(path)
-    elif kind == ".toml":
-        try:
-            pairs = tomllib.loads(path.read_text(encoding="utf-8"))
-        except tomllib.TOMLDecodeError as error:
-            raise UsageError(f"{str(path)!r} is not valid TOML ({error}).") from error
+    if kind in (".json", ".toml"):
+        pairs = read_mapping(path)
     elif kind == ".csv":
         with path.open(newline="", encoding="utf-8") as stream:
             rows = [row for row in csv.reader(stream) if row]
@@ -82,6 +77,6 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
         pairs = dict(rows)
     else:
         raise UsageError(f"A match file ends in .json, .toml or .csv; received {path.name!r}.")
-    if not isinstance(pairs, dict) or not all(isinstance(value, (str, type(None))) for value in pairs.values()):
+    if not all(isinstance(value, (str, type(None))) for value in pairs.values()):
         raise UsageError(f"{str(path)!r} must map recording labels to stimulus labels (text, or null to drop one).")
     return {str(key): value or None for key, value in pairs.items()}

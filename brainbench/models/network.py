@@ -198,15 +198,13 @@ class EncoderAttenderDecoder(nn.Module):
             decoder -= first - first // self.decoder.steps
         return self.encoder.multiply_adds() + attender + decoder
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> NetworkState:
+    def init_state(self, batch: int) -> NetworkState:
         """Return the state before the first step."""
         attender, decoder = self.attender, self.decoder
         return NetworkState(
-            self.encoder.init_state(batch, device=device, dtype=dtype),
-            attender.init_state(batch, device=device, dtype=dtype) if attender is not None else None,
-            decoder.init_state(batch, device=device, dtype=dtype) if isinstance(decoder, AllStepsDecoder) else None,
+            self.encoder.init_state(batch),
+            attender.init_state(batch) if attender is not None else None,
+            decoder.init_state(batch) if isinstance(decoder, AllStepsDecoder) else None,
         )
 
     def step(self, x: torch.Tensor, state: NetworkState) -> tuple[torch.Tensor, NetworkState]:

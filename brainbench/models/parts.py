@@ -30,10 +30,8 @@ class Part(Protocol):
         """Return the multiply-adds of matrix products and convolutions in the first step of one stimulus."""
         ...
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> Any:
-        """Return the state before the first step."""
+    def init_state(self, batch: int) -> Any:
+        """Return the state before the first step, on the device and in the precision of the weights."""
         ...
 
     def step(self, x: torch.Tensor, state: Any) -> tuple[torch.Tensor, Any]:

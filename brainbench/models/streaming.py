@@ -8,6 +8,7 @@ told, and differs between CUDA and the processor. Letters: B batch, S numbers of
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -20,6 +21,8 @@ from brainbench.models.attenders.mamba import MambaAttender, MambaMemory
 from brainbench.models.encoders.s4 import S4Encoder
 from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
+
+_Tensors = list[torch.Tensor]
 
 
 class StreamingStep(nn.Module):
@@ -43,9 +46,10 @@ class StreamingStep(nn.Module):
                 f"received {type(model).__name__}."
             )
         self.model = model
-        self.encoder = _encoder_part(model)
-        self.attender = _attender_part(model.attender)
-        self.shapes: tuple[tuple[int, ...], ...] = (*self.encoder.shapes, *self.attender.shapes) or ((1,),)
+        self.encoder = _part_of(model.encoder, model.unroll)
+        self.attender = None if model.attender is None else _part_of(model.attender, model.unroll)
+        attended = () if self.attender is None else self.attender.shapes
+        self.shapes: tuple[tuple[int, ...], ...] = (*self.encoder.shapes, *attended) or ((1,),)
         """Shape of each part of the state, per row."""
         self.state_size = sum(math.prod(shape) for shape in self.shapes)
         """S."""
@@ -62,9 +66,11 @@ class StreamingStep(nn.Module):
         innermost = h_in.is_cuda and not torch.compiler.is_exporting()
         parts = [_part(part, shape, innermost) for part, shape in zip(h_in.split(sizes, 1), self.shapes, strict=True)]
         count = len(self.encoder.shapes)
-        features, before = self.encoder(self.model.normaliser(obs), parts[:count])
-        features, after = self.attender(features, parts[count:])
-        kept = [*before, *after] or parts
+        features, kept = self.encoder(self.model.normaliser(obs), parts[:count])
+        if self.attender is not None:
+            features, after = self.attender(features, parts[count:])
+            kept = [*kept, *after]
+        kept = kept or parts
         return features, torch.cat([_flat(part, innermost) for part in kept], 1)
 
 
@@ -80,64 +86,51 @@ def _flat(part: torch.Tensor, innermost: bool) -> torch.Tensor:
     return (part.permute(0, 2, 3, 1) if innermost and part.ndim == 4 else part).flatten(1)
 
 
-class _Stateless(nn.Module):
-    """A part that passes its input on, or acts on each step alone."""
+class _Part(nn.Module):
+    """An encoder or attender whose state is packed into tensors that depend on what was seen, and unpacked again."""
 
-    shapes: tuple[tuple[int, ...], ...] = ()
-
-    def __init__(self, act: Any = None) -> None:
+    def __init__(
+        self, part: Any, pack: Callable[[Any], _Tensors], unpack: Callable[[_Tensors], Any], **how: Any
+    ) -> None:
         super().__init__()
-        self.act = act
-
-    def forward(self, x: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        del state
-        return (x if self.act is None else self.act.step(x, ())[0]), []
-
-
-class _GraphPart(nn.Module):
-    def __init__(self, graph: TemporalGraph, unroll: Any) -> None:
-        super().__init__()
-        self.graph, self.unroll = graph, unroll
-        state = graph.init_state(1)
-        # What no edge leads from is read by nobody in the next step.
-        sources = {edge.source for edge in graph.spec.edges}
-        self.outputs = tuple(name for name in state.outputs if name in sources)
-        self.memories = tuple(state.memories)
-        kept = [state.outputs[name] for name in self.outputs] + [state.memories[name] for name in self.memories]
-        self.shapes = tuple(tuple(item.shape[1:]) for item in kept)
-
-    def forward(self, x: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        outputs = dict(zip(self.outputs, state[: len(self.outputs)], strict=True))
-        memories = dict(zip(self.memories, state[len(self.outputs) :], strict=True))
-        y, after = self.graph.step(x, GraphState(outputs, memories), unroll=self.unroll)
-        kept = [after.outputs[name] for name in self.outputs] + [after.memories[name] for name in self.memories]
-        return y, kept
-
-
-class _S4Part(nn.Module):
-    def __init__(self, encoder: S4Encoder) -> None:
-        super().__init__()
-        self.encoder = encoder
+        self.part, self.pack, self.unpack, self.how = part, pack, unpack, how
         with torch.no_grad():
-            state = encoder.init_state(1)
-        self.systems = [system for _, system in state]
-        self.shapes = tuple(tuple(memory.shape[1:]) for memory, _ in state)
+            self.shapes = tuple(tuple(item.shape[1:]) for item in pack(part.init_state(1)))
 
-    def forward(self, x: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        y, after = self.encoder.step(x, tuple(zip(state, self.systems, strict=True)))
-        return y, [memory for memory, _ in after]
+    def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
+        y, after = self.part.step(x, self.unpack(state), **self.how)
+        return y, self.pack(after)
 
 
-class _MambaPart(nn.Module):
-    def __init__(self, attender: MambaAttender) -> None:
-        super().__init__()
-        self.attender = attender
-        self.shapes = tuple(tuple(item.shape[1:]) for memory in attender.init_state(1) for item in memory)
+def _graph_part(graph: TemporalGraph, unroll: Any) -> _Part:
+    # What no edge leads from is read by nobody in the next step.
+    sources, empty = {edge.source for edge in graph.spec.edges}, graph.init_state(1)
+    outputs = [name for name in empty.outputs if name in sources]
 
-    def forward(self, x: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        memories = tuple(MambaMemory(*state[index : index + 2]) for index in range(0, len(state), 2))
-        y, after = self.attender.step(x, memories)
-        return y, [item for memory in after for item in memory]
+    def pack(state: GraphState) -> _Tensors:
+        return [*(state.outputs[name] for name in outputs), *(state.memories[name] for name in empty.memories)]
+
+    def unpack(parts: _Tensors) -> GraphState:
+        memories = zip(empty.memories, parts[len(outputs) :], strict=True)
+        return GraphState(dict(zip(outputs, parts, strict=False)), dict(memories))
+
+    return _Part(graph, pack, unpack, unroll=unroll)
+
+
+def _s4_part(encoder: S4Encoder) -> _Part:
+    with torch.no_grad():
+        systems = [system for _, system in encoder.init_state(1)]
+    return _Part(
+        encoder, lambda state: [memory for memory, _ in state], lambda parts: tuple(zip(parts, systems, strict=True))
+    )
+
+
+def _mamba_part(attender: MambaAttender) -> _Part:
+    return _Part(
+        attender,
+        lambda state: [item for memory in state for item in memory],
+        lambda parts: tuple(MambaMemory(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)),
+    )
 
 
 class _GPTPart(nn.Module):
@@ -150,7 +143,7 @@ class _GPTPart(nn.Module):
         cache = (2, heads, attender.context, attender.features // heads)
         self.shapes = ((1,), *(cache for _ in attender.blocks))
 
-    def forward(self, x: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
         attender = self.attender
         seen, caches = state[0], state[1:]
         slots = torch.arange(attender.context, device=x.device, dtype=seen.dtype)
@@ -160,7 +153,7 @@ class _GPTPart(nn.Module):
         free = (1 - place.sum(1))[:, None, :, None]
         pair = torch.stack((x, attender.action.expand_as(x)), 1)
         stream = attender.embed(pair) + place @ attender.positions
-        after: list[torch.Tensor] = [seen + 2]
+        after = [seen + 2]
         for module, cache in zip(attender.blocks, caches, strict=True):
             width = stream.shape[-1]
             fused = module.query_key_value(module.norm_attention(stream))
@@ -178,13 +171,13 @@ class _GPTPart(nn.Module):
         return torch.where(full, torch.full_like(y, torch.nan), y), after
 
 
-def _encoder_part(model: EncoderAttenderDecoder) -> Any:
-    if isinstance(model.encoder, TemporalGraph):
-        return _GraphPart(model.encoder, model.unroll)
-    return _S4Part(model.encoder) if isinstance(model.encoder, S4Encoder) else _Stateless(model.encoder)
-
-
-def _attender_part(attender: Any) -> Any:
-    if isinstance(attender, GPTAttender):
-        return _GPTPart(attender)
-    return _MambaPart(attender) if isinstance(attender, MambaAttender) else _Stateless()
+def _part_of(part: Any, unroll: Any) -> Any:
+    if isinstance(part, TemporalGraph):
+        return _graph_part(part, unroll)
+    if isinstance(part, S4Encoder):
+        return _s4_part(part)
+    if isinstance(part, GPTAttender):
+        return _GPTPart(part)
+    if isinstance(part, MambaAttender):
+        return _mamba_part(part)
+    return _Part(part, lambda state: [], lambda parts: ())

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core import files
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, DataFileNotFoundError
 
 
 @dataclass(frozen=True)
@@ -114,3 +114,21 @@ def test_provenance_names_version_packages_and_time():
     assert {"version", "python", "packages", "machine", "time"} <= set(origin)
     assert origin["seed"] == 3
     assert origin["packages"]["numpy"] == np.__version__
+
+
+def test_names_and_values_are_read_from_toml_and_json(tmp_path):
+    (tmp_path / "a.toml").write_text('epochs = 4\naugmentation = "none"\n')
+    (tmp_path / "a.json").write_text(json.dumps({"epochs": 4, "augmentation": "none"}))
+    assert (
+        files.read_mapping(tmp_path / "a.toml")
+        == files.read_mapping(tmp_path / "a.json")
+        == {"epochs": 4, "augmentation": "none"}
+    )
+    (tmp_path / "b.toml").write_text("epochs = \n")
+    with pytest.raises(DataError, match="not valid TOML"):
+        files.read_mapping(tmp_path / "b.toml")
+    with pytest.raises(DataFileNotFoundError):
+        files.read_mapping(tmp_path / "none.toml")
+    (tmp_path / "c.json").write_text("[1]")
+    with pytest.raises(DataError, match="holds a list"):
+        files.read_mapping(tmp_path / "c.json")

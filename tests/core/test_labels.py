@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.labels import join_labels, read_match
 
 
@@ -54,13 +54,13 @@ def test_match_files_of_three_kinds_say_the_same(tmp_path: Path):
     [
         ("m.txt", "", "ends in .json, .toml or .csv"),
         ("m.csv", "a,b,c\n", "two columns"),
-        ("m.json", "[1]", "must map"),
+        ("m.json", "[1]", "holds a list"),
         ("m.toml", "= 3", "not valid TOML"),
     ],
 )
 def test_a_wrong_match_file_is_refused(tmp_path: Path, name: str, text: str, message: str):
     (tmp_path / name).write_text(text)
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises((UsageError, DataError), match=message):
         read_match(tmp_path / name)
     with pytest.raises(UsageError, match="no match file"):
         read_match(tmp_path / "none.json")

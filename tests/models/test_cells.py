@@ -206,7 +206,10 @@ def test_wrong_parameters_are_named():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: TimeDecay(3, 4), "TimeDecay keeps its channels; received 3 in and 4 out"),
+        (
+            lambda: TimeDecay(3, 4),
+            "same channels; received 3 in and 4 out",
+        ),
         (lambda: IntersectionRNN(3, 4, kernel_size=2), "same channels; received 3 in and 4 out"),
         (lambda: UGRNN(0, 3, kernel_size=2), "needs channels ≥ 1"),
         (lambda: UGRNN(3, 3, kernel_size=2)(torch.zeros(1, 4, 5, 7)), r"expects \[batch, 3, rows, columns\]"),

@@ -8,7 +8,7 @@ from safetensors.torch import load_file
 
 from brainbench.models.architecture import Architecture
 from brainbench.models.registry import describe_model, load_model
-from brainbench.models.training.batches import ArrayBatches
+from brainbench.models.training.batches import ArrayBatches, BatchOptions
 from brainbench.models.training.checkpoints import CARD, WEIGHTS, read_config, shipped
 from tests.factories.training_sweeps import sweeps
 
@@ -48,7 +48,7 @@ def test_its_configuration_and_card_say_how_it_was_trained_and_how_well(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_it_loads_and_is_not_what_it_was_before_training(name):
     model, architecture = load_model(name), Architecture.parse(name).untrained
-    x, _ = next(iter(ArrayBatches(*sweeps(2, 0, steps=22), batch_size=2, shuffle=False)))
+    x, _ = next(iter(ArrayBatches(*sweeps(2, 0, steps=22), BatchOptions(2, shuffle=False))))
     with torch.no_grad():
         answers = model(x)
     assert answers.shape == (2, 24)

@@ -43,12 +43,7 @@ class MambaBlock(nn.Module):
     Per inner channel and state: h_t = exp(Δ_t A) h_{t−1} + Δ_t B_t u_t, y_t = C_t · h_t + D u_t, where the step
     Δ_t and the vectors B_t, C_t are functions of the input; y is gated by SiLU of a second branch.
 
-    Args:
-        width: Of the stream.
-        expansion: Inner width per width.
-        states: States per inner channel.
-        convolution: Steps that the short convolution sees.
-        depth: Blocks in all; what each adds is scaled by 1/√depth.
+    Sizes are those of :class:`MambaAttender`; what each of ``depth`` blocks adds is scaled by 1/√depth.
     """
 
     def __init__(self, width: int, *, expansion: int, states: int, convolution: int, depth: int) -> None:
@@ -70,11 +65,10 @@ class MambaBlock(nn.Module):
                 # The softplus of this bias is the step size.
                 self.step_size.bias.copy_(size + torch.log(-torch.expm1(-size)))
 
-    def init_memory(self, batch: int, **options: Any) -> MambaMemory:
+    def init_memory(self, batch: int) -> MambaMemory:
         """Return the memory before the first step, all zeros."""
         inner, _, size = self.convolution.weight.shape
-        recent = torch.zeros(batch, inner, size - 1, **options)
-        return MambaMemory(recent, torch.zeros(batch, inner, self.states, **options))
+        return MambaMemory(self.skip.new_zeros(batch, inner, size - 1), self.skip.new_zeros(batch, inner, self.states))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Process a sweep [B, T, width]."""
@@ -173,13 +167,9 @@ class MambaAttender(nn.Module):
         y, activations = run_layers(x, layers, return_activations)
         return y if return_activations is False else (y, activations)
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> MambaState:
+    def init_state(self, batch: int) -> MambaState:
         """Return the state before the first step, all zeros."""
-        like = self.norm.weight
-        options = {"device": device or like.device, "dtype": dtype or like.dtype}
-        return tuple(block.init_memory(batch, **options) for block in self.blocks)
+        return tuple(block.init_memory(batch) for block in self.blocks)
 
     def step(self, x: torch.Tensor, state: MambaState) -> tuple[torch.Tensor, MambaState]:
         """Advance by one step of features [B, F]; return the answer [B, F] and the next state."""

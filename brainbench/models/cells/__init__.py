@@ -1,4 +1,4 @@
-r"""Convolutional recurrent cells, one per module.
+r"""Convolutional recurrent cells.
 
 Every cell maps an input x [B, C, H, W] and a state s to an output y [B, out, H, W] and the next state. The input's
 share of the gates can be computed for all time steps at once (:meth:`Cell.project`).
@@ -14,12 +14,8 @@ Schmidhuber 1997, Gers et al. 2000. Order and names of the gates follow PyTorchT
 
 from collections.abc import Callable, Mapping
 
-from brainbench.models.cells.cell import Cell
-from brainbench.models.cells.gru import GRU
-from brainbench.models.cells.intersection import IntersectionRNN
-from brainbench.models.cells.lstm import LSTM
-from brainbench.models.cells.time_decay import TimeDecay
-from brainbench.models.cells.ugrnn import UGRNN
+from brainbench.models.cells.cell import Cell, TimeDecay
+from brainbench.models.cells.gated import GRU, LSTM, UGRNN, IntersectionRNN
 
 __all__ = ["GRU", "LSTM", "UGRNN", "IntersectionRNN", "TimeDecay"]
 

@@ -1,4 +1,4 @@
-"""The base of all cells."""
+"""The base of all cells, and the one without gates."""
 
 from __future__ import annotations
 
@@ -28,43 +28,36 @@ class ChannelNorm(nn.LayerNorm):
 
 
 class Cell(nn.Module):
-    """Base of all cells: the state's shape, zero initial states and PyTorchTNN's names.
-
-    Args:
-        in_channels: Channels of x.
-        out_channels: Channels of y.
-        kernel_size: One number or (rows, columns) of the gates' convolution.
-        layer_norm: Normalise each gate over channels.
+    """Base of all cells: channels of x and y, the state's shape, zero initial states and PyTorchTNN's names.
 
     Raises:
-        UsageError: there is no channel.
+        UsageError: there is no channel, or the numbers differ in a cell that passes its input on.
     """
 
     state_factor: ClassVar[int] = 1
     """Channels of the state per output channel."""
+    keeps_channels: ClassVar[bool] = False
+    """True where the input itself is part of the output."""
     tnn_names: ClassVar[Mapping[str, str]] = {}
     """Our submodule names → PyTorchTNN's."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
+        name = type(self).__name__
         if in_channels < 1 or out_channels < 1:
-            raise UsageError(f"{type(self).__name__} needs channels ≥ 1; received {in_channels} and {out_channels}.")
-        self.in_channels = in_channels
-        self.out_channels = out_channels
+            raise UsageError(f"{name} needs channels ≥ 1; received {in_channels} and {out_channels}.")
+        if self.keeps_channels and in_channels != out_channels:
+            raise UsageError(
+                f"{name} mixes its input into its output, so both need the same channels; received {in_channels} in "
+                f"and {out_channels} out."
+            )
+        self.in_channels, self.out_channels = in_channels, out_channels
 
-    def initial_state(
-        self,
-        batch: int,
-        *spatial: int,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
-    ) -> torch.Tensor:
-        """Return the zero state [batch, state channels, *spatial], like the parameters unless told otherwise."""
-        like = next(self.parameters())
-        shape = (batch, self.state_factor * self.out_channels, *spatial)
-        return torch.zeros(shape, device=device or like.device, dtype=dtype or like.dtype)
+    def initial_state(self, batch: int, *spatial: int) -> torch.Tensor:
+        """Return the zero state [batch, state channels, *spatial], of the parameters' kind and device."""
+        return next(self.parameters()).new_zeros(batch, self.state_factor * self.out_channels, *spatial)
 
-    def project(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def project(self, x: torch.Tensor) -> Projected:
         """Return what the input alone adds to the gates, for any number of inputs [N, C, H, W] at once.
 
         ``forward(x, state, projected)`` then computes the recurrence only. A cell without gates has nothing to add.
@@ -78,7 +71,7 @@ class Cell(nn.Module):
         Raises:
             DataError: a name is missing or unexpected, or a shape differs.
         """
-        load_named(self.tnn_parameters(), state, what=f"{type(self).__name__}")
+        load_named(self.tnn_parameters(), state, what=type(self).__name__)
 
     def tnn_parameters(self) -> dict[str, torch.Tensor]:
         """Return the parameters under PyTorchTNN's names."""
@@ -89,15 +82,48 @@ class Cell(nn.Module):
         return renamed
 
     def _check(self, x: torch.Tensor, state: torch.Tensor | None) -> torch.Tensor:
+        name = type(self).__name__
         if x.ndim < 2 or x.shape[1] != self.in_channels:
-            raise UsageError(
-                f"{type(self).__name__} expects [batch, {self.in_channels}, rows, columns]; received {list(x.shape)}."
-            )
-        if state is None:
-            return self.initial_state(x.shape[0], *x.shape[2:], device=x.device, dtype=x.dtype)
+            raise UsageError(f"{name} expects [batch, {self.in_channels}, rows, columns]; received {list(x.shape)}.")
         expected = (x.shape[0], self.state_factor * self.out_channels, *x.shape[2:])
+        if state is None:
+            return x.new_zeros(expected)
         if tuple(state.shape) != expected:
-            raise UsageError(
-                f"{type(self).__name__} expects a state of shape {list(expected)}; received {list(state.shape)}."
-            )
+            raise UsageError(f"{name} expects a state of shape {list(expected)}; received {list(state.shape)}.")
         return state
+
+
+class TimeDecay(Cell):
+    """Leaky trace: s ← x + τ s, y = s, with one trainable scalar τ that starts at ``tau``. Works on any [B, C, ...].
+
+    There is no gate to normalise, so ``layer_norm`` normalises the output (y = LN(s)); the trace itself
+    stays as it is, or it would forget how strong the stimulus was. ``kernel_size`` is unused.
+
+    Raises:
+        UsageError: the numbers of channels differ.
+    """
+
+    keeps_channels = True
+    tnn_names: ClassVar[Mapping[str, str]] = {"norm": "norm"}
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        *,
+        kernel_size: Any = None,
+        layer_norm: bool = False,
+        tau: float = 0.0,
+    ) -> None:
+        super().__init__(in_channels, out_channels)
+        self.tau = nn.Parameter(torch.tensor(float(tau)))
+        self.norm = ChannelNorm(out_channels) if layer_norm else nn.Identity()
+
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, C, ...]."""
+        del projected
+        # s_t = x_t + τ s_{t−1}: linear, so the trace of one input decays as τ to the power of the steps since.
+        state = x + self.tau * self._check(x, state)
+        return self.norm(state), state

@@ -1,15 +1,19 @@
-"""The base of the gated cells: one fused convolution for all gates, and what follows it."""
+"""The gated cells: one fused convolution for all gates, and what follows it."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import torch
 from torch import nn
 
-from brainbench.models.cells.cell import Cell, ChannelNorm, Projected
+from brainbench.models.cells.cell import FORGET_BIAS, Cell, ChannelNorm, Projected
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import Conv2d, pair
+
+if TYPE_CHECKING:
+    from brainbench.models.ops.gates import DeferredNormGrad
 
 
 class GatedCell(Cell):
@@ -59,7 +63,8 @@ class GatedCell(Cell):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (y [B, out, H, W], state [B, state channels, H, W])."""
         state = self._check(x, state)
-        return self.apply_gates(self._fused(self.conv, x, state, projected[:1]), x, state)
+        # The gates read what the cell last answered, which is the last part of its state.
+        return self.apply_gates(self._fused(self.conv, x, state.chunk(self.state_factor, 1)[-1], projected), x, state)
 
     def apply_gates(
         self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
@@ -89,3 +94,139 @@ class GatedCell(Cell):
         if not self.norms:
             return list(parts)
         return [self.norms[name](part) for name, part in zip(names, parts, strict=True)]
+
+
+class UGRNN(GatedCell):
+    """Update-gate cell: g = σ(g' + 1), c = tanh(c'), s ← g s + (1 − g) c, y = s (Collins et al. 2017)."""
+
+    gates = ("g", "c")
+    tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv", "norms.g": "ln_g_act", "norms.c": "ln_c_act"}
+
+    def apply_gates(
+        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
+        # Thesis, equation 3.1 and the text after it; the +1 favours keeping the state early in training.
+        keep, candidate = self._normalised(fused, self.gates)
+        keep = torch.sigmoid(keep + FORGET_BIAS)
+        state = keep * state + (1 - keep) * torch.tanh(candidate)
+        return state, state
+
+
+class IntersectionRNN(GatedCell):
+    """Cell gated through time and through depth (Collins et al. 2017), with as many channels of y as of x.
+
+    State: p = σ(p' + 1), s ← p s + (1 − p) tanh(m'). Output: q = σ(q' + 1), y = q x + (1 − q) relu(n').
+
+    Raises:
+        UsageError: the numbers of channels differ.
+    """
+
+    keeps_channels = True
+    gates = ("gh", "h", "gy", "y")
+    tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv"} | {f"norms.{name}": f"ln_{name}_act" for name in gates}
+    deferred: DeferredNormGrad | None = None
+    """Place for the gradients of the norms of each step; None outside of a deferring pass."""
+
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W]."""
+        state = self._check(x, state)
+        fused = self._fused(self.conv, x, state, projected)
+        return dispatch.apply_gates(self, fused, x, state, projected=bool(projected))
+
+    def norm(self, gate: str) -> ChannelNorm:
+        """Return the norm of a gate."""
+        return cast(ChannelNorm, self.norms[gate])
+
+    def apply_gates(
+        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
+        keep, candidate, through, output = self._normalised(fused, self.gates)
+        keep = torch.sigmoid(keep + FORGET_BIAS)
+        # Thesis, equations 3.2 and 3.3: one gate passes the state on in time, the other the input on in depth.
+        through = torch.sigmoid(through + FORGET_BIAS)
+        # h = y x + (1 − y) n and s = p s + (1 − p) m: early in training most of input and state passes.
+        y = through * x + (1 - through) * torch.relu(output)
+        return y.to(x.dtype), keep * state + (1 - keep) * torch.tanh(candidate)
+
+
+class GRU(GatedCell):
+    """Gated recurrent unit with two convolutions (Cho et al. 2014).
+
+    r = σ(r' + 1), u = σ(u') from cat(x, s); c = tanh of a second convolution of cat(x, r s);
+    s ← u s + (1 − u) c, y = s. The fixed +1 sits on the reset gate alone.
+    """
+
+    gates = ("r", "u")
+    other_norms = ("c",)
+    fused_parts = ("reset", "update")
+    tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv_ru", "candidate": "conv_c"} | {
+        f"norms.{name}": f"ln_{name}_pre" for name in "ruc"
+    }
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
+    ) -> None:
+        super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
+        self.candidate = self._convolution(1, kernel_size)
+
+    @property
+    def convolutions(self) -> tuple[Conv2d, ...]:
+        """Convolutions of the gates and of the candidate."""
+        return self.conv, self.candidate
+
+    def forward(
+        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, out, H, W]."""
+        state = self._check(x, state)
+        remembered, keep = self.reset(self._fused(self.conv, x, state, projected[:1]), state)
+        state = self.update(self._fused(self.candidate, x, remembered, projected[1:]), keep, state)
+        return state, state
+
+    def reset(self, fused: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (r s, u) from the gates' pre-activations."""
+        reset, keep = self._normalised(fused, self.gates)
+        # The +1 lets the old state into the candidate early in training; the update gate has none.
+        return torch.sigmoid(reset + FORGET_BIAS) * state, torch.sigmoid(keep)
+
+    def update(self, fused: torch.Tensor, keep: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Return the next state from the candidate's pre-activation and the update gate u."""
+        (candidate,) = self._normalised(fused, ("c",))
+        # s ← u s + (1 − u) c (Cho et al. 2014): old state and candidate mix, so the state stays within ±1.
+        return keep * state + (1 - keep) * torch.tanh(candidate)
+
+
+class LSTM(GatedCell):
+    """Long short-term memory; the state is cat(c, h) [B, 2 out, H, W].
+
+    c ← c σ(f' + 1) + σ(i') tanh(j'), normalised too with ``layer_norm``; h = tanh(c) σ(o'); y = h.
+    """
+
+    state_factor = 2
+    gates = ("i", "j", "f", "o")
+    other_norms = ("c",)
+    tnn_names: ClassVar[Mapping[str, str]] = {
+        "conv": "conv",
+        "norms.i": "ln_input",
+        "norms.j": "ln_transform",
+        "norms.f": "ln_forget",
+        "norms.o": "ln_output",
+        "norms.c": "ln_state",
+    }
+
+    def apply_gates(
+        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y [B, out, H, W], state [B, 2 out, H, W]) from the gates' pre-activations."""
+        del x
+        memory = state.chunk(2, 1)[0]
+        write, candidate, keep, read = self._normalised(fused, self.gates)
+        # The +1 on the forget gate keeps the memory early in training; c is normalised before it is read and stored.
+        memory = memory * torch.sigmoid(keep + FORGET_BIAS) + torch.sigmoid(write) * torch.tanh(candidate)
+        (memory,) = self._normalised(memory, ("c",))
+        hidden = torch.tanh(memory) * torch.sigmoid(read)
+        return hidden, torch.cat((memory, hidden), 1)

@@ -6,8 +6,8 @@ step; the last layer gives the features. 11,523,840 parameters at full width.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -21,13 +21,7 @@ _WIDTHS = (64, 128, 256, 512)
 
 
 class BasicBlock(nn.Module):
-    """Two 3×3 convolutions with batch norm around a shortcut, [B, C, H, W] → [B, out, H', W'].
-
-    Args:
-        in_channels: C.
-        out_channels: Of the result.
-        stride: Of the first convolution and of the shortcut.
-    """
+    """Two 3×3 convolutions with batch norm around a shortcut, [B, C, H, W] → [B, out, H', W']."""
 
     def __init__(self, in_channels: int, out_channels: int, stride: int) -> None:
         super().__init__()
@@ -50,49 +44,37 @@ class BasicBlock(nn.Module):
 class ResNet18Encoder(nn.Module):
     """Features [B, T, F] of a sweep [B, T, C, H, W], each step alone.
 
-    Args:
-        small: All widths × 3/16 (F = 96 instead of 512; 0.4 M parameters).
-        input_shape: (C, H, W) of one step.
-
-    In training, batch norm pools over batch and time.
+    With ``small`` all widths × 3/16 (F = 96 instead of 512; 0.4 M parameters). In training, batch norm pools over batch
+    and time.
     """
 
     layers: tuple[str, ...] = ("conv1", "layer1", "layer2", "layer3", "layer4", "fc")
+    input_shape: tuple[int, int, int] = INPUT_SHAPE
     latency: int = 0
     receptive_field: int | None = 1
 
-    def __init__(self, *, small: bool = False, input_shape: tuple[int, int, int] = INPUT_SHAPE) -> None:
+    def __init__(self, *, small: bool = False) -> None:
         super().__init__()
         widths = [small_width(width) if small else width for width in _WIDTHS]
-        self.input_shape = input_shape
         self.features = widths[-1]
-        self.conv1 = nn.Sequential(
-            _convolution(input_shape[0], widths[0], 7, 2),
-            nn.BatchNorm2d(widths[0]),
-            nn.ReLU(),
-            nn.MaxPool2d(3, 2, 1),
-        )
-        before = widths[0]
-        for index, width in enumerate(widths, start=1):
+        first = _convolution(self.input_shape[0], widths[0], 7, 2)
+        self.conv1 = nn.Sequential(first, nn.BatchNorm2d(widths[0]), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        for index, (before, width) in enumerate(pairwise((widths[0], *widths)), start=1):
             stride = 1 if index == 1 else 2
-            self.add_module(
-                f"layer{index}", nn.Sequential(BasicBlock(before, width, stride), BasicBlock(width, width, 1))
-            )
-            before = width
-        self.fc = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), Linear(before, self.features))
+            blocks = nn.Sequential(BasicBlock(before, width, stride), BasicBlock(width, width, 1))
+            self.add_module(f"layer{index}", blocks)
+        self.fc = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), Linear(self.features, self.features))
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one step of one stimulus."""
-        _, rows, columns = self.input_shape
-        # The first convolution and the pool halve the grid, as does every layer from the second on.
-        size = (_halved(_halved(rows)), _halved(_halved(columns)))
-        first, *_ = (module for module in self.conv1 if isinstance(module, Conv2d))
-        total = first.weight.numel() * _halved(rows) * _halved(columns)
-        for index in range(1, 5):
-            size = size if index == 1 else (_halved(size[0]), _halved(size[1]))
-            layer = self.get_submodule(f"layer{index}")
-            total += sum(m.weight.numel() for m in layer.modules() if isinstance(m, Conv2d)) * math.prod(size)
-        return total + self.features**2
+        total, (_, rows, columns) = self.features**2, self.input_shape
+        # The first convolution halves the grid, its pool too, and every layer from the second on: a stride of 2 with
+        # "same"-like padding of an odd kernel rounds up.
+        for name, times in (("conv1", 1), ("layer1", 2), ("layer2", 3), ("layer3", 4), ("layer4", 5)):
+            places = -(-rows // 2**times) * -(-columns // 2**times)
+            layer = self.get_submodule(name)
+            total += sum(m.weight.numel() for m in layer.modules() if isinstance(m, Conv2d)) * places
+        return total
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the features [B, T, F], with activations also ``{layer: [B, T, ...]}``.
@@ -110,11 +92,9 @@ class ResNet18Encoder(nn.Module):
             return y
         return y, {name: value.unflatten(0, leading) for name, value in activations.items()}
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> tuple[()]:
+    def init_state(self, batch: int) -> tuple[()]:
         """Return the state before the first step: there is none to keep."""
-        del batch, device, dtype
+        del batch
         return ()
 
     def step(self, x: torch.Tensor, state: tuple[()]) -> tuple[torch.Tensor, tuple[()]]:
@@ -123,17 +103,5 @@ class ResNet18Encoder(nn.Module):
 
 
 def _convolution(in_channels: int, out_channels: int, size: int, stride: int) -> Conv2d:
-    return Conv2d(
-        in_channels,
-        out_channels,
-        kernel_size=(size, size),
-        stride=(stride, stride),
-        padding=(size // 2, size // 2),
-        use_bias=False,
-        gain=RECTIFIER_GAIN,
-    )
-
-
-def _halved(length: int) -> int:
-    """Return the length after a stride of 2 with "same"-like padding of an odd kernel."""
-    return (length + 1) // 2
+    shape = {"kernel_size": (size, size), "stride": (stride, stride), "padding": (size // 2, size // 2)}
+    return Conv2d(in_channels, out_channels, **shape, use_bias=False, gain=RECTIFIER_GAIN)

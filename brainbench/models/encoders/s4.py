@@ -24,20 +24,13 @@ S4State = tuple[tuple[torch.Tensor, System], ...]
 
 
 class S4Block(nn.Module):
-    """x + GLU(GELU(state space(LayerNorm(x)))), [B, T, width].
+    """x + GLU(GELU(state space(LayerNorm(x)))), [B, T, width]."""
 
-    Args:
-        width: Of the stream.
-        pairs: Conjugate pairs of states per channel.
-        dropout: Share of what the state space gives that is dropped while training.
-    """
-
-    def __init__(self, width: int, pairs: int, dropout: float) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(width)
-        self.memory = StateSpace(width, pairs)
+        self.memory = StateSpace(width)
         self.mix = Linear(width, 2 * width)
-        self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Process a sweep [B, T, width]."""
@@ -50,39 +43,26 @@ class S4Block(nn.Module):
 
     def _mixed(self, y: torch.Tensor) -> torch.Tensor:
         # State spaces keep channels apart; the gated linear unit mixes them at every step.
-        return functional.glu(self.mix(self.dropout(functional.gelu(y))), -1)
+        return functional.glu(self.mix(functional.gelu(y)), -1)
 
 
 class S4Encoder(nn.Module):
     """Features [B, T, F] of a sweep [B, T, C, H, W], causally.
 
-    Args:
-        small: All widths × 3/16 (F = 96 instead of 512; 0.3 M parameters).
-        input_shape: (C, H, W) of one step.
-        blocks: Number of S4 blocks.
-        pairs: Conjugate pairs of poles per channel.
-        dropout: Inside the blocks, in training alone.
+    With ``small`` all widths × 3/16 (F = 96 instead of 512; 0.3 M parameters).
     """
 
+    layers: tuple[str, ...] = ("embed", "block1", "block2", "block3", "block4", "fc")
+    input_shape: tuple[int, int, int] = INPUT_SHAPE
     latency: int = 0
     receptive_field: int | None = None
 
-    def __init__(
-        self,
-        *,
-        small: bool = False,
-        input_shape: tuple[int, int, int] = INPUT_SHAPE,
-        blocks: int = 4,
-        pairs: int = 32,
-        dropout: float = 0.0,
-    ) -> None:
+    def __init__(self, *, small: bool = False) -> None:
         super().__init__()
-        self.input_shape = input_shape
         self.features = small_width(512) if small else 512
-        self.embed = Linear(math.prod(input_shape), self.features, gain=RECTIFIER_GAIN)
-        self.blocks: Any = nn.ModuleList(S4Block(self.features, pairs, dropout) for _ in range(blocks))
+        self.embed = Linear(math.prod(self.input_shape), self.features, gain=RECTIFIER_GAIN)
+        self.blocks: Any = nn.ModuleList(S4Block(self.features) for _ in range(len(self.layers) - 2))
         self.fc = Linear(self.features, self.features)
-        self.layers: tuple[str, ...] = ("embed", *(f"block{index}" for index in range(1, blocks + 1)), "fc")
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of one streamed step: linear layers, and 12 per conjugate pair of the recurrence."""
@@ -101,11 +81,9 @@ class S4Encoder(nn.Module):
         y, activations = run_layers(x.flatten(2), layers, return_activations)
         return y if return_activations is False else (y, activations)
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> S4State:
+    def init_state(self, batch: int) -> S4State:
         """Return the state before the first step: empty memories and the systems discretised from the weights."""
-        return tuple(block.memory.init_state(batch, device, dtype) for block in self.blocks)
+        return tuple(block.memory.init_state(batch) for block in self.blocks)
 
     def step(self, x: torch.Tensor, state: S4State) -> tuple[torch.Tensor, S4State]:
         """Return the features [B, F] of one step [B, C, H, W] and the next state."""

@@ -10,15 +10,6 @@ if TYPE_CHECKING:
     from brainbench.models.graph.spec import GraphSpec
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
-__all__ = [
-    "GraphSpec",
-    "TemporalGraph",
-]
+__all__ = ["GraphSpec", "TemporalGraph"]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    {
-        "GraphSpec": ".spec",
-        "TemporalGraph": ".temporal_graph",
-    },
-)
+__getattr__, __dir__ = lazy_exports(__name__, {"GraphSpec": ".spec", "TemporalGraph": ".temporal_graph"})

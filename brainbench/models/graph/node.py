@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import nn
@@ -47,17 +48,10 @@ def _operation(node: Node, shape: Shape) -> tuple[nn.Module, int]:
     what = node.operation
     if what is None:
         return nn.Identity(), shape[0]
-    options = {"use_bias": what.use_bias, "bias": what.bias, "method": what.initialiser}
+    options: dict[str, Any] = {"use_bias": what.use_bias, "bias": what.bias, "method": what.initialiser}
     if isinstance(what, Convolution):
-        layer = Conv2d(
-            shape[0],
-            what.channels,
-            kernel_size=what.kernel_size,
-            stride=what.stride,
-            padding=what.padding,
-            **options,
-        )
-        return layer, what.channels
+        options |= {"kernel_size": what.kernel_size, "stride": what.stride, "padding": what.padding}
+        return Conv2d(shape[0], what.channels, **options), what.channels
     # Gain √2 as for convolutions (He et al. 2015), since a rectifier follows.
     return Linear(math.prod(shape), what.features, gain=RECTIFIER_GAIN, **options), what.features
 

@@ -50,14 +50,11 @@ class Convolution(Operation):
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (C, H, W) for an input (C, H, W)."""
-        size = []
-        for axis, length in enumerate(shape[1:]):
-            if self.padding == "same":
-                size.append(length)
-                continue
-            padding = 0 if self.padding == "valid" else self.padding[axis]
-            size.append((length + 2 * padding - self.kernel_size[axis]) // self.stride[axis] + 1)
-        return (self.channels, *size)
+        if self.padding == "same":
+            return (self.channels, *shape[1:])
+        pads = (0, 0) if self.padding == "valid" else self.padding
+        windows = zip(shape[1:], pads, self.kernel_size, self.stride, strict=True)
+        return (self.channels, *((length + 2 * pad - size) // step + 1 for length, pad, size, step in windows))
 
 
 @dataclass(frozen=True)
@@ -199,20 +196,18 @@ class GraphSpec:
                 raise UsageError(f"The edge {end[0]} → {end[1]} appears more than once.")
         if len(self.input_shape) != 3 or min(self.input_shape) < 1:
             raise UsageError(f"The input shape must be (channels, rows, columns); received {self.input_shape!r}.")
-        reached = self._reached()
-        if len(reached) < len(names):
-            lost = [name for name in names if name not in reached]
+        if lost := [name for name in names if not any(name in self._reach[source] for source in self.inputs)]:
             raise UsageError(f"No path leads from the input nodes {list(self.inputs)} to {listing(lost)}.")
         object.__setattr__(self, "order", self._sorted())
 
-    def _reached(self) -> set[str]:
-        reached, frontier = set(self.inputs), list(self.inputs)
-        while frontier:
-            current = frontier.pop()
-            new = [edge.target for edge in self.edges if edge.source == current and edge.target not in reached]
-            reached.update(new)
-            frontier.extend(new)
-        return reached
+    @cached_property
+    def _reach(self) -> dict[str, set[str]]:
+        """Nodes that each node reaches, itself included: after as many passes as nodes no further one is found."""
+        reach = {node.name: {node.name} for node in self.nodes}
+        for _ in self.nodes:
+            for edge in self.edges:
+                reach[edge.source] |= reach[edge.target]
+        return reach
 
     def _sorted(self) -> tuple[str, ...]:
         waiting = {
@@ -246,41 +241,37 @@ class GraphSpec:
         check_unroll(unroll)
         return {(e.source, e.target): 1 if unroll == "biological" or e.feedback else 0 for e in self.edges}
 
-    def shapes(self, input_shape: Shape | None = None) -> tuple[dict[str, Shape], dict[str, Shape]]:
+    def shapes(self) -> tuple[dict[str, Shape], dict[str, Shape]]:
         """Return each node's concatenated input shape and output shape.
 
         Raises:
             UsageError: shapes do not fit one another; the message names the node.
         """
-        stimulus = tuple(input_shape or self.input_shape)
         # Feedback reaches back to nodes whose grid is known only later, so outputs come first: they
         # depend on the shape_from predecessor's grid and on no other input.
         outputs: dict[str, Shape] = {}
         grids: dict[str, Shape] = {}
         for name in self.order:
-            grids[name] = self._grid(name, stimulus, outputs)
+            grids[name] = self._grid(name, outputs)
             node = self.by_name[name]
-            channels = self._channels(name, stimulus, outputs) if node.operation is None else 1
+            channels = self._channels(name, outputs) if node.operation is None else 1
             outputs[name] = node.output_shape((channels, *grids[name]))
             if min(outputs[name]) < 1:
                 raise UsageError(
                     f"Node {name!r} has nothing left of a grid of {list(grids[name])}: its output would be "
-                    f"{list(outputs[name])}; the stimulus {list(stimulus)} is too small."
+                    f"{list(outputs[name])}; the stimulus {list(self.input_shape)} is too small."
                 )
-        inputs: dict[str, Shape] = {}
         for name in self.order:
-            self._check_grids(name, grids[name], stimulus, outputs)
-            inputs[name] = (self._channels(name, stimulus, outputs), *grids[name])
-        return inputs, outputs
+            self._check_grids(name, grids[name], outputs)
+        return {name: (self._channels(name, outputs), *grids[name]) for name in self.order}, outputs
 
-    def _grid(self, name: str, stimulus: Shape, outputs: Mapping[str, Shape]) -> Shape:
+    def _grid(self, name: str, outputs: Mapping[str, Shape]) -> Shape:
         source = self.by_name[name].shape_from
         if source is None:
             if name in self.inputs:
-                return stimulus[1:]
-            source = max(
-                (e.source for e in self.predecessors[name] if not e.feedback), key=self.order.index, default=None
-            )
+                return self.input_shape[1:]
+            ahead = (edge.source for edge in self.predecessors[name] if not edge.feedback)
+            source = max(ahead, key=self.order.index, default=None)
             if source is None:
                 raise UsageError(f"Node {name!r} has only feedback inputs; say with shape_from whose grid it takes.")
         if source not in outputs:
@@ -289,8 +280,8 @@ class GraphSpec:
             )
         return outputs[source][1:]
 
-    def _channels(self, name: str, stimulus: Shape, outputs: Mapping[str, Shape]) -> int:
-        seen = stimulus[0] if name in self.inputs else 0
+    def _channels(self, name: str, outputs: Mapping[str, Shape]) -> int:
+        seen = self.input_shape[0] if name in self.inputs else 0
         try:
             return seen + sum(outputs[edge.source][0] for edge in self.predecessors[name])
         except KeyError as error:
@@ -298,11 +289,11 @@ class GraphSpec:
                 f"Node {name!r} has no operation and receives feedback from {error}; give it one."
             ) from None
 
-    def _check_grids(self, name: str, grid: Shape, stimulus: Shape, outputs: Mapping[str, Shape]) -> None:
+    def _check_grids(self, name: str, grid: Shape, outputs: Mapping[str, Shape]) -> None:
         node = self.by_name[name]
         arriving = {edge.source: outputs[edge.source][1:] for edge in self.predecessors[name]}
         if name in self.inputs:
-            arriving["the stimulus"] = stimulus[1:]
+            arriving["the stimulus"] = self.input_shape[1:]
         for source, size in arriving.items():
             if len(size) != len(grid) or (size != grid and not node.resize):
                 raise UsageError(
@@ -344,17 +335,12 @@ class GraphSpec:
     @cached_property
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Strongly connected components in the order in which they can be computed."""
-        # Reach of every node by as many passes as nodes; two nodes that reach one another are in one loop.
-        reach = {node.name: {node.name} for node in self.nodes}
-        for _ in self.nodes:
-            for edge in self.edges:
-                reach[edge.source] |= reach[edge.target]
-        components = {
-            name: tuple(other for other in self.order if other in reach[name] and name in reach[other])
-            for name in self.order
-        }
+        reach = self._reach
+        # Two nodes that reach one another are in one loop.
+        unique = dict.fromkeys(
+            tuple(other for other in self.order if other in reach[name] and name in reach[other]) for name in self.order
+        )
         # A component that reaches another comes first, and it reaches strictly more nodes.
-        unique = dict.fromkeys(components.values())
         return tuple(sorted(unique, key=lambda group: -len(reach[group[0]])))
 
 

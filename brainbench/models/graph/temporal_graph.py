@@ -26,6 +26,7 @@ from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.graph.unrolling import UnrolledSweep, needed_steps
 from brainbench.models.ops.layers import Conv2d, Linear
 from brainbench.models.ops.parameters import check_named, copy_named
+from brainbench.models.parts import wanted
 
 _log = logging.getLogger(__name__)
 
@@ -61,18 +62,13 @@ class TemporalGraph(nn.Module):
 
     @classmethod
     def from_config(
-        cls,
-        source: Mapping[str, Any] | str | os.PathLike[str],
-        *,
-        input_shape: tuple[int, int, int] | None = None,
+        cls, source: Mapping[str, Any] | str | os.PathLike[str], *, input_shape: tuple[int, int, int] | None = None
     ) -> TemporalGraph:
         """Build a graph from PyTorchTNN's configuration: a mapping or the path of a JSON file.
 
-        Args:
-            source: The configuration.
-            input_shape: (C, H, W) that overrides the configuration's. PyTorchTNN's published files
-                declare shapes that its callers override, so without this argument the declared shape is
-                a default: :meth:`load_tnn_state` gives it up if the weights were made for another.
+        ``input_shape`` (C, H, W) overrides the configuration's. PyTorchTNN's published files declare shapes that its
+        callers override, so without this argument the declared shape is a default: :meth:`load_tnn_state` gives it up
+        if the weights were made for another.
 
         Raises:
             DataError: the file is missing or not JSON, or a key is missing or unsupported.
@@ -187,15 +183,8 @@ class TemporalGraph(nn.Module):
                 total += sum(m.weight.numel() for m in node.memory.modules() if isinstance(m, Conv2d)) * places
         return total
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> GraphState:
+    def init_state(self, batch: int) -> GraphState:
         """Return the state before the first step: silent nodes and empty memories, all zeros.
-
-        Args:
-            batch: B.
-            device: Of the state; by default that of the weights.
-            dtype: Of the state; by default that of the weights.
 
         Raises:
             UsageError: the shape of the stimulus is still open.
@@ -203,10 +192,9 @@ class TemporalGraph(nn.Module):
         if self._open_grid:
             raise UsageError("The stimulus shape is still open; pass input_shape to TemporalGraph.from_config.")
         like = next(self.parameters())
-        options = {"device": device or like.device, "dtype": dtype or like.dtype}
-        outputs = {name: torch.zeros(batch, *self.shapes[name], **options) for name in self.layers}
+        outputs = {name: like.new_zeros(batch, *self.shapes[name]) for name in self.layers}
         memories = {
-            name: node.memory.initial_state(batch, *self.memory_grid(name), **options)
+            name: node.memory.initial_state(batch, *self.memory_grid(name))
             for name, node in self.named_nodes()
             if node.memory is not None
         }
@@ -269,21 +257,15 @@ class TemporalGraph(nn.Module):
         Only what the answer reads is computed and kept: steps whose effect comes too late are left out, and steps that
         the stimulus has not reached are computed for one stimulus and shared.
 
-        Args:
-            x: The sweep.
-            unroll: ``biological`` or ``full``.
-            return_activations: True for every node, or the names of the nodes wanted.
-            last: Return the output of the last step alone.
-
         Returns:
-            The outputs [B, T, ...] or, with ``last``, [B, ...]; with ``return_activations`` also
-            ``{node: [B, T, ...]}``.
+            The outputs [B, T, ...] or, with ``last``, those of the last step [B, ...]; with ``return_activations``
+            (True for every node, or names) also ``{node: [B, T, ...]}``.
 
         Raises:
             UsageError: the shape does not fit, or a node or unrolling does not exist.
         """
         check_unroll(unroll)
-        wanted = self._wanted(return_activations)
+        asked = self._wanted(return_activations)
         if x.ndim != 5 or x.shape[1] < 1:
             raise UsageError(
                 f"A temporal graph expects [batch, time, channels, rows, columns]; received {list(x.shape)}."
@@ -293,26 +275,24 @@ class TemporalGraph(nn.Module):
             # Tensor cores and norms over channels both want channels innermost.
             x = x.flatten(0, 1).to(memory_format=torch.channels_last).unflatten(0, x.shape[:2])
         output = self.spec.output
-        whole, final = (wanted, {output}) if last else (wanted | {output}, set())
+        whole, final = (asked, {output}) if last else (asked | {output}, set())
         steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
         kept = UnrolledSweep(self, x, unroll, steps).run(whole | final)
         y = kept[output][1]
         y = y[:, -1] if last else y
         if return_activations is False:
             return y
-        return y, {name: kept[name][1] for name in self.layers if name in wanted}
+        return y, {name: kept[name][1] for name in self.layers if name in asked}
 
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{node: [B, T, ...]}`` of the biological unrolling for the nodes asked for (all by default)."""
         return self(x, return_activations=True if layers is None else tuple(layers))[1]
 
-    def _wanted(self, return_activations: bool | Collection[str]) -> set[str]:
-        if isinstance(return_activations, bool):
-            return set(self.layers) if return_activations else set()
-        for name in return_activations:
-            if name not in self.layers:
-                raise unknown_name("node", name, self.layers)
-        return set(return_activations)
+    def _wanted(self, asked: bool | Collection[str]) -> set[str]:
+        names = set(wanted(self.layers, asked))
+        for name in names.difference(self.layers):
+            raise unknown_name("node", name, self.layers)
+        return names
 
     @property
     def draws_random(self) -> bool:

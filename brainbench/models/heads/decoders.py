@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear
+from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
 
 CLASSES = 117
 """Object categories of the whisking data set (Zhuang et al. 2017)."""
@@ -22,13 +22,7 @@ def linear_decoder(features: int, classes: int = CLASSES) -> nn.Module:
 
 def mlp_decoder(features: int, classes: int = CLASSES) -> nn.Module:
     """Return linear layers 1024, 512 and ``classes`` with ReLU between (1,110,133 parameters for 512 features)."""
-    return nn.Sequential(
-        Linear(features, 1024, gain=RECTIFIER_GAIN),
-        nn.ReLU(),
-        Linear(1024, 512, gain=RECTIFIER_GAIN),
-        nn.ReLU(),
-        Linear(512, classes),
-    )
+    return perceptron(features, 1024, 512, classes)
 
 
 class AllStepsDecoder(nn.Module):
@@ -38,11 +32,6 @@ class AllStepsDecoder(nn.Module):
     45 ms of touch (12,120,181 parameters for 512 features and 22 steps). Steps that have not come yet count
     as zeros, so the answer after every step is defined and a stream needs only the running sum of the first
     layer.
-
-    Args:
-        features: F.
-        classes: Number of outputs.
-        steps: Longest sweep.
     """
 
     def __init__(self, features: int, classes: int = CLASSES, *, steps: int = 22) -> None:
@@ -50,7 +39,7 @@ class AllStepsDecoder(nn.Module):
         self.steps = steps
         self.features = features
         self.first = Linear(steps * features, 1024, gain=RECTIFIER_GAIN)
-        self.rest = nn.Sequential(nn.ReLU(), Linear(1024, 512, gain=RECTIFIER_GAIN), nn.ReLU(), Linear(512, classes))
+        self.rest = nn.Sequential(nn.ReLU(), *perceptron(1024, 512, classes))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Return the answer [B, classes] after the last step of [B, T, F]."""
@@ -66,12 +55,9 @@ class AllStepsDecoder(nn.Module):
         parts = torch.einsum("btf,otf->bto", features, weight.to(features.dtype))
         return self.rest(parts.cumsum(1) + self.first.bias)
 
-    def init_state(
-        self, batch: int, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> tuple[torch.Tensor, int]:
+    def init_state(self, batch: int) -> tuple[torch.Tensor, int]:
         """Return the state before the first step: the first layer's sum [B, 1024] and the number of steps seen."""
-        like = self.first.weight
-        return torch.zeros(batch, 1024, device=device or like.device, dtype=dtype or like.dtype), 0
+        return self.first.weight.new_zeros(batch, 1024), 0
 
     def step(
         self, features: torch.Tensor, state: tuple[torch.Tensor, int]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -207,6 +208,19 @@ class Conv2d(nn.Conv2d):
 
 def _two(value: Any) -> tuple[int, int]:
     return (int(value[0]), int(value[1]))
+
+
+def perceptron(*widths: int, norms: int = 0, use_bias: bool = True) -> nn.Sequential:
+    """Return linear layers of these widths with ReLU between, the first ``norms`` of them followed by batch norms."""
+    layers = nn.Sequential()
+    for index, (width, after) in enumerate(pairwise(widths)):
+        if index:
+            layers.append(nn.ReLU())
+        gain = RECTIFIER_GAIN if index < len(widths) - 2 else 1.0
+        layers.append(Linear(width, after, use_bias=use_bias, gain=gain))
+        if index < norms:
+            layers.append(nn.BatchNorm1d(after))
+    return layers
 
 
 class Linear(nn.Linear):

@@ -16,6 +16,7 @@ Letters: H channels, N conjugate pairs, L length.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,13 +49,9 @@ class System(NamedTuple):
 class StateSpace(nn.Module):
     """H independent systems with N conjugate pairs each: [B, L, H] → [B, L, H].
 
-    Args:
-        channels: H.
-        pairs: N.
-        step_range: Smallest and largest initial Δ in time steps, drawn log-uniformly.
-
-    Initial dynamics are HiPPO-LegS (Gu et al. 2020), the same for every channel. Complex parameters are
-    stored as real and imaginary parts, so that a change of precision cannot drop one.
+    The initial Δ is drawn log-uniformly in ``step_range``, in time steps. Initial dynamics are HiPPO-LegS (Gu et al.
+    2020), the same for every channel. Complex parameters are stored as real and imaginary parts, so that a change of
+    precision cannot drop one.
     """
 
     def __init__(self, channels: int, pairs: int = 32, *, step_range: tuple[float, float] = (1e-3, 1e-1)) -> None:
@@ -90,7 +87,7 @@ class StateSpace(nn.Module):
         """Return the response [H, L] in double precision to one unit of input at step 0, without the skip."""
         rows = max(1, _BLOCK // (self.frequency.shape[1] * (length + 1)))
         parts = zip(*(part.split(rows) for part in self._double()), strict=True)
-        return torch.cat([_kernel(*part, length=length) for part in parts])
+        return torch.cat([_kernel(part, length) for part in parts])
 
     def system(self) -> System:
         """Return the discretised system for :meth:`step`, in the precision of the parameters."""
@@ -106,13 +103,9 @@ class StateSpace(nn.Module):
         parts = (2 * inverse - 1, 2 * left, row, step[:, None] * driven, readout)
         return System(*(torch.view_as_real(part).to(self.skip.dtype) for part in parts))
 
-    def init_state(
-        self, batch: int, device: torch.device | str | None, dtype: torch.dtype | None
-    ) -> tuple[torch.Tensor, System]:
+    def init_state(self, batch: int) -> tuple[torch.Tensor, System]:
         """Return the empty memory [batch, H, N, 2] and the discretised system."""
-        options = {"device": device or self.skip.device, "dtype": dtype or self.skip.dtype}
-        system = System(*(part.to(**options) for part in self.system()))
-        return torch.zeros(batch, *self.readout.shape, **options), system
+        return self.skip.new_zeros(batch, *self.readout.shape), self.system()
 
     def step(self, u: torch.Tensor, memory: torch.Tensor, system: System) -> tuple[torch.Tensor, torch.Tensor]:
         """Advance by one step of input [B, H]; return the answer [B, H] and the next memory [B, H, N, 2]."""
@@ -130,16 +123,9 @@ class StateSpace(nn.Module):
         return (poles, *others, torch.exp(self.log_step.double()))
 
 
-def _kernel(
-    poles: torch.Tensor,
-    low_rank: torch.Tensor,
-    drive: torch.Tensor,
-    readout: torch.Tensor,
-    step: torch.Tensor,
-    *,
-    length: int,
-) -> torch.Tensor:
+def _kernel(system: Sequence[torch.Tensor], length: int) -> torch.Tensor:
     """Return the kernel [H, L] of systems given by Λ, P, B, C [H, N] and Δ [H]."""
+    poles, low_rank, drive, readout, step = system
     points = 2 * length
     radius = _WRAPPED ** (1.0 / points)
     turns = torch.arange(length + 1, device=step.device, dtype=torch.float64) * (-2 * math.pi / points)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 from brainbench.models.architecture import OBJECTIVES
-from brainbench.models.recipes import BATCH_SIZE, EPOCHS, TrainingSetting, recipe_for
+from brainbench.models.recipes import BATCH_SIZE, EPOCHS, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
 
 PRECISIONS = ("auto", "float32", "bf16")
@@ -100,18 +98,13 @@ class TrainingConfig:
         recipe = recipe_for(model, objective)
         setting = recipe.setting
         if variant == "warmup" and objective == "simsiam":
-            setting = TrainingSetting(setting.optimizer, setting.schedule, setting.learning_rate, 10)
+            setting = replace(setting, warmup_epochs=10)
         elif variant:
-            raise unknown_name("objective", f"{objective}-{variant}", ("supervised", "simclr", "simsiam", "ae"))
-        values = {
-            "model": model,
-            "objective": objective,
-            "batch_size": recipe.batch_size,
-            "epochs": recipe.epochs,
-            "decoder": recipe.decoder if objective == "supervised" else "linear",
-            **dataclasses.asdict(setting),
-        }
-        return cls.from_mapping({**values, **{name: value for name, value in changes.items() if value is not None}})
+            raise unknown_name("objective", f"{objective}-{variant}", OBJECTIVES)
+        values = {"model": model, "objective": objective, "batch_size": recipe.batch_size, "epochs": recipe.epochs}
+        values["decoder"] = recipe.decoder if objective == "supervised" else "linear"
+        stated = {name: value for name, value in changes.items() if value is not None}
+        return cls.from_mapping({**values, **vars(setting), **stated})
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> TrainingConfig:
@@ -120,13 +113,13 @@ class TrainingConfig:
         Raises:
             UsageError: a name does not exist, or a value is of another kind or outside its range.
         """
-        known = {field.name: field for field in fields(cls)}
+        known = {field.name: str(field.type) for field in fields(cls)}
         for name, value in values.items():
             if name not in known:
                 raise unknown_name("training option", name, known)
-            kinds = {"str": (str,), "int": (int,), "float": (int, float)}[str(known[name].type)]
+            kinds = {"str": str, "int": int, "float": (int, float)}[known[name]]
             if not isinstance(value, kinds) or isinstance(value, bool):
-                raise UsageError(f"The training option {name!r} is a {known[name].type}; received {value!r}.")
+                raise UsageError(f"The training option {name!r} is a {known[name]}; received {value!r}.")
         if "model" not in values:
             raise UsageError("A training configuration needs the option 'model'.")
         return cls(**values)
@@ -142,7 +135,7 @@ class TrainingConfig:
     def identity(self) -> dict[str, Any]:
         """Options that must be equal for a run to be resumed: all but how often and how exactly results are stored."""
         free = ("checkpoint_seconds", "weights_dtype")
-        return {name: value for name, value in dataclasses.asdict(self).items() if name not in free}
+        return {name: value for name, value in asdict(self).items() if name not in free}
 
 
 def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
@@ -171,29 +164,3 @@ def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
             "attender, or the augmentation 'image', can learn."
         )
     return found
-
-
-def read_options(path: str | Path) -> dict[str, Any]:
-    """Read training options from a TOML or JSON file.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-        DataError: it cannot be parsed or holds no mapping.
-    """
-    import tomllib
-
-    from brainbench.core.files import read_json
-
-    path = Path(path)
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
-    if path.suffix.lower() == ".json":
-        values = read_json(path)
-    else:
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise DataError(f"{str(path)!r} is not valid TOML ({error}).") from error
-    if not isinstance(values, dict):
-        raise DataError(f"{str(path)!r} holds a {type(values).__name__}, not names and values.")
-    return values

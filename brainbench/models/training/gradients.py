@@ -63,7 +63,7 @@ class Gradients:
     """The loss of a batch, its clipped gradients in the parameters, and their norm.
 
     Args:
-        forward: Maps (views, labels) to (loss, anything).
+        forward: Maps (views, labels) to the loss.
         parameters: What is trained.
         clip: Largest norm; 0 leaves it alone.
         autocast: Makes the context of the forward pass.
@@ -108,7 +108,7 @@ class Gradients:
         for parameter in self.parameters:
             parameter.grad = None
         with self.autocast():
-            loss, _ = self.forward(given[:-1], given[-1])
+            loss = self.forward(given[:-1], given[-1])
         loss.backward()
         # One norm over all tensors keeps the direction of the step; an infinite limit measures it alone.
         trained = [parameter for parameter in self.parameters if parameter.grad is not None]

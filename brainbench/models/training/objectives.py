@@ -20,7 +20,7 @@ RECONSTRUCTION_WEIGHT = 0.5
 SPARSITY_WEIGHT = 1e-4
 
 
-def nt_xent(first: torch.Tensor, second: torch.Tensor, *, temperature: float = TEMPERATURE) -> torch.Tensor:
+def nt_xent(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """Return the normalised temperature-scaled cross-entropy of embeddings [B, D] of two views (Chen et al. 2020).
 
     Each view must find its partner among the 2 B − 1 others. Over several processes the embeddings of all are
@@ -34,7 +34,7 @@ def nt_xent(first: torch.Tensor, second: torch.Tensor, *, temperature: float = T
     itself = row + 2 * start
     # Mixed precision would round cosines to three digits before they are divided by the temperature.
     with torch.autocast(own.device.type, enabled=False):
-        similarity = own @ every.T / temperature
+        similarity = own @ every.T / TEMPERATURE
     # A view is no candidate of its own: the softmax runs over the 2 B − 1 others.
     similarity = similarity.index_put((row, itself), torch.full((), -torch.inf, device=own.device).expand(len(own)))
     # Both views of a sweep stand side by side, so indices of partners differ in the last bit.
@@ -56,19 +56,17 @@ def autoencoder_loss(reconstruction: torch.Tensor, target: torch.Tensor, latent:
 
 
 class Learner(nn.Module):
-    """A network and the head of its objective; forward gives (loss, answers [B, classes] or None).
+    """A network [B, T, C, H, W] in SI → [B, classes] with its objective's head: (views, labels [B]) → loss [].
 
-    Args:
-        model: Maps [B, T, C, H, W] in SI to [B, classes]. Self-supervised objectives need ``encode``, ``features`` and
-            ``normaliser``, as :class:`~brainbench.models.network.EncoderAttenderDecoder` has them.
+    Self-supervised objectives need a network with ``encode``, ``features`` and ``normaliser``, as
+    :class:`~brainbench.models.network.EncoderAttenderDecoder` has them.
 
     Raises:
         UsageError: the objective learns from features, and the network names none.
-
-    ``views`` says how many augmented views of a batch the forward pass takes.
     """
 
     views: int = 1
+    """Augmented views of a batch that the forward pass takes."""
     supervised: bool = False
 
     def __init__(self, model: nn.Module) -> None:
@@ -83,28 +81,19 @@ class Learner(nn.Module):
             # The decoder has no part in it and is fitted afterwards, by the linear probe.
             self.model.decoder.requires_grad_(False)
 
-    def last_features(self, *views: torch.Tensor) -> torch.Tensor:
-        """Return the features at the last step of all views [views × B, F]."""
-        return self.model.encode(torch.cat(views), last=True)
-
 
 class Supervised(Learner):
     """Cross-entropy of the decoder's answer to the class labels."""
 
     supervised = True
 
-    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        """Return (loss, answers [B, classes])."""
-        answers = self.model(views[0])
-        return functional.cross_entropy(answers.float(), labels), answers
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
+        """Return the loss."""
+        return functional.cross_entropy(self.model(views[0]).float(), labels)
 
 
 class SimCLR(Learner):
-    """Contrast of two views at the last step's features.
-
-    Args:
-        model: As of :class:`Learner`.
-    """
+    """Contrast of two views at the last step's features."""
 
     views = 2
 
@@ -112,19 +101,14 @@ class SimCLR(Learner):
         super().__init__(model)
         self.head = SimCLRHead(self.model.features)
 
-    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        """Return (loss, None)."""
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
+        """Return the loss; labels have no part in it."""
         del labels
-        first, second = self.head(self.last_features(*views)).chunk(2)
-        return nt_xent(first, second), None
+        return nt_xent(*self.head(self.model.encode(torch.cat(views), last=True)).chunk(2))
 
 
 class SimSiam(Learner):
-    """Prediction of one view's projection from the other's.
-
-    Args:
-        model: As of :class:`Learner`.
-    """
+    """Prediction of one view's projection from the other's."""
 
     views = 2
 
@@ -132,30 +116,27 @@ class SimSiam(Learner):
         super().__init__(model)
         self.head = SimSiamHead(self.model.features)
 
-    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        """Return (loss, None)."""
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
+        """Return the loss; labels have no part in it."""
         del labels
-        first, second = self.last_features(*views).chunk(2)
+        first, second = self.model.encode(torch.cat(views), last=True).chunk(2)
         (z1, p1), (z2, p2) = self.head(first), self.head(second)
-        return simsiam_loss(p1, z1, p2, z2), None
+        return simsiam_loss(p1, z1, p2, z2)
 
 
 class Autoencoding(Learner):
     """Reconstruction of every step of the stimulus, in normalised units, from the features.
 
     Features know a step only after the encoder's latency, so those of step t + latency reconstruct step t.
-
-    Args:
-        model: As of :class:`Learner`.
     """
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__(model)
-        channels, rows, columns = self.model.spec.input_shape
-        self.head = AutoencoderHead(self.model.features, channels=channels, grid=(rows, columns))
+        channels, *grid = self.model.spec.input_shape
+        self.head = AutoencoderHead(self.model.features, channels=channels, grid=(grid[0], grid[1]))
 
-    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        """Return (loss, None).
+    def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
+        """Return the loss; labels have no part in it.
 
         Raises:
             UsageError: sweeps are no longer than the encoder's latency.
@@ -169,7 +150,7 @@ class Autoencoding(Learner):
             )
         latent = self.model.encode(x)[:, latency:]
         target = self.model.normaliser(x[:, : x.shape[1] - latency])
-        return autoencoder_loss(self.head(latent), target, latent), None
+        return autoencoder_loss(self.head(latent), target, latent)
 
 
 LEARNERS = {"supervised": Supervised, "simclr": SimCLR, "simsiam": SimSiam, "ae": Autoencoding}

@@ -130,27 +130,3 @@ def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int 
     # Cosine annealing ½(1 + cos πt) to zero, with t from the end of the warm-up (thesis, table 3.2).
     done = (epoch - warmup) / max(epochs - warmup, 1e-9)
     return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
-
-
-def make_capturable(optimizer: Optimizer, rate: torch.Tensor) -> None:
-    """Let an optimiser read its learning rate from a tensor, and keep its counters on the device.
-
-    Args:
-        optimizer: One of :data:`OPTIMIZERS`, before its first step.
-        rate: The learning rate [], on the device of the parameters.
-    """
-    for group in optimizer.param_groups:
-        group["lr"] = rate
-        if "fused" in group:
-            group["fused"], group["foreach"] = True, False
-        if "capturable" in group:
-            group["capturable"] = rate.is_cuda
-
-
-@torch.no_grad()
-def reset_optimizer(optimizer: Optimizer) -> None:
-    """Put all moments and counters back to zero, in place."""
-    for entries in optimizer.state.values():
-        for value in entries.values():
-            if isinstance(value, torch.Tensor):
-                value.zero_()

@@ -6,7 +6,7 @@ the folder; ``job`` picks every count-th run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from brainbench.core.errors import DataError, UsageError
@@ -14,18 +14,10 @@ from brainbench.models.recipes import recipe_for
 from brainbench.models.training.config import TrainingConfig
 
 
-@dataclass(frozen=True)
-class SweepRun:
-    """One point of a search space and where it is trained."""
-
-    config: TrainingConfig
-    folder: Path
-
-
 def sweep_runs(
     config: TrainingConfig, out: str | Path, *, job: tuple[int, int] = (0, 1), warmup: bool = False
-) -> list[SweepRun]:
-    """Return the runs of the search space published for a model and an objective.
+) -> list[tuple[TrainingConfig, Path]]:
+    """Return the runs of the search space published for a model and an objective, each with its folder.
 
     Args:
         config: What all runs share; optimiser, schedule and learning rate are replaced.
@@ -36,18 +28,15 @@ def sweep_runs(
     Raises:
         UsageError: the job's number is not below the number of jobs.
     """
-    import dataclasses
-
     if not 0 <= job[0] < job[1]:
         raise UsageError(f"A job is (number, count) with 0 ≤ number < count; received {job}.")
     runs = []
     for setting in recipe_for(config.model, config.objective).search[job[0] :: job[1]]:
         if warmup:
-            setting = dataclasses.replace(setting, warmup_epochs=10)
-        point = dataclasses.replace(config, **dataclasses.asdict(setting))
+            setting = replace(setting, warmup_epochs=10)
         warm = f"-warm{setting.warmup_epochs}" if setting.warmup_epochs else ""
         name = f"{setting.optimizer}-{setting.schedule}{warm}-{setting.learning_rate:g}-seed{config.seed}"
-        runs.append(SweepRun(point, Path(out) / name))
+        runs.append((replace(config, **vars(setting)), Path(out) / name))
     return runs
 
 
@@ -63,19 +52,17 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
     from brainbench.core.files import read_json
     from brainbench.models.training.run_folder import RUN, read_log
 
-    scores: dict[str, tuple[float, float]] = {}
+    scores: dict[str, float] = {}
+    costs: dict[str, float] = {}
     for path in sorted(Path(out).glob(f"*/{RUN}")):
         if read_json(path).get("status") != "finished":
             continue
-        lines = read_log(path.parent, "validation") or read_log(path.parent, "epoch")
+        name, lines = path.parent.name, read_log(path.parent, "validation") or read_log(path.parent, "epoch")
         accuracies = [line["top1"] for line in lines if line.get("top1") is not None]
         losses = [line["loss"] for line in lines if line.get("loss") is not None]
-        if accuracies:
-            scores[path.parent.name] = (-max(accuracies), max(accuracies))
-        elif losses:
-            scores[path.parent.name] = (min(losses), min(losses))
+        if accuracies or losses:
+            scores[name] = max(accuracies) if accuracies else min(losses)
+            costs[name] = -scores[name] if accuracies else scores[name]
     if not scores:
         raise DataError(f"No run in {str(out)!r} is finished.")
-    return Path(out) / min(scores, key=lambda name: scores[name][0]), {
-        name: shown for name, (_, shown) in scores.items()
-    }
+    return Path(out) / min(costs, key=costs.__getitem__), scores

@@ -26,7 +26,7 @@ from brainbench.models.activations import evaluating
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import Augmentation
-from brainbench.models.training.batches import Batches, Data
+from brainbench.models.training.batches import Batches, BatchOptions, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, config_warnings
@@ -257,7 +257,7 @@ class _Run:
                 # The same views in every epoch, so that losses can be compared.
                 views = self._views(x, -1 - index)
                 if len(x) > 1:
-                    total, count = total + float(self.learner(views, labels)[0]), count + 1
+                    total, count = total + float(self.learner(views, labels)), count + 1
         mean = self.where.mean(total / max(count, 1))
         self.log.write("validation", self.at.step, loss=mean)
         return mean if math.isfinite(mean) else math.inf
@@ -271,15 +271,9 @@ class _Run:
             self._load_best()
             if self.config.objective != "supervised" and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
-                features = self._batches("train", shuffle=False, part=False)
-                fit_probe(
-                    self.model,
-                    features or (),
-                    classes=len(self.data.classes),
-                    epochs=self.config.probe_epochs,
-                    seed=self.config.seed,
-                    device=self.where.device,
-                )
+                sweeps, epochs = self._batches("train", shuffle=False, part=False) or (), self.config.probe_epochs
+                how = {"classes": len(self.data.classes), "epochs": epochs, "seed": self.config.seed}
+                fit_probe(self.model, sweeps, **how, device=self.where.device)
             for split in ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)
                 if batches is not None:
@@ -301,23 +295,10 @@ class _Run:
         load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
 
     def _publish(self, result: Evaluation | None) -> None:
-        info = checkpoint_info(
-            self.config,
-            self.data.classes,
-            epochs_done=self.at.epoch,
-            best_epoch=self.at.best_epoch,
-            evaluation=result,
-            drawn_biases=self.drawn,
-        )
-        save_checkpoint(
-            self.out / BEST,
-            self.model,
-            architecture=self.config.model,
-            options=self.options,
-            info=info,
-            card=model_card(self.config, info),
-            dtype=self.config.stored_dtype,
-        )
+        done = {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch, "drawn_biases": self.drawn}
+        info = checkpoint_info(self.config, self.data.classes, evaluation=result, **done)
+        told = {"info": info, "card": model_card(self.config, info), "dtype": self.config.stored_dtype}
+        save_checkpoint(self.out / BEST, self.model, architecture=self.config.model, options=self.options, **told)
 
     def _save(self) -> None:
         self.saved = time.monotonic()
@@ -352,26 +333,15 @@ class _Run:
         return reason
 
     def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:
+        where = (self.at.step, self.at.epoch, self.at.best_epoch)
         return TrainingResult(
-            status,
-            reason,
-            self.out / BEST,
-            self.at.step,
-            self.at.epoch,
-            self.at.best_epoch,
-            evaluation,
-            round(time.monotonic() - self.started, 3),
+            status, reason, self.out / BEST, *where, evaluation, round(time.monotonic() - self.started, 3)
         )
 
     def _batches(self, split: str, *, shuffle: bool, part: bool = True) -> Batches | None:
-        return self.data.batches(
-            split,
-            batch_size=self.config.batch_size,
-            shuffle=shuffle,
-            seed=self.config.seed,
-            part=self.where.part if part else (0, 1),
-            device=self.where.device,
-        )
+        mine = self.where.part if part else (0, 1)
+        options = BatchOptions(self.config.batch_size, shuffle, self.config.seed, mine, self.where.device)
+        return self.data.batches(split, options)
 
     def _precision(self) -> Any:
         if self.config.precision == "float32":

@@ -50,7 +50,7 @@ def test_the_kernel_equals_powers_of_the_dense_bilinear_system(space):
 def test_the_convolution_equals_the_recurrence(length):
     space, u = StateSpace(8, 32), torch.randn(2, length, 8)
     expected = space(u)
-    memory, system = space.init_state(2, None, None)
+    memory, system = space.init_state(2)
     for t in range(length):
         y, memory = space.step(u[:, t], memory, system)
         torch.testing.assert_close(y, expected[:, t], atol=1e-4, rtol=1e-4)

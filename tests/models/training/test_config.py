@@ -1,13 +1,12 @@
-import json
 import logging
 
 import pytest
 import torch
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import reverse_time
-from brainbench.models.training.config import TrainingConfig, config_warnings, read_options
+from brainbench.models.training.config import TrainingConfig, config_warnings
 from brainbench.models.training.trainer import train
 from tests.factories.training_sweeps import sweeps, tiny
 
@@ -51,22 +50,6 @@ def test_a_configuration_names_its_model():
         TrainingConfig.from_mapping({"epochs": 1})
     with pytest.raises(UsageError, match="objective 'ae-warmup'"):
         TrainingConfig.published("zhuang", "ae-warmup")
-
-
-def test_options_are_read_from_toml_and_json(tmp_path):
-    (tmp_path / "a.toml").write_text('epochs = 4\naugmentation = "none"\n')
-    (tmp_path / "a.json").write_text(json.dumps({"epochs": 4, "augmentation": "none"}))
-    assert (
-        read_options(tmp_path / "a.toml") == read_options(tmp_path / "a.json") == {"epochs": 4, "augmentation": "none"}
-    )
-    (tmp_path / "b.toml").write_text("epochs = \n")
-    with pytest.raises(DataError, match="not valid TOML"):
-        read_options(tmp_path / "b.toml")
-    with pytest.raises(DataFileNotFoundError):
-        read_options(tmp_path / "none.toml")
-    (tmp_path / "c.json").write_text("[1]")
-    with pytest.raises(DataError, match="holds a list"):
-        read_options(tmp_path / "c.json")
 
 
 def _warnings(name, objective, **changes):
@@ -114,9 +97,9 @@ def test_validation_of_a_contrastive_run_mixes_the_classes(objective, mixed, tmp
     data, asked = tiny(), []
     batches = data.batches
 
-    def spy(split, **options):
-        asked.append((split, options["shuffle"]))
-        return batches(split, **options)
+    def spy(split, options):
+        asked.append((split, options.shuffle))
+        return batches(split, options)
 
     monkeypatch.setattr(data, "batches", spy)
     options = {"epochs": 1, "batch_size": 8, "probe_epochs": 0, "precision": "float32", "learning_rate": 1e-3}

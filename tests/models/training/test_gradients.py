@@ -4,38 +4,10 @@ import torch
 from brainbench.models.cells import CELLS
 from brainbench.models.training import gradients
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.gradients import copy_state, fuse
-from brainbench.models.training.optimizers import OPTIMIZERS, make_capturable, make_optimizer, reset_optimizer
+from brainbench.models.training.gradients import fuse
 from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
 from tests.factories.training_sweeps import tiny
-
-
-def _step(layer, optimizer, x):
-    optimizer.zero_grad()
-    layer(x).square().sum().backward()
-    optimizer.step()
-
-
-@pytest.mark.parametrize("name", OPTIMIZERS)
-def test_an_optimizer_put_back_to_zero_steps_like_a_new_one_with_its_rate_in_a_tensor(name):
-    torch.manual_seed(0)
-    first, second = torch.nn.Linear(5, 4), torch.nn.Linear(5, 4)
-    second.load_state_dict(first.state_dict())
-    plain = make_optimizer(name, first.parameters(), 1e-2)
-    other, rate = make_optimizer(name, second.parameters(), 1.0), torch.tensor(1.0)
-    make_capturable(other, rate)
-    start = {key: value.clone() for key, value in second.state_dict().items()}
-    _step(second, other, torch.randn(7, 5))
-    assert not torch.equal(second.weight, start["weight"])
-    copy_state(second, start)
-    reset_optimizer(other)
-    rate.fill_(1e-2)
-    for _ in range(4):
-        x = torch.randn(7, 5)
-        _step(first, plain, x)
-        _step(second, other, x)
-    torch.testing.assert_close(second.weight, first.weight)
 
 
 @pytest.mark.parametrize("model", ["zhuang-small", "resnet18-small"])

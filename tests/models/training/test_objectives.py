@@ -58,7 +58,7 @@ def test_the_autoencoder_loss_weighs_error_and_sparsity():
 @pytest.mark.parametrize("objective", NAMES)
 def test_gradients_reach_what_an_objective_trains_and_nothing_else(objective):
     learner = _learner(objective)
-    loss, _ = learner(*_batch(learner))
+    loss = learner(*_batch(learner))
     loss.backward()
     for name, parameter in learner.named_parameters():
         if parameter.requires_grad:
@@ -75,7 +75,7 @@ def test_a_few_steps_on_one_batch_lower_the_loss(objective):
     optimizer = torch.optim.Adam([p for p in learner.parameters() if p.requires_grad], lr=1e-3)
     losses = []
     for _ in range(6):
-        loss, _ = learner(*batch)
+        loss = learner(*batch)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -95,7 +95,7 @@ def test_a_plain_network_can_only_be_trained_supervised():
         def forward(self, x):
             return x.flatten(1)[:, :3]
 
-    assert make_learner("supervised", Plain())((torch.zeros(2, 1, 6, 5, 7),), torch.tensor([0, 1]))[0] > 0
+    assert make_learner("supervised", Plain())((torch.zeros(2, 1, 6, 5, 7),), torch.tensor([0, 1])) > 0
     with pytest.raises(UsageError, match=r"SimCLR .* Plain"):
         make_learner("simclr", Plain())
     with pytest.raises(UsageError, match="objective 'simclear'"):

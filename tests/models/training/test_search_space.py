@@ -14,22 +14,22 @@ def _config(**changes):
 
 def test_a_sweep_has_a_run_for_every_point_of_the_search_space(tmp_path):
     runs = sweep_runs(_config(), tmp_path)
-    assert len(runs) == len({run.folder for run in runs}) == 6
-    assert runs[0].folder.name == "sgd-step-0.1-seed0"
-    assert {run.config.epochs for run in runs} == {1}
+    assert len(runs) == len({folder for _, folder in runs}) == 6
+    assert runs[0][1].name == "sgd-step-0.1-seed0"
+    assert {config.epochs for config, _ in runs} == {1}
     shares = [sweep_runs(_config(), tmp_path, job=(number, 4)) for number in range(4)]
-    assert sorted(run.folder for share in shares for run in share) == sorted(run.folder for run in runs)
+    assert sorted(folder for share in shares for _, folder in share) == sorted(folder for _, folder in runs)
     with pytest.raises(UsageError, match="0 ≤ number < count"):
         sweep_runs(_config(), tmp_path, job=(4, 4))
     warm = sweep_runs(TrainingConfig.published("zhuang", "simsiam"), tmp_path, warmup=True)
-    assert {run.config.warmup_epochs for run in warm} == {10}
+    assert {config.warmup_epochs for config, _ in warm} == {10}
 
 
 def test_the_best_run_is_chosen_by_validation(tmp_path):
     with pytest.raises(DataError, match=r"No run in .* is finished"):
         best_run(tmp_path)
-    for run in sweep_runs(_config(), tmp_path)[:2]:
-        train(run.config, tiny(), out=run.folder, device="cpu")
+    for config, folder in sweep_runs(_config(), tmp_path)[:2]:
+        train(config, tiny(), out=folder, device="cpu")
     winner, scores = best_run(tmp_path)
     assert len(scores) == 2
     assert scores[winner.name] == max(scores.values())
