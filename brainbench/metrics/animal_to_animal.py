@@ -15,7 +15,7 @@ from brainbench.core.records import Interval, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
 from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.inference.intervals import interval_reasons, two_factor_interval
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, label_orders
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
@@ -68,12 +68,13 @@ def score_agreement(
     values = {i: raw[i] * factors[i].value for i in compared}
     found = [i for i in compared if math.isfinite(values[i])]
     parts = np.array([values[i] for i in found])
-    null, without = np.empty(0), np.empty(0)
+    null, without, chance = np.empty(0), np.empty(0), math.nan
     if found and len(found) == len(compared):
         weights = np.array([factors[i].value for i in found])
         without = np.stack([pair.without_each()[:, 0, 0] for pair in pairs], axis=1) @ weights / len(weights)
         if count >= SMALLEST_STIMULI:
             null = _null(metric, animals, weights, seed)
+            chance = _chance(metric, pairs, weights, seed)
     smallest = smallest_p_of_animals(count, max(2, len(compared)), metric.orders_between)
     status, reasons = _verdict(metric, animals, factors, found, count, smallest)
     reliability, reliability_interval = mean_reliability(animals)
@@ -110,11 +111,17 @@ def score_agreement(
         metric=f"{metric.describe(animals.subjects)}; each animal against the others",
         stimuli=tuple(map(str, stimuli)),
         brain_rdm=mean_rdm(animals) if metric.of_rdms else (),
-        chance=float(null.mean()) if null.size else math.nan,
+        chance=chance,
         attainable=attainable,
         without_stimulus=tuple(without[np.argsort(animals.order)].tolist()) if without.size else (),
         provenance=Provenance.of({"seed": seed, "reliability_gate": RELIABILITY_GATE}),
     )
+
+
+def _chance(metric: Metric, pairs: Sequence[LayerComparisons], factors: Floats, seed: int) -> float:
+    """Return the mean agreement when the others' stimuli are permuted together, as those of a model are."""
+    orders = list(label_orders(pairs[0].animals[0].count, seed, exact=0, draws=metric.orders_between))[1:]
+    return float(np.mean([np.mean(next(pair.under(lambda: orders))) for pair in pairs] * factors))
 
 
 def _null(metric: Metric, animals: Animals, factors: Floats, seed: int) -> Floats:

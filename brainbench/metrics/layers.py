@@ -53,7 +53,7 @@ class LayerRule:
 
     def held(self, r: Floats) -> Floats:
         """Return the comparison [..., A] of each animal with the layer chosen for it."""
-        return r[..., self.fixed, :] if self.kind == "fixed" else _take(r, self.choose(r))
+        return r[..., self.fixed, :] if self.kind == "fixed" else take_layers(r, self.choose(r))
 
 
 def layer_rule(
@@ -90,7 +90,7 @@ def choose_on_others(r: Floats) -> Ints:
 
 def held_out(r: Floats) -> Floats:
     """Return the comparison [..., A] of each animal with the layer chosen on the others, from r [..., L, A]."""
-    return _take(r, choose_on_others(r))
+    return take_layers(r, choose_on_others(r))
 
 
 def most_chosen(chosen: Ints) -> int:
@@ -109,5 +109,7 @@ def _first_best(values: Floats) -> Ints:
     return np.argmax(values >= values.max(axis=-2, keepdims=True) - _TIE, axis=-2)
 
 
-def _take(values: Floats, index: Ints) -> Floats:
+def take_layers(values: Floats, index: Ints) -> Floats:
+    """Return the values [..., A] of one layer for each animal, from [..., L, A] and layers [A] or [..., A]."""
+    index = np.broadcast_to(index, (*values.shape[:-2], values.shape[-1]))
     return np.take_along_axis(values, index[..., None, :], axis=-2)[..., 0, :]

@@ -29,7 +29,7 @@ from brainbench.metrics.inference.permutation import (
     most_exact,
     smallest_p,
 )
-from brainbench.metrics.layers import HALVES, LayerRule, first_best, layer_rule, most_chosen
+from brainbench.metrics.layers import HALVES, LayerRule, first_best, layer_rule, most_chosen, take_layers
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 
@@ -128,18 +128,20 @@ def score_layers(
     means = result.layer_values.mean(axis=1)
     best, chosen = first_best(means), most_chosen(result.chosen)
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
+    attainable, hopeless = _attainable(metric, animals, result, seed)
+    if hopeless:
+        about |= {"status": "unreliable", "reasons": (hopeless, *about["reasons"])}
     statistics = {
         "monte_carlo_error": {
             "value": splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
             "p": result.test.monte_carlo_error,
         },
-        **metric.statistics(layer, scored, seed),
+        **metric.statistics(metric.take(layer, animals.order), animals.sorted, seed),
     }
     if result.layer_null.size:
         statistics["layer_tests"] = layer_table(defined, result.layer_null)
     shown = {label: row for row, label in enumerate(defined)}
     repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
-    attainable = metric.attainable(scored, seed)
     value = float(result.values.mean())
     made = Score(
         value=value,
@@ -155,7 +157,7 @@ def score_layers(
         subjects=_subjects(metric, layers, animals, result, defined),
         model_rdm=tuple(layer.tolist()) if metric.of_rdms else (),
         chance=_mean(result.test.null),
-        attainable=float((attainable * animals.factors(animals.scored)).mean()),
+        attainable=attainable,
         without_stimulus=tuple(result.without[np.argsort(animals.order)].tolist()),
         provenance=Provenance.of({"statistics": statistics, **stated}),
         **about,
@@ -211,7 +213,9 @@ def _result(
     r = judged.given() if judged is not compared else given
     chosen = rule.choose(r)
     held = rule.held(r)
-    without = rule.held(judged.without_each()) @ weights / len(weights)
+    # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
+    # a jackknife that repeats it measures the jumps instead of the stimuli.
+    without = take_layers(judged.without_each(), chosen) @ weights / len(weights)
     if judged is not compared:
         few = halves[0][: 2 * _HALVES_IN_PERMUTATIONS]
         judged, weights = LayerComparisons(metric, layers, few, compared.device), weights[: len(few)]
@@ -256,6 +260,16 @@ def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int)
     # An order under which a comparison has no value says nothing.
     found = np.where(np.isfinite(found), found, -np.inf)
     return make_test(found, exact=count <= exact, smallest=smallest), np.concatenate(means)
+
+
+def _attainable(metric: Metric, animals: Animals, result: _Result, seed: int) -> tuple[float, str]:
+    """Return the value of a perfect model, NaN where chance reaches it in one of twenty orders, and why."""
+    raw = metric.attainable([animals.subjects[i] for i in animals.scored], seed)
+    found = float((raw * animals.factors(animals.scored)).mean())
+    null = result.test.null[np.isfinite(result.test.null)]
+    if null.size and not found > (reached := float(np.quantile(null, 0.95))):
+        return math.nan, f"no scale: a perfect model would score {found:.2f}, which chance reaches ({reached:.2f})"
+    return found, ""
 
 
 def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:

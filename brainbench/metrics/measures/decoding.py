@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,15 @@ class LabelledFeatures:
     classes: Mapping[str, Ints]
     """Property → class of each stimulus [K]."""
 
+    @cached_property
+    def decoder(self) -> Decoder:
+        """The decoder, which remembers what it has decoded."""
+        return Decoder(self.features, np.arange(len(self.features)))
+
+    def right(self, order: Ints) -> Floats:
+        """Return whether each left-out stimulus is decoded rightly [properties, K], its classes in an order [K]."""
+        return np.array([self.decoder(codes[order]) for codes in self.classes.values()])
+
 
 class LabelDecoding(Metric):
     """Accuracy of decoding the labels' properties, leaving one stimulus out."""
@@ -81,23 +91,16 @@ class LabelDecoding(Metric):
         self, layers: Sequence[Any], animals: Sequence[SubjectRDM], chunks: Iterable[Ints], device: Any = None
     ) -> Iterator[Floats]:
         """Yield accuracies [N, L, A], the same for all animals."""
-        # Classes are permuted over stimuli; the folds of patterns stay and are prepared once.
-        decoders = [Decoder(layer.features, np.arange(len(layer.features))) for layer in layers]
         for orders in chunks:
-            values = np.array(
-                [
-                    [_correct(decoder, layer.classes, order).mean() for decoder, layer in zip(decoders, layers, strict=True)]
-                    for order in orders
-                ]
-            )
+            # Classes are permuted over stimuli; the folds of patterns stay and are prepared once.
+            values = np.array([[layer.right(order).mean() for layer in layers] for order in orders])
             yield np.repeat(values[..., None], len(animals), axis=-1)
 
     def compare_without(self, layers: Sequence[Any], animals: Sequence[SubjectRDM]) -> Floats:
         """Return accuracies [K, L, A] over the other stimuli left out."""
         found = []
         for layer in layers:
-            order = np.arange(len(layer.features))
-            right = _correct(Decoder(layer.features, order), layer.classes, order).mean(axis=0)
+            right = layer.right(np.arange(len(layer.features))).mean(axis=0)
             found.append((right.sum() - right) / (len(right) - 1))
         return np.repeat(np.stack(found, axis=1)[..., None], len(animals), axis=-1)
 
@@ -105,9 +108,9 @@ class LabelDecoding(Metric):
         """Return the accuracy of every property."""
         if not self.known(layer).all():
             return {}
-        orders = np.concatenate(list(label_orders(len(layer.features), seed, exact=most_exact(self.orders), draws=self.orders)))
-        decoder = Decoder(layer.features, np.arange(len(layer.features)))
-        values = np.stack([_correct(decoder, layer.classes, order).mean(axis=1) for order in orders])
+        exact = most_exact(self.orders)
+        orders = np.concatenate(list(label_orders(len(layer.features), seed, exact=exact, draws=self.orders)))
+        values = np.stack([layer.right(order).mean(axis=1) for order in orders])
         return {"decoding": _by_property(layer.classes, values)}
 
     def score(self, features: Mapping[str, ArrayLike], animals: Sequence[SubjectRDM], **options: Any) -> Score:
@@ -162,16 +165,11 @@ class _BoundDecoding(LabelDecoding):
         """Return the mean accuracy [N] with the classes of every animal's stimuli in another order."""
         found = []
         for animal, given in zip(animals, orders.swapaxes(0, 1), strict=True):
-            decoder = Decoder(animal.patterns, np.arange(animal.count))
+            layer = LabelledFeatures(animal.patterns, self._classes)
             # Orders are relative to the first, which is that of the data.
             moved = given[:, np.argsort(given[0])]
-            found.append([_correct(decoder, self._classes, order).mean() for order in moved])
+            found.append([layer.right(order).mean() for order in moved])
         return np.mean(found, axis=0)
-
-
-def _correct(decoder: Decoder, classes: Mapping[str, Ints], order: Ints) -> Floats:
-    """Return whether each left-out stimulus is decoded rightly [properties, K], its classes in an order [K]."""
-    return np.array([decoder(codes[order]) for codes in classes.values()])
 
 
 def _by_property(properties: Mapping[str, Ints], values: Floats) -> list[dict[str, Any]]:

@@ -40,6 +40,7 @@ class RidgeEncoding(PatternMetric):
     title = "share of explainable variance that ridge regression predicts for stimuli left out"
     corrected = True
     reasons = ()
+    orders_between = 39
 
     def compare(self, model: Floats, brain: SubjectRDM) -> float:
         """Return the share of variance that features [K, F] predict, raw."""
