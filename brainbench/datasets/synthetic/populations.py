@@ -48,7 +48,7 @@ class PopulationDesign:
     """Standard deviation of a unit's rate over stimuli, as a share of its mean; 0 is the null."""
     individual: float = 0.0
     """Share of the tuning variance that is an animal's own and not the shared geometry."""
-    emphasis: float = 0.5
+    emphasis: float = 0.3
     """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
     spread: float = 0.4
     """Standard deviation of the logarithm of mean rates over units."""
