@@ -111,7 +111,7 @@ class Board:
 
 
 def make_board(candidates: Sequence[Candidate], design: RecoveryDesign, true: int, number: int) -> Board:
-    """Draw the animals of a board from candidate ``true`` and score all candidates; a pure function of its arguments."""
+    """Draw the animals of a board from candidate ``true`` and score all candidates, by the arguments alone."""
     layer, rows, animals = draw_board(candidates, design, true, number)
     scores = score_board(candidates, rows, animals, design)
     scaled = scores.scaled(scores.values)
