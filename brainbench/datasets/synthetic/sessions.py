@@ -17,8 +17,8 @@ from brainbench.core.errors import unknown_name
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.sessions import Session, make_session
-from brainbench.datasets.synthetic.design import Design, DrawnSession, draw_sessions
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
+from brainbench.datasets.synthetic.populations import DrawnSession, PopulationDesign, draw_sessions
 from brainbench.datasets.synthetic.truth import SyntheticSession, write_with_truth
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
@@ -48,14 +48,14 @@ _TOUCH = 0.05
 
 
 def as_recordings(
-    geometry: ResponseGeometry, design: Design | None = None, *, seed: int | Sequence[int] = 0
+    geometry: ResponseGeometry, design: PopulationDesign | None = None, *, seed: int | Sequence[int] = 0
 ) -> xr.Dataset:
     """Draw synthetic animals as a recordings data set, ready for ``trials_by_subject`` and ``score``.
 
     Raises:
         DataError: the design leaves no trial or one condition only.
     """
-    counted, length = [], (design or Design()).window
+    counted, length = [], (design or PopulationDesign()).window
     for drawn in draw_sessions(geometry, design, seed):
         trials, units = drawn.counts.shape
         labels = tuple(geometry.labels[index] for index in drawn.labels)
@@ -85,7 +85,7 @@ def as_recordings(
 
 
 def make_sessions(
-    geometry: ResponseGeometry, design: Design | None = None, *, seed: int | Sequence[int] = 0
+    geometry: ResponseGeometry, design: PopulationDesign | None = None, *, seed: int | Sequence[int] = 0
 ) -> list[Session]:
     """Draw synthetic animals as sessions of spike times.
 
@@ -100,7 +100,7 @@ def make_sessions(
 def write_files(
     folder: str | os.PathLike[str],
     geometry: ResponseGeometry,
-    design: Design | None = None,
+    design: PopulationDesign | None = None,
     *,
     seed: int | Sequence[int] = 0,
     format: str = "nwb",
@@ -125,7 +125,7 @@ def write_files(
         write=writers[format],
         suffix=f".{format}",
         seed=seed,
-        design=design or Design(),
+        design=design or PopulationDesign(),
         labels=geometry.labels,
         shared=geometry.rdm,
     )
