@@ -167,7 +167,9 @@ def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator
     entries = design.stimuli**2
     # Bounds the comparisons that are held at once, over experiments, orders, layers and animals.
     step = max(
-        1, _CHUNK_ELEMENTS // (orders * max(entries * design.layers, design.layers * (design.animals if design.layers > 1 else 1)))
+        1,
+        _CHUNK_ELEMENTS
+        // (orders * max(entries * design.layers, design.layers * (design.animals if design.layers > 1 else 1))),
     )
     for start in range(0, simulations, step):
         yield min(step, simulations - start)

@@ -144,9 +144,7 @@ def score_over_time(
     observed = joined.compared()
     own = held_out_course(observed)[0][0] * factors
     left_out = [joined.without_stimulus(stimulus) for stimulus in range(joined.stimuli)]
-    intervals = _intervals(
-        own, np.stack([_mean(held_out_course(item)[0][0] * factors) for item in left_out], axis=-1)
-    )
+    intervals = _intervals(own, np.stack([_mean(held_out_course(item)[0][0] * factors) for item in left_out], axis=-1))
     points = tuple(
         TimePoint(
             time=(index + 0.5) * width,
@@ -288,7 +286,9 @@ def _latencies(
                 latency=math.nan if reason else float(best[index]),
                 value=float(np.nanmax(reached[index])) if tried else math.nan,
                 p=float(p[index]) if tried else math.nan,
-                interval=_interval(float(best[index]), pseudo[index], without[index]) if steady and not reason else None,
+                interval=_interval(float(best[index]), pseudo[index], without[index])
+                if steady and not reason
+                else None,
                 reason=reason,
             )
         )

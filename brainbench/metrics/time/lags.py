@@ -42,9 +42,7 @@ class LaggedRDMs:
     comparison: str
 
     @classmethod
-    def join(
-        cls, movies: Sequence[Floats], animals: Sequence[Floats], *, largest: int, comparison: str
-    ) -> LaggedRDMs:
+    def join(cls, movies: Sequence[Floats], animals: Sequence[Floats], *, largest: int, comparison: str) -> LaggedRDMs:
         """Join movies [T', P] of layers and [T, P] of animals.
 
         Args:
