@@ -20,6 +20,7 @@ from leaderboards.entries import Entry
 from leaderboards.figures.architecture import diagram, layer_order
 from leaderboards.figures.charts import layers_of
 from leaderboards.figures.marks import axis_of, interval_ends, record_charts
+from leaderboards.figures.time_course import draw_time_course
 from leaderboards.ranking import comparisons
 from leaderboards.site.page import render
 
@@ -66,6 +67,7 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
         "record": record,
         "recordings": score.provenance.recordings_name,
         **record_charts(record),
+        "time_course": draw_time_course(score.provenance.statistics),
         "comparisons": comparisons(record),
         "methods": text.methods(record),
         "command": score.provenance.command,

@@ -164,13 +164,9 @@ def needed(
 
 
 def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator[int]:
-    entries = design.stimuli**2
-    # Bounds the comparisons that are held at once, over experiments, orders, layers and animals.
-    step = max(
-        1,
-        _CHUNK_ELEMENTS
-        // (orders * max(entries * design.layers, design.layers * (design.animals if design.layers > 1 else 1))),
-    )
+    # Bounds the models' moved entries and the comparisons, held at once over experiments and orders.
+    each = design.layers * max(design.stimuli**2, design.animals)
+    step = max(1, _CHUNK_ELEMENTS // (orders * each))
     for start in range(0, simulations, step):
         yield min(step, simulations - start)
 

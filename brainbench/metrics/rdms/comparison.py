@@ -113,7 +113,7 @@ def permuted_comparisons(
         else:
             # A square matrix read row by row: the entry (i, j) comes from (order[i], order[j]).
             places = (moved[:, :, None] * count + moved[:, None, :]).reshape(len(moved), -1)
-        # numpy's plain indexing would put the pairs in the slowest axis, where the product cannot use BLAS: 10 times slower.
+        # Plain indexing leaves the pairs in a slow axis, where the product cannot use BLAS: 10 times slower.
         permuted = left[:, places] if is_tensor(left) else left.take(places, axis=1)
         yield fetch((permuted @ right).swapaxes(0, 1))
 

@@ -26,7 +26,7 @@ from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, tw
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.layers import most_chosen
 from brainbench.metrics.rdms.comparison import check_comparison
-from brainbench.metrics.rdms.pairs import Floats, Ints, rdm_stack
+from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 from brainbench.metrics.time.lags import LaggedRDMs, held_out_course, peak_lag, profile, votes
 from brainbench.metrics.time.movies import AnimalMovie

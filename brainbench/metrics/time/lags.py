@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.metrics.inference.permutation import canonical_order, label_orders
 from brainbench.metrics.layers import choose_on_others
 from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
-from brainbench.metrics.inference.permutation import canonical_order, label_orders
 from brainbench.metrics.reliability.subject_rdm import is_flat
 
 _NEVER = -2.0

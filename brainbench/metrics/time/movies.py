@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +17,9 @@ from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.dissimilarity import rdm_movie
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.subject_rdm import subject_rdm
+
+if TYPE_CHECKING:
+    from brainbench.metrics.measures.rsa import RSA
 
 SPLITS = 100
 """Random split halves of an animal in each bin."""
@@ -42,13 +45,12 @@ def animal_movie(
     blocks: Sequence[Trials],
     n_stimuli: int,
     *,
+    metric: RSA,
     stimuli: Sequence[str] | None = None,
-    method: str = "sqeuclidean",
-    comparison: str = "whitened-cosine",
     splits: int = SPLITS,
     seed: int = 0,
 ) -> AnimalMovie:
-    """Return an animal's RDM and reliability in every bin, by the rules of :func:`subject_rdm` in each.
+    """Return an animal's RDM and reliability in every bin, prepared by ``metric`` as for a score without time.
 
     All bins split the same trials into the same halves, so differences between bins are not those of the splits.
 
@@ -56,14 +58,14 @@ def animal_movie(
         subject: Name of the animal.
         blocks: Its sessions, whose responses are [R, T, U].
         n_stimuli: K.
+        metric: How RDMs are made and compared, such as ``get_metric("rsa")``.
         stimuli: Names of the stimuli, for messages.
-        method: RDM method of :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`.
-        comparison: Comparison of RDMs, for the reliability.
         splits: Random split halves.
         seed: Seed of the splits.
 
     Raises:
-        UsageError: responses without a time axis, or sessions of different numbers of bins; else as subject_rdm.
+        UsageError: responses without a time axis, or sessions of different numbers of bins; else as
+            :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`.
     """
     shapes = [np.shape(block.responses) for block in blocks]
     if not shapes or any(len(shape) != 3 for shape in shapes) or len({shape[1] for shape in shapes}) > 1:
@@ -74,18 +76,7 @@ def animal_movie(
     found = []
     for bin in range(shapes[0][1]):
         parts = [replace(block, responses=np.asarray(block.responses)[:, bin]) for block in blocks]
-        found.append(
-            subject_rdm(
-                subject,
-                parts,
-                n_stimuli,
-                stimuli=stimuli,
-                method=method,
-                comparison=comparison,
-                splits=splits,
-                seed=seed,
-            )
-        )
+        found.append(metric.animal(subject, parts, n_stimuli, stimuli=stimuli, splits=splits, seed=seed))
     usable = np.array([item.problem is None for item in found])
     rdms = np.where(usable[:, None], np.stack([item.rdm for item in found]), np.nan)
     reliability = np.where(usable, [item.reliability for item in found], np.nan)
