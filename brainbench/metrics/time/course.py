@@ -35,7 +35,7 @@ PERMUTATIONS = 1000
 """Random orders of the stimuli, above six stimuli; all orders up to six."""
 ALPHA = 0.05
 """Level at which a layer's latency is given."""
-_FARTHEST = 0.25
+_FARTHEST = 0.4
 """Largest lag, as a share of the recorded time."""
 
 
