@@ -61,10 +61,11 @@ def time_course(
     width = float(np.median(np.diff(begins)))
     seconds = width * len(begins) if network.seconds is None else network.seconds
     sessions = brain.trials(kept)
+    how = {"method": metric.brain_method, "comparison": metric.comparison}
     total, animals, layers = len(sessions) + len(network.activations), [], {}
     for subject, blocks in sessions.items():
         _tell(progress, len(animals), total)
-        animals.append(animal_movie(subject, blocks, len(kept), metric=metric, stimuli=kept, seed=seed))
+        animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=seed, **how))
     for name, values in network.activations.items():
         _tell(progress, len(animals) + len(layers), total)
         layers[name] = layer_movie(values[rows], seconds / values.shape[1], width, method=metric.model_method)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,9 +16,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.dissimilarity import rdm_movie
 from brainbench.metrics.rdms.pairs import Floats
-
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.rsa import RSA
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 
 SPLITS = 100
 """Random split halves of an animal in each bin."""
@@ -45,12 +42,14 @@ def animal_movie(
     blocks: Sequence[Trials],
     n_stimuli: int,
     *,
-    metric: RSA,
     stimuli: Sequence[str] | None = None,
+    method: str = "crossnobis",
+    comparison: str = "whitened-cosine",
+    noise: str = "none",
     splits: int = SPLITS,
     seed: int = 0,
 ) -> AnimalMovie:
-    """Return an animal's RDM and reliability in every bin, prepared by ``metric`` as for a score without time.
+    """Return an animal's RDM and reliability in every bin.
 
     All bins split the same trials into the same halves, so differences between bins are not those of the splits.
 
@@ -58,8 +57,11 @@ def animal_movie(
         subject: Name of the animal.
         blocks: Its sessions, whose responses are [R, T, U].
         n_stimuli: K.
-        metric: How RDMs are made and compared, such as ``get_metric("rsa")``.
         stimuli: Names of the stimuli, for messages.
+        method: RDM method of :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`. The default is the squared
+            Euclidean distance without the share of trial noise, which would look like geometry before any response.
+        comparison: Comparison of RDMs, for the reliability.
+        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``.
         splits: Random split halves.
         seed: Seed of the splits.
 
@@ -76,7 +78,19 @@ def animal_movie(
     found = []
     for bin in range(shapes[0][1]):
         parts = [replace(block, responses=np.asarray(block.responses)[:, bin]) for block in blocks]
-        found.append(metric.animal(subject, parts, n_stimuli, stimuli=stimuli, splits=splits, seed=seed))
+        found.append(
+            subject_rdm(
+                subject,
+                parts,
+                n_stimuli,
+                stimuli=stimuli,
+                method=method,
+                comparison=comparison,
+                noise=noise,
+                splits=splits,
+                seed=seed,
+            )
+        )
     usable = np.array([item.problem is None for item in found])
     rdms = np.where(usable[:, None], np.stack([item.rdm for item in found]), np.nan)
     reliability = np.where(usable, [item.reliability for item in found], np.nan)

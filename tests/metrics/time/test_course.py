@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import get_metric
 from brainbench.metrics.time import animal_movie, score_over_time
 from tests.factories.moving_geometry import BIN, lagged, make_layer, make_movie, make_path, make_session
 
@@ -120,9 +119,9 @@ def test_the_order_of_stimuli_does_not_matter():
 
 def test_trials_are_enough():
     rng = np.random.default_rng(9)
-    path, metric = make_path(rng, 10, 10), get_metric("rsa")
+    path = make_path(rng, 10, 10)
     sessions = [make_session(rng, lagged(path, 1), noise=1.0) for _ in range(4)]
-    animals = [animal_movie(str(i), [one], 10, metric=metric, splits=20) for i, one in enumerate(sessions)]
+    animals = [animal_movie(str(i), [one], 10, splits=20) for i, one in enumerate(sessions)]
     course = score_over_time({"layer": make_layer(rng, path)}, animals, width=BIN, permutations=99)
     assert course.latencies[0].latency == pytest.approx(BIN, abs=0.3 * BIN)
     assert course.p <= 0.05
